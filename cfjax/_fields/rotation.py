@@ -1,0 +1,46 @@
+"""Rotations of space: the Lie algebra so(3) in three numbers."""
+
+from __future__ import annotations
+
+from typing import Self
+
+import equinox as eqx
+import jax.numpy as jnp
+from jaxtyping import Array, Float
+
+from .._frozen_field import AbstractAlgebraElement
+from .._functions.rotate import cross, rotate
+
+
+class Rotation(AbstractAlgebraElement):
+    """The rotation of space with angular velocity `omega`: `x' = omega x x` (cross product).
+
+    It acts on a vector, shape `(3,)`, and on every column of a matrix, shape `(3, k)`: with
+    k = 3 on attitude matrices in SO(3), with `omega` in the fixed frame.
+
+    The flow is Rodrigues' formula, about 100 flops, exact to rounding for every angle, and so are
+    its derivatives of every order, also at `omega = 0`.
+
+    **Arguments:** `omega`, shape `(3,)`, float32 or float64, in radians per unit of time.
+
+    **Raises** `ValueError` for another shape, `TypeError` for another dtype.
+    """
+
+    omega: Float[Array, "3"] = eqx.field(converter=jnp.asarray)
+
+    def __check_init__(self):
+        if self.omega.shape != (3,):
+            raise ValueError(f"omega must have shape (3,), got {self.omega.shape}.")
+        if self.omega.dtype not in (jnp.float32, jnp.float64):
+            raise TypeError(f"omega must be float32 or float64, got {self.omega.dtype}.")
+
+    def flow(self, point: Float[Array, "3 *k"]) -> Float[Array, "3 *k"]:
+        return rotate(self.omega, point)
+
+    def tangent(self, point: Float[Array, "3 *k"]) -> Float[Array, "3 *k"]:
+        if point.ndim not in (1, 2) or point.shape[0] != 3:
+            raise ValueError(f"Rotation acts on shapes (3,) and (3, k), got {point.shape}.")
+        return cross(self.omega, point)
+
+    def bracket(self, other: Self) -> Self:
+        return type(self)(cross(self.omega, other.omega))

@@ -1,0 +1,136 @@
+"""Frozen vector fields: the one thing a commutator-free method needs to know of a manifold."""
+
+from __future__ import annotations
+
+import abc
+from collections.abc import Sequence
+from typing import Any, ClassVar, Self
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import jax.tree_util as jtu
+from jaxtyping import Array, Inexact, PyTree, Real
+
+Weight = float | Real[Array, ""]
+
+
+class AbstractFrozenField(eqx.Module):
+    """A vector field of the frame, with coefficients frozen at one point.
+
+    A method needs two things of it (Celledoni, Marthinsen & Owren 2003, Section 2): its flow,
+    and linear combinations with other fields of the same frame. A subclass says what they are:
+
+    - `flow(point)`: where the field carries `point` in unit time;
+    - `tangent(point)`: the velocity of that flow at `point`, as an array shaped like `point`;
+    - `combine(weights, fields)`: by default linear in every array of the class. Override it where
+      an array is structure (a spectrum, a factor) instead of a coordinate.
+
+    `flow` and `tangent` must accept the zero field.
+    """
+
+    # Whether the point that the field acts on is a pytree instead of one array.
+    acts_on_subtree: ClassVar[bool] = False
+
+    @abc.abstractmethod
+    def flow(self, point: Any) -> Any:
+        """The point that `point` reaches in unit time; shaped like `point`."""
+
+    @abc.abstractmethod
+    def tangent(self, point: Any) -> Any:
+        """The ambient velocity at `point`, the derivative of the flow at time zero."""
+
+    @classmethod
+    def combine(cls, weights: Sequence[Weight], fields: Sequence[Self]) -> Self:
+        """The field `sum_i weights[i] * fields[i]`. Weights are real scalars."""
+        return jtu.tree_map(lambda *leaves: _linear_combination(weights, leaves), *fields)
+
+
+class AbstractAlgebraElement(AbstractFrozenField):
+    """A frozen field from a set that is closed under the bracket: an element of a Lie algebra.
+
+    Munthe-Kaas methods accept only these. The bracket is normalised so that `y = exp(u) p` has
+    `u' = v - [u, v]/2 + [u, [u, v]]/12 - ...` for the field v at y. So a matrix that acts from the
+    left has `[a, b] = ab - ba`, and one that acts from the right `[a, b] = ba - ab`.
+    """
+
+    @abc.abstractmethod
+    def bracket(self, other: Self) -> Self:
+        """The bracket `[self, other]`."""
+
+
+def is_field(x: Any) -> bool:
+    return isinstance(x, AbstractFrozenField)
+
+
+def flow(field: PyTree, point: PyTree) -> PyTree:
+    """Carries `point` along `field` for unit time.
+
+    `field` is a pytree whose structure is a prefix of `point`'s. An array in it is a constant
+    field, whose flow is a translation; an `AbstractFrozenField` acts on the part of `point` that
+    stands in its place.
+    """
+    return jtu.tree_map(
+        lambda f, p: f.flow(p) if is_field(f) else p + f, field, point, is_leaf=is_field
+    )
+
+
+def tangent(field: PyTree, point: PyTree) -> PyTree:
+    """The velocity of `field` at `point`, in the ambient space. Structures as in `flow`."""
+    return jtu.tree_map(
+        lambda f, p: f.tangent(p) if is_field(f) else f, field, point, is_leaf=is_field
+    )
+
+
+def combine(weights: Sequence[Weight], fields: Sequence[PyTree]) -> PyTree:
+    """The field `sum_i weights[i] * fields[i]`, for fields of one structure.
+
+    The weights are real scalars. They take the precision of the field, so a step in float64
+    does not promote a field in float32.
+    """
+
+    def combine_leaf(*leaves):
+        if is_field(leaves[0]):
+            return type(leaves[0]).combine(weights, leaves)
+        return _linear_combination(weights, leaves)
+
+    return jtu.tree_map(combine_leaf, *fields, is_leaf=is_field)
+
+
+def bracket(a: PyTree, b: PyTree) -> PyTree:
+    """The bracket `[a, b]` part by part. Translations commute.
+
+    **Raises** `TypeError` if a part is a frozen field without a bracket.
+    """
+
+    def bracket_leaf(x, y):
+        if isinstance(x, AbstractAlgebraElement):
+            return x.bracket(y)
+        if is_field(x):
+            raise TypeError(without_bracket(x))
+        return jnp.zeros_like(x)
+
+    return jtu.tree_map(bracket_leaf, a, b, is_leaf=is_field)
+
+
+def without_bracket(field: AbstractFrozenField) -> str:
+    return (
+        f"A Munthe-Kaas method needs brackets, and {type(field).__name__} has none: it is an "
+        "AbstractFrozenField but not an AbstractAlgebraElement. Use a commutator-free method, "
+        "for example cfjax.CF4()."
+    )
+
+
+def _linear_combination(
+    weights: Sequence[Weight], arrays: Sequence[Inexact[Array, "..."]]
+) -> Inexact[Array, "..."]:
+    total = _scale(weights[0], arrays[0])
+    for weight, array in zip(weights[1:], arrays[1:], strict=True):
+        total = total + _scale(weight, array)
+    return total
+
+
+def _scale(weight: Weight, array: Inexact[Array, "..."]) -> Inexact[Array, "..."]:
+    if isinstance(weight, jax.Array):
+        weight = weight.astype(array.dtype)
+    return weight * array

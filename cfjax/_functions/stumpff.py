@@ -1,0 +1,157 @@
+"""Stumpff functions: sines and cosines of a square root, smooth at zero and everywhere."""
+
+from __future__ import annotations
+
+import functools
+from collections.abc import Sequence
+from math import factorial, pi
+from typing import NamedTuple
+
+import jax
+import jax.numpy as jnp
+from jax import lax
+from jaxtyping import Array, Float
+
+
+@functools.partial(jax.custom_jvp, nondiff_argnums=(0,))
+def stumpff(n: int, s: Float[Array, "*batch"]) -> Float[Array, "*batch"]:
+    """The function `c_n(s) = sum_j (-s)^j / (n + 2j)!`, for `n >= 0` and `s >= 0`.
+
+    With `s = x^2`: `c_0 = cos x`, `c_1 = sin x / x`, `c_2 = (1 - cos x) / x^2`, and
+    `s c_{n+2} = 1/n! - c_n`. They are entire functions of s, with the derivatives
+    `c_n' = (n c_{n+2} - c_{n+1}) / 2`. So every derivative is exact, at zero too.
+
+    The error of c_1 and c_2 is a unit of rounding of x, for every x: absolute in `x c_1` and
+    `x^2 c_2`, relative for small x. A value that is not finite gives NaN. Works in float32 and
+    float64. Source: Stiefel & Scheifele, Linear and Regular Celestial Mechanics (1971), Section 11.
+    """
+    if n == 0:
+        return 1 - s * stumpff(2, s)
+    if n <= 2:
+        constants = _DOUBLE if s.dtype == jnp.float64 else _SINGLE
+        scale = _reduction(s, constants)
+        if n == 1:
+            return scale * _polynomial(constants.sin, s * scale**2)
+        return scale**2 * _polynomial(constants.versin, s * scale**2)
+    # The recursion loses digits to cancellation for small s, the series for large s.
+    small = s < 16
+    coefficients = [(-1) ** j / factorial(n + 2 * j) for j in range(18)]
+    series = _polynomial(coefficients, jnp.where(small, s, 0))
+    recursion = (1 / factorial(n - 2) - stumpff(n - 2, s)) / jnp.where(small, 1, s)
+    return jnp.where(small, series, recursion)
+
+
+@stumpff.defjvp
+def _stumpff_jvp(n, primals, tangents):
+    (s,), (s_dot,) = primals, tangents
+    slope = (n * stumpff(n + 2, s) - stumpff(n + 1, s)) / 2
+    return stumpff(n, s), slope * s_dot
+
+
+class _Constants(NamedTuple):
+    """Polynomials that interpolate at Chebyshev nodes, in powers of their variable."""
+
+    sin: Sequence[float]  # sin(sqrt z) / sqrt z for 0 <= z <= 3.1417^2
+    versin: Sequence[float]  # (1 - cos(sqrt z)) / z on the same interval
+    rsqrt: Sequence[float]  # 1 / sqrt(1 - e) for |e| <= 0.0682
+    seed: int
+    bits: type
+
+
+def _reduction(s: Float[Array, "*batch"], constants: _Constants) -> Float[Array, "*batch"]:
+    """The factor that takes `x = sqrt(s)` to the angle in [-pi, pi] that differs by full turns.
+
+    XLA materialises every square root and division, which would cost a loop of small steps more
+    than the arithmetic does. So 1/x comes from its exponent bits and one polynomial. No branch:
+    without a full turn the factor is exactly 1.
+    """
+    bits = lax.bitcast_convert_type(s, constants.bits)
+    guess = lax.bitcast_convert_type(constants.seed - (bits >> 1), s.dtype)
+    correction = _polynomial(constants.rsqrt, 1 - (s * guess) * guess)
+    # What does not need the correction is grouped so that it does not wait for it.
+    turns = jnp.round(((s * (0.5 / pi)) * guess) * correction)
+    return 1 - turns * (((2 * pi) * guess) * correction)
+
+
+def _polynomial(coefficients: Sequence[float], x: Float[Array, "*batch"]) -> Float[Array, "*batch"]:
+    """Estrin's scheme: shorter chains of dependent operations than Horner's."""
+    terms: list = [jnp.asarray(a, x.dtype) for a in coefficients]
+    while len(terms) > 1:
+        pairs = [terms[i] + terms[i + 1] * x for i in range(0, len(terms) - 1, 2)]
+        terms = pairs + terms[len(pairs) * 2 :]
+        x = x * x
+    return terms[0]
+
+
+_DOUBLE = _Constants(
+    sin=(
+        1.0,
+        -0.16666666666666663,
+        0.008333333333333188,
+        -0.000198412698412469,
+        2.7557319222124525e-06,
+        -2.5052108297305365e-08,
+        1.6059041233543041e-10,
+        -7.647114302277936e-13,
+        2.8108533080427597e-15,
+        -8.174655376108592e-18,
+        1.7577527426101735e-20,
+    ),
+    versin=(
+        0.5,
+        -0.041666666666666664,
+        0.0013888888888888829,
+        -2.4801587301577676e-05,
+        2.7557319223205003e-07,
+        -2.0876756950897077e-09,
+        1.1470744505903215e-11,
+        -4.779456606604926e-14,
+        1.5616675610328964e-16,
+        -4.0910585753793584e-19,
+        8.062113626809763e-22,
+    ),
+    rsqrt=(
+        1.0,
+        0.500000000000004,
+        0.37500000000000383,
+        0.3124999999828909,
+        0.2734374999836026,
+        0.2460937705876731,
+        0.22558595723120636,
+        0.20946255027202312,
+        0.19637092974129178,
+        0.18763809600293596,
+        0.17827435092178798,
+    ),
+    seed=0x5FE6E8EABEAD1636,
+    bits=jnp.int64,
+)
+_SINGLE = _Constants(
+    sin=(
+        1.0,
+        -0.16666666,
+        0.008333322,
+        -0.00019840531,
+        2.7535796e-06,
+        -2.4728324e-08,
+        1.3611441e-10,
+    ),
+    versin=(
+        0.5,
+        -0.041666668,
+        0.0013888881,
+        -2.480112e-05,
+        2.7543695e-07,
+        -2.0672082e-09,
+        9.928024e-12,
+    ),
+    rsqrt=(
+        1.0,
+        0.49999833,
+        0.37499848,
+        0.3139365,
+        0.2747544,
+    ),
+    seed=0x5F374755,
+    bits=jnp.int32,
+)

@@ -1,0 +1,149 @@
+"""Munthe-Kaas methods: one flow for each stage, paid for with commutators."""
+
+from __future__ import annotations
+
+import abc
+import functools
+from collections.abc import Callable
+from fractions import Fraction
+from math import factorial
+from typing import Any
+
+import diffrax
+import equinox as eqx
+import jax.tree_util as jtu
+from jaxtyping import PyTree
+
+from .._frozen_field import (
+    AbstractAlgebraElement,
+    bracket,
+    combine,
+    flow,
+    is_field,
+    without_bracket,
+)
+from .._order_conditions import runge_kutta_order
+from .base import AbstractLieSolver
+
+
+class AbstractMuntheKaas(AbstractLieSolver):
+    """The step `exp(v) y0` with v in the Lie algebra. Fields without a bracket are refused."""
+
+    @abc.abstractmethod
+    def increment(self, field: Callable[[float, PyTree], PyTree]) -> PyTree:
+        """The element v; `field(c, u)` is `h f(t + c h, exp(u) y0)`, and `u = None` means zero."""
+
+    def end_point(self, field, y0):
+        def field_at(c: float, u: PyTree) -> PyTree:
+            value = field(c, y0 if u is None else flow(u, y0))
+            for part in jtu.tree_leaves(value, is_leaf=is_field):
+                if is_field(part) and not isinstance(part, AbstractAlgebraElement):
+                    raise TypeError(without_bracket(part))
+            return value
+
+        return flow(self.increment(field_at), y0)
+
+
+class RKMK3(AbstractMuntheKaas):
+    """Munthe-Kaas method of order 3 with one commutator: 3 evaluations, 3 flows.
+
+    Source: Munthe-Kaas & Owren, Computations in a free Lie algebra, Phil. Trans. R. Soc. A 357
+    (1999).
+    """
+
+    def order(self, terms) -> int:
+        return 3
+
+    def increment(self, field):
+        k1 = field(0.0, None)
+        k2 = field(0.5, combine((1 / 2,), (k1,)))
+        k3 = field(1.0, combine((-1.0, 2.0), (k1, k2)))
+        return combine((1 / 6, 2 / 3, 1 / 6, -1 / 6), (k1, k2, k3, bracket(k1, k2)))
+
+
+class RKMK4(AbstractMuntheKaas):
+    """Munthe-Kaas method of order 4 with two commutators: 4 evaluations, 4 flows.
+
+    Source: Munthe-Kaas & Owren, Computations in a free Lie algebra, Phil. Trans. R. Soc. A 357
+    (1999). Their two brackets of the last line, `-[Q1, Q2]/6 - [Q1, Q4]/12`, are `-[K1, K4]/12`.
+    """
+
+    def order(self, terms) -> int:
+        return 4
+
+    def increment(self, field):
+        k1 = field(0.0, None)
+        k2 = field(0.5, combine((1 / 2,), (k1,)))
+        k3 = field(0.5, combine((1 / 2, -1 / 8), (k2, bracket(k1, k2))))
+        k4 = field(1.0, k3)
+        return combine(
+            (1 / 6, 1 / 3, 1 / 3, 1 / 6, -1 / 12), (k1, k2, k3, k4, bracket(k1, k4))
+        )
+
+
+class RKMK(AbstractMuntheKaas):
+    """The Munthe-Kaas method of any explicit Runge-Kutta method.
+
+    Each stage takes the inverse derivative of the exponential as a series, with all its
+    commutators: an s-stage method of order q costs up to `(s - 1)(q - 2)` of them. It has order q.
+
+    **Arguments:** `tableau`, a `diffrax.ButcherTableau`, for example `diffrax.Dopri5.tableau`.
+
+    **Raises** `TypeError` if it is something else, `ValueError` if the method is implicit.
+
+    Source: Munthe-Kaas, High order Runge-Kutta methods on manifolds, Appl. Numer. Math. 29 (1999).
+    """
+
+    # Tuples: unlike diffrax's tableau they compare by value, as a static field must.
+    a: tuple[tuple[float, ...], ...] = eqx.field(static=True)
+    b: tuple[float, ...] = eqx.field(static=True)
+
+    def __init__(self, tableau: diffrax.ButcherTableau):
+        if not isinstance(tableau, diffrax.ButcherTableau):
+            raise TypeError(f"tableau must be a diffrax.ButcherTableau, got {tableau!r}.")
+        if tableau.implicit:
+            raise ValueError("tableau must be explicit, got one of an implicit method.")
+        b = tableau.b_sol.tolist()
+        # A last stage without weight only serves an error estimate or the next step.
+        while b[-1] == 0:
+            b.pop()
+        self.a = ((), *(tuple(row.tolist()) for row in tableau.a_lower[: len(b) - 1]))
+        self.b = tuple(b)
+
+    def order(self, terms) -> int:
+        return _classical_order(self.a[1:], self.b)
+
+    def increment(self, field):
+        degree = self.order(None) - 2
+        stages: list[PyTree] = []
+        for row in self.a:
+            u = _combine_nonzero(row, stages) if any(row) else None
+            value = field(sum(row), u)
+            stages.append(value if u is None else _dexpinv(u, value, degree))
+        return _combine_nonzero(self.b, stages)
+
+
+_classical_order = functools.lru_cache(runge_kutta_order)
+
+
+def _combine_nonzero(weights: Any, fields: Any) -> PyTree:
+    used = [(w, f) for w, f in zip(weights, fields, strict=True) if w != 0]
+    return combine(*zip(*used, strict=True))
+
+
+def _dexpinv(u: PyTree, v: PyTree, degree: int) -> PyTree:
+    """`sum_k B_k / k! ad_u^k(v)` for k up to `degree`, with the Bernoulli numbers B_k."""
+    weights, terms = [1.0], [v]
+    for k in range(1, degree + 1):
+        v = bracket(u, v)
+        weights.append(float(_bernoulli(k) / factorial(k)))
+        terms.append(v)
+    return _combine_nonzero(weights, terms)
+
+
+def _bernoulli(n: int) -> Fraction:
+    """Bernoulli numbers with `B_1 = -1/2`, by the Akiyama-Tanigawa recursion."""
+    row = [Fraction(1, m + 1) for m in range(n + 1)]
+    for k in range(n, 0, -1):
+        row = [(j + 1) * (row[j] - row[j + 1]) for j in range(k)]
+    return -row[0] if n == 1 else row[0]

@@ -1,0 +1,115 @@
+"""`LieTerm`: a field of frozen vector fields as a diffrax term."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from typing import Any
+
+import diffrax
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import jax.tree_util as jtu
+import numpy as np
+from jaxtyping import Array, PyTree, Real
+
+from ._frozen_field import combine, is_field, tangent
+
+_ARRAY_TYPES = jax.Array | np.ndarray | np.generic | int | float | complex
+
+
+class LieTerm(diffrax.AbstractTerm):
+    """The term `f(t, y, args) dt` of an ordinary differential equation on a manifold.
+
+    `field(t, y, args)` returns the frozen vector field at `y`: a pytree whose structure is a
+    prefix of the state's, with an `AbstractFrozenField` or an array (a translation) for each part.
+
+    ```python
+    def field(t, y, args):
+        return cfjax.Rotation(-y / args)
+
+    term = cfjax.LieTerm(field)
+    ```
+
+    What the field returns is checked against the state once, when the program is traced. A part of
+    wrong structure, shape or dtype raises a `TypeError` or `ValueError` that names its place in
+    the state. A Python scalar is taken in the state's dtype.
+
+    Solvers of linear spaces refuse the term, with one exception: where every part is a translation
+    the term is an ordinary one, and every diffrax solver runs it. `vf_prod` is the tangent vector
+    in the ambient space, so `diffrax.BacksolveAdjoint(solver=diffrax.Tsit5())` works.
+    """
+
+    field: Callable[[Any, Any, Any], PyTree]
+
+    def vf(self, t: Any, y: PyTree, args: PyTree) -> PyTree:
+        return _checked(self.field(t, y, args), y)
+
+    def contr(self, t0: Any, t1: Any, **kwargs: Any) -> Any:
+        return t1 - t0
+
+    def prod(self, vf: PyTree, control: float | Real[Array, ""]) -> PyTree:
+        return combine((control,), (vf,))
+
+    def vf_prod(self, t: Any, y: PyTree, args: PyTree, control: Any) -> PyTree:
+        return tangent(self.prod(self.vf(t, y, args), control), y)
+
+
+def _checked(field: PyTree, y: PyTree) -> PyTree:
+    parts, treedef = jtu.tree_flatten_with_path(field, is_leaf=is_field)
+    try:
+        points = treedef.flatten_up_to(y)
+    except ValueError as error:
+        raise ValueError(
+            "The field of a LieTerm must return a pytree whose structure is a prefix of the "
+            f"state's. Got {eqx.tree_pformat(field)} for the state {_describe(y)}: {error}"
+        ) from error
+    return treedef.unflatten(
+        _checked_part("y" + jtu.keystr(path), part, point)
+        for (path, part), point in zip(parts, points, strict=True)
+    )
+
+
+def _checked_part(place: str, part: Any, point: PyTree) -> Any:
+    if is_field(part):
+        name = type(part).__name__
+        if not part.acts_on_subtree and not jtu.all_leaves([point]):
+            raise TypeError(
+                f"The field returned {name} for {place}. It acts on one array, but the state has "
+                f"{_describe(point)} there."
+            )
+        try:
+            velocity = eqx.filter_eval_shape(type(part).tangent, part, point)
+        except (TypeError, ValueError) as error:
+            raise type(error)(
+                f"The field returned {name} for {place}, where the state is {_describe(point)}. "
+                f"It does not act there: {error}"
+            ) from error
+        if _struct(velocity) != _struct(point):
+            raise ValueError(
+                f"The field returned {name} for {place}. Its tangent is {_describe(velocity)}, but "
+                f"the state is {_describe(point)} there. Shape and dtype must agree."
+            )
+        return part
+    if not isinstance(part, _ARRAY_TYPES) or not jtu.all_leaves([point]):
+        raise TypeError(
+            f"The field returned {_describe(part)} for {place}, where the state is "
+            f"{_describe(point)}. Expected a frozen field, or an array of the state's shape and "
+            "dtype (a translation)."
+        )
+    if isinstance(part, int | float | complex):
+        part = jnp.asarray(part, jnp.result_type(part, jnp.result_type(point)))
+    if _struct(part) != _struct(point) or not jnp.issubdtype(jnp.result_type(part), jnp.inexact):
+        raise ValueError(
+            f"The field returned a translation of type {_describe(part)} for {place}, where the "
+            f"state is {_describe(point)}. Shape and dtype must agree, and be floating or complex."
+        )
+    return part
+
+
+def _struct(x: PyTree) -> PyTree:
+    return jtu.tree_map(lambda a: jax.ShapeDtypeStruct(jnp.shape(a), jnp.result_type(a)), x)
+
+
+def _describe(x: PyTree) -> str:
+    return eqx.tree_pformat(x, struct_as_array=True, width=10_000)

@@ -1,0 +1,3 @@
+"""Problems with known answers, one to a module."""
+
+from . import rigid_body as rigid_body
