@@ -5,8 +5,6 @@ for each of them, or sends it through memory. A step of a small system runs seve
 when no short vector is ever built inside it, above all in a batch.
 """
 
-from __future__ import annotations
-
 from collections.abc import Callable, Sequence
 from typing import Any
 
@@ -20,6 +18,7 @@ from jaxtyping import PyTree
 
 # Longer vectors fuse well as they are, and the program grows with the number of components.
 _MAX_LENGTH = 6
+_MAX_PRODUCT = 16
 
 _CHEAP = frozenset(
     "abs add add_any and ceil clamp complex conj convert_element_type copy eq floor ge gt imag "
@@ -27,8 +26,8 @@ _CHEAP = frozenset(
     "xor".split()
 )
 _EXPENSIVE = frozenset(
-    "acos acosh asin asinh atan atan2 atanh cbrt cos cosh div erf exp exp2 expm1 log log1p logistic "
-    "pow rem rsqrt sin sinh sqrt tan tanh".split()
+    "acos acosh asin asinh atan atan2 atanh cbrt cos cosh div erf exp exp2 expm1 log log1p "
+    "logistic pow rem rsqrt sin sinh sqrt tan tanh".split()
 )
 
 
@@ -73,8 +72,9 @@ def _evaluate(jaxpr: Jaxpr, consts: Sequence[Any], args: Sequence[Any]) -> list[
 
 def _in_components(eqn: JaxprEqn, name: str, values: list[Any]) -> Any:
     """The result of one operation, if there is a rule for it, else None."""
-    shape = () if eqn.primitive.multiple_results else eqn.outvars[0].aval.shape
-    if len(shape) == 1 and shape[0] <= _MAX_LENGTH:
+    aval: Any = eqn.outvars[0].aval if not eqn.primitive.multiple_results else None
+    shape = getattr(aval, "shape", None)
+    if shape is not None and len(shape) == 1 and 1 <= shape[0] <= _MAX_LENGTH:
         if name in _CHEAP or name in _EXPENSIVE:
             rows = list(zip(*(_entries(v, shape[0]) for v in values), strict=True))
             if name in _CHEAP:
@@ -136,15 +136,25 @@ def _expensive(eqn: JaxprEqn, rows: Sequence[tuple]) -> _Vector:
         return out, (True,) * len(out)
 
     # `custom_vmap` has no reverse mode, so the derivative goes around it.
-    out = jax.custom_jvp(whole)
-    out.defjvp(lambda primals, tangents: (whole(*primals), jax.jvp(by_component, primals, tangents)[1]))
-    return _Vector(out(tuple(rows)))
+    differentiable = jax.custom_jvp(whole)
+
+    @differentiable.defjvp
+    def _(primals, tangents):
+        return whole(*primals), jax.jvp(by_component, primals, tangents)[1]
+
+    return _Vector(differentiable(tuple(rows)))
 
 
 def _is_plain_product(eqn: JaxprEqn, values: Sequence[Any]) -> bool:
-    small = all(isinstance(v, _Vector) or jnp.size(v) <= _MAX_LENGTH**2 // 2 for v in values)
-    dtypes = {v.aval.dtype for v in (*eqn.invars, *eqn.outvars)}
-    return small and any(isinstance(v, _Vector) for v in values) and len(dtypes) == 1
+    """A vector times a vector or a small matrix, all of one dtype."""
+    contracted, batched = eqn.params["dimension_numbers"]
+    avals: list[Any] = [v.aval for v in (*eqn.invars, *eqn.outvars)]
+    return (
+        any(isinstance(v, _Vector) for v in values)
+        and all(aval.size <= _MAX_PRODUCT for aval in avals)
+        and len({aval.dtype for aval in avals}) == 1
+        and tuple(map(len, (*contracted, *batched))) == (1, 1, 0, 0)
+    )
 
 
 def _product(eqn: JaxprEqn, left: Any, right: Any) -> _Vector:
@@ -161,7 +171,7 @@ def _dot(a: Sequence[Any], b: Sequence[Any]) -> Any:
 
 
 def _is_short(x: Any) -> bool:
-    return _ndim(x) == 1 and len(x) <= _MAX_LENGTH
+    return _ndim(x) == 1 and 1 <= len(x) <= _MAX_LENGTH
 
 
 def _ndim(x: Any) -> int:

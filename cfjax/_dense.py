@@ -1,7 +1,5 @@
 """Output between the steps."""
 
-from __future__ import annotations
-
 from typing import Any
 
 import diffrax

@@ -1,7 +1,5 @@
 """Frozen vector fields: the one thing a commutator-free method needs to know of a manifold."""
 
-from __future__ import annotations
-
 import abc
 from collections.abc import Sequence
 from typing import Any, ClassVar, Self
@@ -55,8 +53,8 @@ class AbstractAlgebraElement(AbstractFrozenField):
     """
 
     @abc.abstractmethod
-    def bracket(self, other: Self) -> Self:
-        """The bracket `[self, other]`."""
+    def bracket(self, other: Any) -> Self:
+        """The bracket `[self, other]` with another element of the same class."""
 
 
 def is_field(x: Any) -> bool:

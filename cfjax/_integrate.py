@@ -1,7 +1,5 @@
 """Integration with a fixed number of steps, as one compiled loop."""
 
-from __future__ import annotations
-
 from typing import Any
 
 import diffrax
@@ -111,11 +109,9 @@ def _integrate(
 def _check_types(term: Any, solver: Any, y0: PyTree) -> None:
     is_term = lambda x: isinstance(x, diffrax.AbstractTerm)  # noqa: E731
     if not all(map(is_term, jtu.tree_leaves(term, is_leaf=is_term))):
-        raise TypeError(
-            f"term must be a diffrax term, for example cfjax.LieTerm(field), got {term!r}."
-        )
+        raise TypeError(f"term must be a diffrax term, such as cfjax.LieTerm(field), got {term!r}.")
     if not isinstance(solver, diffrax.AbstractSolver):
-        raise TypeError(f"solver must be a diffrax solver, for example cfjax.CF4(), got {solver!r}.")
+        raise TypeError(f"solver must be a diffrax solver, such as cfjax.CF4(), got {solver!r}.")
     for path, leaf in jtu.tree_leaves_with_path(y0):
         is_array = isinstance(leaf, jax.Array | np.ndarray | np.generic | float | complex)
         if not is_array or not jnp.issubdtype(jnp.result_type(leaf), jnp.inexact):

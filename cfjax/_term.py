@@ -1,7 +1,5 @@
 """`LieTerm`: a field of frozen vector fields as a diffrax term."""
 
-from __future__ import annotations
-
 from collections.abc import Callable
 from typing import Any
 

@@ -1,8 +1,6 @@
 """Matrix Lie algebras, acting from the left or from the right."""
 
-from __future__ import annotations
-
-from typing import Self
+from typing import Any, Self
 
 import equinox as eqx
 import jax.numpy as jnp
@@ -46,7 +44,7 @@ class LeftMatrix(AbstractAlgebraElement):
             )
         return _product(self.a, point)
 
-    def bracket(self, other: Self) -> Self:
+    def bracket(self, other: Any) -> Self:
         return type(self)(_product(self.a, other.a) - _product(other.a, self.a))
 
 
@@ -74,7 +72,7 @@ class RightMatrix(AbstractAlgebraElement):
             )
         return _product(point, self.a)
 
-    def bracket(self, other: Self) -> Self:
+    def bracket(self, other: Any) -> Self:
         # Flows from the right compose the other way round.
         return type(self)(_product(other.a, self.a) - _product(self.a, other.a))
 

@@ -102,7 +102,7 @@ def _scaling(scheme: _Scheme, a2: Array) -> tuple[Array, Array]:
     magnitude = jnp.abs(a2.real) + jnp.abs(a2.imag) if jnp.iscomplexobj(a2) else jnp.abs(a2)
     square = jnp.max(jnp.sum(magnitude, axis=0)) / scheme.theta**2
     info = jnp.finfo(square.dtype)
-    # The exponent field is exact where a rounded log2 is not, and puts inf and NaN above all numbers.
+    # The exponent field is exact where a rounded log2 is not, and puts inf and NaN on top.
     integer = jnp.dtype(f"int{info.bits}")
     exponent = (lax.bitcast_convert_type(square, integer) >> info.nmant) - (info.maxexp - 2)
     s = jnp.maximum((exponent + 1) // 2, 0)

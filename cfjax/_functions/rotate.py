@@ -1,12 +1,10 @@
 """Rotation of vectors in space by the exponential of a cross product."""
 
-from __future__ import annotations
-
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
-from .stumpff import stumpff
+from .stumpff import stumpff_1_2
 
 
 def cross(a: Float[Array, "3"], x: Float[Array, "3 *k"]) -> Float[Array, "3 *k"]:
@@ -22,7 +20,7 @@ def rotate(a: Float[Array, "3"], x: Float[Array, "3 *k"]) -> Float[Array, "3 *k"
     """
     a0, a1, a2 = a[0], a[1], a[2]
     s = a0 * a0 + a1 * a1 + a2 * a2
-    c1, c2 = stumpff(1, s), stumpff(2, s)
+    c1, c2 = stumpff_1_2(s)
     once = _cross((a0, a1, a2), (x[0], x[1], x[2]))
     twice = _cross((a0, a1, a2), once)
     return _vector(

@@ -1,7 +1,5 @@
 """Stumpff functions: sines and cosines of a square root, smooth at zero and everywhere."""
 
-from __future__ import annotations
-
 import functools
 from collections.abc import Sequence
 from math import factorial, pi
@@ -21,18 +19,15 @@ def stumpff(n: int, s: Float[Array, "*batch"]) -> Float[Array, "*batch"]:
     `s c_{n+2} = 1/n! - c_n`. They are entire functions of s, with the derivatives
     `c_n' = (n c_{n+2} - c_{n+1}) / 2`. So every derivative is exact, at zero too.
 
-    The error of c_1 and c_2 is a unit of rounding of x, for every x: absolute in `x c_1` and
-    `x^2 c_2`, relative for small x. A value that is not finite gives NaN. Works in float32 and
-    float64. Source: Stiefel & Scheifele, Linear and Regular Celestial Mechanics (1971), Section 11.
+    The error is a few units of rounding of x, for every x: absolute in `x c_1` and `x^2 c_2`,
+    relative for small x. A value that is not finite gives NaN. Works in float32 and float64.
+
+    Source: Stiefel & Scheifele, Linear and Regular Celestial Mechanics (1971), Section 11.
     """
     if n == 0:
         return 1 - s * stumpff(2, s)
     if n <= 2:
-        constants = _DOUBLE if s.dtype == jnp.float64 else _SINGLE
-        scale = _reduction(s, constants)
-        if n == 1:
-            return scale * _polynomial(constants.sin, s * scale**2)
-        return scale**2 * _polynomial(constants.versin, s * scale**2)
+        return stumpff_1_2(s)[n - 1]
     # The recursion loses digits to cancellation for small s, the series for large s.
     small = s < 16
     coefficients = [(-1) ** j / factorial(n + 2 * j) for j in range(18)]
@@ -42,10 +37,27 @@ def stumpff(n: int, s: Float[Array, "*batch"]) -> Float[Array, "*batch"]:
 
 
 @stumpff.defjvp
-def _stumpff_jvp(n, primals, tangents):
+def _(n, primals, tangents):
     (s,), (s_dot,) = primals, tangents
-    slope = (n * stumpff(n + 2, s) - stumpff(n + 1, s)) / 2
-    return stumpff(n, s), slope * s_dot
+    return stumpff(n, s), (n * stumpff(n + 2, s) - stumpff(n + 1, s)) / 2 * s_dot
+
+
+@jax.custom_jvp
+def stumpff_1_2(s: Float[Array, "*batch"]) -> tuple[Float[Array, "*batch"], Float[Array, "*batch"]]:
+    """`stumpff(1, s)` and `stumpff(2, s)` together, for the price of one and a half."""
+    constants = _DOUBLE if s.dtype == jnp.float64 else _SINGLE
+    scale = _reduction(s, constants)
+    square = scale * scale
+    z = s * square
+    return scale * _polynomial(constants.sin, z), square * _polynomial(constants.versin, z)
+
+
+@stumpff_1_2.defjvp
+def _(primals, tangents):
+    (s,), (s_dot,) = primals, tangents
+    c1, c2 = stumpff_1_2(s)
+    c3, c4 = stumpff(3, s), stumpff(4, s)
+    return (c1, c2), ((c3 - c2) / 2 * s_dot, (c4 - c3 / 2) * s_dot)
 
 
 class _Constants(NamedTuple):

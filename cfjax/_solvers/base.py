@@ -1,7 +1,5 @@
 """What all Lie group methods are to diffrax: one-step maps made of flows."""
 
-from __future__ import annotations
-
 import abc
 from collections.abc import Callable
 from typing import Any, ClassVar

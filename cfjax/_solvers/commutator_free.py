@@ -1,8 +1,6 @@
 """Commutator-free methods: one step for every tableau."""
 
-from __future__ import annotations
-
-from typing import Any, ClassVar
+from typing import ClassVar
 
 import equinox as eqx
 from jaxtyping import PyTree

@@ -1,7 +1,5 @@
 """Munthe-Kaas methods: one flow for each stage, paid for with commutators."""
 
-from __future__ import annotations
-
 import abc
 import functools
 from collections.abc import Callable
@@ -76,9 +74,7 @@ class RKMK4(AbstractMuntheKaas):
         k2 = field(0.5, combine((1 / 2,), (k1,)))
         k3 = field(0.5, combine((1 / 2, -1 / 8), (k2, bracket(k1, k2))))
         k4 = field(1.0, k3)
-        return combine(
-            (1 / 6, 1 / 3, 1 / 3, 1 / 6, -1 / 12), (k1, k2, k3, k4, bracket(k1, k4))
-        )
+        return combine((1 / 6, 1 / 3, 1 / 3, 1 / 6, -1 / 12), (k1, k2, k3, k4, bracket(k1, k4)))
 
 
 class RKMK(AbstractMuntheKaas):
