@@ -2,7 +2,7 @@
 
 import abc
 from collections.abc import Sequence
-from typing import Any, ClassVar, Self
+from typing import Any, ClassVar
 
 import equinox as eqx
 import jax
@@ -39,7 +39,7 @@ class AbstractFrozenField(eqx.Module):
         """The ambient velocity at `point`, the derivative of the flow at time zero."""
 
     @classmethod
-    def combine(cls, weights: Sequence[Weight], fields: Sequence[Self]) -> Self:
+    def combine(cls, weights: Sequence[Weight], fields: Sequence[Any]) -> Any:
         """The field `sum_i weights[i] * fields[i]`. Weights are real scalars."""
         return jtu.tree_map(lambda *leaves: _linear_combination(weights, leaves), *fields)
 
@@ -53,7 +53,7 @@ class AbstractAlgebraElement(AbstractFrozenField):
     """
 
     @abc.abstractmethod
-    def bracket(self, other: Any) -> Self:
+    def bracket(self, other: Any) -> "AbstractAlgebraElement":
         """The bracket `[self, other]` with another element of the same class."""
 
 

@@ -1,6 +1,6 @@
 """Matrix Lie algebras, acting from the left or from the right."""
 
-from typing import Any, Self
+from typing import Any
 
 import equinox as eqx
 import jax.numpy as jnp
@@ -8,7 +8,7 @@ from jax import lax
 from jaxtyping import Array, Inexact
 
 from .._frozen_field import AbstractAlgebraElement
-from .._functions.expm import expm
+from .._functions.expm import expm_parts
 
 
 class LeftMatrix(AbstractAlgebraElement):
@@ -33,7 +33,8 @@ class LeftMatrix(AbstractAlgebraElement):
         _check_square(self.a)
 
     def flow(self, point: Inexact[Array, "n *k"]) -> Inexact[Array, "n *k"]:
-        return _product(expm(self.a), point)
+        weight, rest = expm_parts(self.a)
+        return weight.astype(point.dtype) * point + _product(rest, point)
 
     def tangent(self, point: Inexact[Array, "n *k"]) -> Inexact[Array, "n *k"]:
         n = len(self.a)
@@ -44,7 +45,7 @@ class LeftMatrix(AbstractAlgebraElement):
             )
         return _product(self.a, point)
 
-    def bracket(self, other: Any) -> Self:
+    def bracket(self, other: Any) -> "LeftMatrix":
         return type(self)(_product(self.a, other.a) - _product(other.a, self.a))
 
 
@@ -61,7 +62,8 @@ class RightMatrix(AbstractAlgebraElement):
         _check_square(self.a)
 
     def flow(self, point: Inexact[Array, "*k n"]) -> Inexact[Array, "*k n"]:
-        return _product(point, expm(self.a))
+        weight, rest = expm_parts(self.a)
+        return weight.astype(point.dtype) * point + _product(point, rest)
 
     def tangent(self, point: Inexact[Array, "*k n"]) -> Inexact[Array, "*k n"]:
         n = len(self.a)
@@ -72,7 +74,7 @@ class RightMatrix(AbstractAlgebraElement):
             )
         return _product(point, self.a)
 
-    def bracket(self, other: Any) -> Self:
+    def bracket(self, other: Any) -> "RightMatrix":
         # Flows from the right compose the other way round.
         return type(self)(_product(other.a, self.a) - _product(self.a, other.a))
 

@@ -1,6 +1,6 @@
 """Rotations of space: the Lie algebra so(3) in three numbers."""
 
-from typing import Any, Self
+from typing import Any
 
 import equinox as eqx
 import jax.numpy as jnp
@@ -40,5 +40,5 @@ class Rotation(AbstractAlgebraElement):
             raise ValueError(f"Rotation acts on shapes (3,) and (3, k), got {point.shape}.")
         return cross(self.omega, point)
 
-    def bracket(self, other: Any) -> Self:
+    def bracket(self, other: Any) -> "Rotation":
         return type(self)(cross(self.omega, other.omega))

@@ -1,5 +1,6 @@
 """Rotation of vectors in space by the exponential of a cross product."""
 
+import jax
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
@@ -12,6 +13,7 @@ def cross(a: Float[Array, "3"], x: Float[Array, "3 *k"]) -> Float[Array, "3 *k"]
     return _vector(_cross((a[0], a[1], a[2]), (x[0], x[1], x[2])))
 
 
+@jax.jit  # One trace for the many rotations of a step.
 def rotate(a: Float[Array, "3"], x: Float[Array, "3 *k"]) -> Float[Array, "3 *k"]:
     """Rotates a vector, or every column of a matrix, about `a` by the angle `|a|`.
 

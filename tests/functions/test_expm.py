@@ -13,6 +13,9 @@ import scipy.linalg
 
 from cfjax._functions.expm import _DEGREE_15, _DEGREE_21, _SCHEMES, expm
 
+# One compilation for each size and dtype keeps this file fast.
+compiled = jax.jit(expm)
+
 DTYPES = [np.float32, np.float64, np.complex64, np.complex128]
 SCHEMES = pytest.mark.parametrize(
     ("scheme", "degree", "unit"), [(_DEGREE_15, 15, 2.0**-24), (_DEGREE_21, 21, 2.0**-53)]
@@ -122,19 +125,27 @@ def test_theta_is_where_the_backward_error_reaches_the_unit_roundoff(scheme, deg
 
 
 @pytest.mark.parametrize("dtype", DTYPES)
-@pytest.mark.parametrize("kind", ["skew", "negative", "general"])
-@pytest.mark.parametrize("norm", [1e-30, 1e-8, 0.3, 1.0, 4.0, 30.0, 1000.0, 1e5])
+@pytest.mark.parametrize(
+    ("kind", "norm"),
+    [
+        *(
+            (kind, norm)
+            for kind in ("skew", "negative", "general")
+            for norm in (1e-8, 0.3, 1.0, 4.0)
+        ),
+        *((kind, norm) for kind in ("skew", "negative") for norm in (30.0, 1000.0, 1e5)),
+        ("general", 30.0),
+    ],
+)
 def test_accuracy(kind, norm, dtype):
     a = random(kind, 5, norm, dtype=dtype)
     condition = 1.0
     if kind == "general":
-        if norm > 30:
-            pytest.skip("exp overflows, or is conditioned worse than single precision")
         condition = scipy.linalg.expm_cond(a.astype(np.promote_types(dtype, np.float64)))
     # A squaring of a normal matrix doubles the relative error and adds one product's, n units: in
     # all n·2ˢ ≤ n·norm. 4 covers the polynomial. A general one can lose its condition number.
     bound = 4 * 5 * np.finfo(dtype).eps * max(1.0, norm, condition)
-    got = expm(jnp.asarray(a))
+    got = compiled(jnp.asarray(a))
     assert got.dtype == dtype
     assert error(got, reference(a)) <= bound
 
@@ -144,10 +155,10 @@ def test_accuracy(kind, norm, dtype):
 def test_every_size(n, dtype):
     # Sizes 1, up to 4, 5 to 7 and above go different ways.
     if n == 0:
-        assert expm(jnp.zeros((0, 0), dtype)).shape == (0, 0)
+        assert compiled(jnp.zeros((0, 0), dtype)).shape == (0, 0)
         return
     a = random("skew" if n > 1 else "general", n, 1.5, dtype=dtype)
-    got = expm(jnp.asarray(a))
+    got = compiled(jnp.asarray(a))
     assert got.dtype == dtype and got.shape == (n, n)
     # One product's error is n units; 4 products follow the first, most of them well below one.
     assert error(got, reference(a)) <= 2 * (n + 2) * np.finfo(dtype).eps
@@ -157,31 +168,31 @@ def test_every_size(n, dtype):
 @pytest.mark.parametrize("n", [1, 3, 6, 8])
 def test_exact_at_zero(n, dtype):
     # A field that vanishes must not move the state, however often: no tolerance.
-    assert np.array_equal(expm(jnp.zeros((n, n), dtype)), np.eye(n))
+    assert np.array_equal(compiled(jnp.zeros((n, n), dtype)), np.eye(n))
     direction = jnp.asarray(random("general", n, 1.0, dtype=dtype))
-    value, tangent = jax.jvp(expm, (jnp.zeros((n, n), dtype),), (direction,))
+    value, tangent = jax.jvp(compiled, (jnp.zeros((n, n), dtype),), (direction,))
     assert np.array_equal(value, np.eye(n))
     assert np.array_equal(tangent, direction)
     tiny = jnp.asarray(1e-30, dtype) * direction
     off = ~np.eye(n, dtype=bool)
-    assert np.array_equal(np.asarray(expm(tiny))[off], np.asarray(tiny)[off])
+    assert np.array_equal(np.asarray(compiled(tiny))[off], np.asarray(tiny)[off])
 
 
 def test_smallest_number():
     a = random("general", 5, 1e-300)
     off = ~np.eye(5, dtype=bool)
-    assert np.array_equal(np.asarray(expm(jnp.asarray(a)))[off], a[off])
+    assert np.array_equal(np.asarray(compiled(jnp.asarray(a)))[off], a[off])
 
 
 def test_large_but_nilpotent_needs_no_squaring():
     # The norm of a would ask for 20 squarings, that of a² for none: then I + a comes out exactly.
     a = jnp.asarray([[0.0, 1e6], [0.0, 0.0]])
-    assert np.array_equal(expm(a), [[1.0, 1e6], [0.0, 1.0]])
+    assert np.array_equal(compiled(a), [[1.0, 1e6], [0.0, 1.0]])
 
 
 def test_negative_eigenvalues_underflow_to_zero():
     a = jnp.diag(jnp.asarray([-1000.0, 1.0, -1.0]))
-    got = np.asarray(expm(a))
+    got = np.asarray(compiled(a))
     assert got[0, 0] == 0
     # 10 squarings: 2¹⁰ units of rounding.
     np.testing.assert_allclose(np.diag(got)[1:], [np.e, 1 / np.e], rtol=2**10 * 2.3e-16)
@@ -190,7 +201,7 @@ def test_negative_eigenvalues_underflow_to_zero():
 def test_each_member_of_a_batch_has_its_own_scaling():
     norms = [1e-8, 0.5, 3.0, 2e4]
     batch = np.stack([random("skew", 5, norm, seed=i) for i, norm in enumerate(norms)])
-    got = jax.vmap(expm)(jnp.asarray(batch))
+    got = jax.jit(jax.vmap(expm))(jnp.asarray(batch))
     for x, a, norm in zip(got, batch, norms, strict=True):
         # As in test_accuracy. With the scaling of the largest this would be 2e4 times as much.
         assert error(x, reference(a)) <= 4 * 5 * 2.3e-16 * max(1.0, norm)
@@ -207,25 +218,25 @@ def test_not_finite_gives_nan_and_stays_with_its_member(n, dtype):
     # As in test_accuracy; the condition number of such a matrix is below 3·e³ = 60.
     assert error(got[3], reference(good)) <= 4 * n * np.finfo(dtype).eps * 60
     for bad in batch[:3]:
-        assert np.isnan(expm(jnp.asarray(bad))).all()
+        assert np.isnan(compiled(jnp.asarray(bad))).all()
 
 
 def test_not_finite_gives_nan_gradient():
     a = jnp.asarray([[0.0, np.inf], [0.0, 0.0]])
-    assert np.isnan(jax.jit(jax.grad(lambda a: jnp.sum(expm(a))))(a)).all()
+    assert np.isnan(jax.jit(jax.grad(lambda a: jnp.sum(compiled(a))))(a)).all()
 
 
 @pytest.mark.parametrize("dtype", DTYPES)
 def test_overflow_and_too_large_are_never_a_plausible_number(dtype):
     eye = jnp.eye(3, dtype=dtype)
-    assert not np.isfinite(np.diag(expm(jnp.asarray(2000, dtype) * eye))).any()
+    assert not np.isfinite(np.diag(compiled(jnp.asarray(2000, dtype) * eye))).any()
     rotation = jnp.asarray([[0, 1], [-1, 0]], dtype)
     digits = 2.0 ** np.finfo(dtype).nmant
     theta = _SCHEMES[np.dtype(dtype).name].theta
-    assert np.isfinite(expm(jnp.asarray(0.99 * theta * digits, dtype) * rotation)).all()
-    assert np.isnan(expm(jnp.asarray(1.01 * theta * digits, dtype) * rotation)).all()
+    assert np.isfinite(compiled(jnp.asarray(0.99 * theta * digits, dtype) * rotation)).all()
+    assert np.isnan(compiled(jnp.asarray(1.01 * theta * digits, dtype) * rotation)).all()
     largest = jnp.asarray(np.finfo(dtype).max / 8, dtype)
-    assert np.isnan(expm(largest * rotation)).all()
+    assert np.isnan(compiled(largest * rotation)).all()
 
 
 def conditions(f, *args):
@@ -247,7 +258,7 @@ def test_branches_stay_branches_in_a_batch():
         assert alone > 0
         assert conditions(jax.vmap(f), a) == alone
         assert conditions(jax.vmap(jax.vmap(f)), a[None]) == alone
-    # Only the last map has a batched condition to offer; the outer one knows nothing of it.
+    # A map over something else leaves the matrix, and so its condition, unbatched.
     assert conditions(jax.vmap(lambda _, x: expm(x), in_axes=(0, None)), a, a[0]) > 0
 
 
@@ -305,7 +316,7 @@ def test_second_derivatives(member):
 
 
 def test_third_derivative():
-    # d³/dx³ exp(x·J) = −J·exp(x·J) for a rotation J.
+    # d³/dx³ exp(x·J) = -J·exp(x·J) for a rotation J.
     rotation = jnp.asarray([[0.0, -1.0], [1.0, 0.0]])
 
     def sine(x):
@@ -364,6 +375,7 @@ def test_through_a_scan_with_checkpoints():
 
 
 @pytest.mark.parametrize("shape", [(), (3,), (2, 3), (2, 3, 3)])
+@pytest.mark.usefixtures("no_shape_hook")
 def test_refuses_what_is_not_a_square_matrix(shape):
     # Unwrapped, since the suite's shape checks would answer first.
     with pytest.raises(ValueError, match=r"`a` must be a square matrix.*got shape"):
@@ -371,6 +383,7 @@ def test_refuses_what_is_not_a_square_matrix(shape):
 
 
 @pytest.mark.parametrize("dtype", [jnp.int32, jnp.bool_, jnp.float16, jnp.bfloat16])
+@pytest.mark.usefixtures("no_shape_hook")
 def test_refuses_other_dtypes(dtype):
     with pytest.raises(TypeError, match=rf"`a` must have dtype .*got {jnp.dtype(dtype).name}"):
         inspect.unwrap(expm)(jnp.zeros((2, 2), dtype))

@@ -1,0 +1,224 @@
+"""Time of one CF4 step of the rigid body against diffrax and against C written by hand.
+
+Run as `python benchmarks/rigid_body.py`. All programs take turns in one run, so that the ratios
+mean something on a busy machine. Without a C compiler the ratios are to diffrax's Tsit5.
+"""
+
+import argparse
+import ctypes
+import shutil
+import statistics
+import subprocess
+import tempfile
+import time
+from collections.abc import Callable
+from pathlib import Path
+
+import diffrax
+import jax
+import jax.numpy as jnp
+import numpy as np
+from rich.console import Console
+from rich.table import Table
+
+import cfjax
+from cfjax.scenes import rigid_body
+
+STEP = 0.1
+STEPS = 20_000
+BATCH = 10_000
+BATCH_STEPS = 50
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(description=__doc__)
+    parser.add_argument("--rounds", type=int, default=15, help="turns of every program")
+    rounds = parser.parse_args().rounds
+    jax.config.update("jax_enable_x64", True)
+
+    single, batch = _single_programs(), _batch_programs()
+    with tempfile.TemporaryDirectory() as folder:
+        library = _compile_c(Path(folder))
+        if library is not None:
+            single = {"C, libm, one system": _c_single(library), **single}
+            batch = {"C, vectors of eight": _c_batch(library), **batch}
+        console = Console()
+        console.print(f"{jax.devices()[0].device_kind}, jax {jax.__version__}, {rounds} rounds")
+        console.print(_table("One system", _take_turns(single, rounds), STEPS))
+        work = BATCH * BATCH_STEPS
+        console.print(_table(f"{BATCH} systems", _take_turns(batch, rounds), work))
+    console.print(_compile_times())
+
+
+def _term() -> cfjax.LieTerm:
+    return cfjax.LieTerm(rigid_body.field)
+
+
+def _ode(t, y, inertia):
+    return jnp.cross(y, y / inertia)
+
+
+def _solve(term, solver, y0, inertia, num_steps):
+    """diffrax's loop; `max_steps=None` is its fastest, as it keeps nothing for a gradient."""
+    t1 = num_steps * STEP
+    return diffrax.diffeqsolve(term, solver, 0.0, t1, STEP, y0, inertia, max_steps=None).ys
+
+
+def _integrate(y0, inertia, num_steps):
+    t1 = num_steps * STEP
+    return cfjax.integrate(_term(), cfjax.CF4(), 0.0, t1, y0, inertia, num_steps=num_steps).ys
+
+
+def _initial(batch: int | None = None):
+    inertia = jnp.asarray(rigid_body.inertia)
+    if batch is None:
+        return jnp.asarray(rigid_body.y0), inertia
+    y0 = np.random.default_rng(0).normal(size=(batch, 3))
+    return jnp.asarray(y0 / np.linalg.norm(y0, axis=1, keepdims=True)), inertia
+
+
+def _single_programs() -> dict[str, Callable[[], object]]:
+    ode = diffrax.ODETerm(_ode)
+    y0, inertia = _initial()
+    programs = {
+        "cfjax.integrate, CF4": lambda y, i: _integrate(y, i, STEPS),
+        "diffrax, CF4": lambda y, i: _solve(_term(), cfjax.CF4(), y, i, STEPS),
+        "diffrax, Tsit5": lambda y, i: _solve(ode, diffrax.Tsit5(), y, i, STEPS),
+        "diffrax, Dopri5": lambda y, i: _solve(ode, diffrax.Dopri5(), y, i, STEPS),
+    }
+    return {name: _compiled(program, y0, inertia) for name, program in programs.items()}
+
+
+def _batch_programs() -> dict[str, Callable[[], object]]:
+    ode = diffrax.ODETerm(_ode)
+    n = BATCH_STEPS
+    y0, inertia = _initial(BATCH)
+
+    def chunks(y, i):
+        return jax.lax.map(lambda y: _integrate(y, i, n), y, batch_size=1000)
+
+    def vmap(program):
+        return jax.vmap(program, in_axes=(0, None))
+
+    programs = {
+        "cfjax.integrate, CF4": vmap(lambda y, i: _integrate(y, i, n)),
+        "cfjax.integrate, CF4, chunks of 1000": chunks,
+        "diffrax, CF4": vmap(lambda y, i: _solve(_term(), cfjax.CF4(), y, i, n)),
+        "diffrax, Tsit5": vmap(lambda y, i: _solve(ode, diffrax.Tsit5(), y, i, n)),
+        "diffrax, Dopri5": vmap(lambda y, i: _solve(ode, diffrax.Dopri5(), y, i, n)),
+    }
+    return {name: _compiled(program, y0, inertia) for name, program in programs.items()}
+
+
+def _compiled(program, *args) -> Callable[[], object]:
+    executable = jax.jit(program).lower(*args).compile()
+    return lambda: jax.block_until_ready(executable(*args))
+
+
+def _compile_c(folder: Path) -> ctypes.CDLL | None:
+    compiler = shutil.which("cc")
+    if compiler is None:
+        return None
+    source, target = Path(__file__).with_suffix(".c"), folder / "rigid_body.so"
+    flags = ["-O3", "-march=native", "-shared", "-fPIC"]
+    subprocess.run([compiler, *flags, str(source), "-o", str(target), "-lm"], check=True)
+    library = ctypes.CDLL(str(target))
+    pointer = ctypes.POINTER(ctypes.c_double)
+    library.cf4.argtypes = [pointer, pointer, ctypes.c_double, ctypes.c_long]
+    library.cf4_batch.argtypes = [pointer, ctypes.c_long, *library.cf4.argtypes[1:]]
+    return library
+
+
+def _pointer(array: np.ndarray):
+    return array.ctypes.data_as(ctypes.POINTER(ctypes.c_double))
+
+
+def _c_single(library: ctypes.CDLL) -> Callable[[], object]:
+    y0, inertia = map(np.array, _initial())
+
+    def run():
+        y = y0.copy()
+        library.cf4(_pointer(y), _pointer(inertia), STEP, STEPS)
+        return y
+
+    _check(run(), _integrate(*_initial(), STEPS)[0])
+    return run
+
+
+def _c_batch(library: ctypes.CDLL) -> Callable[[], object]:
+    y0, inertia = map(np.array, _initial(BATCH))
+
+    def run():
+        y = y0.copy()
+        library.cf4_batch(_pointer(y), BATCH, _pointer(inertia), STEP, BATCH_STEPS)
+        return y
+
+    some = jnp.asarray(y0[:3])
+    _check(run()[:3], jax.vmap(lambda y: _integrate(y, inertia, BATCH_STEPS)[0])(some))
+    return run
+
+
+def _check(c, ours) -> None:
+    # Both make the same steps; what differs is rounding, which the flow lets grow with time.
+    if not np.allclose(c, ours, atol=1e-9, rtol=0):
+        raise RuntimeError(f"C and cfjax disagree: {c} and {ours}.")
+
+
+def _take_turns(programs: dict[str, Callable[[], object]], rounds: int) -> dict[str, list[float]]:
+    times: dict[str, list[float]] = {name: [] for name in programs}
+    for program in programs.values():
+        program()  # warm-up
+    for _ in range(rounds):
+        for name, program in programs.items():
+            start = time.perf_counter()
+            program()
+            times[name].append(time.perf_counter() - start)
+    return times
+
+
+def _table(title: str, times: dict[str, list[float]], steps: int) -> Table:
+    """Ratios are taken round by round to the first program, or to Tsit5 if that is not C."""
+    first = next(iter(times))
+    base = first if first.startswith("C") else "diffrax, Tsit5"
+    table = Table(title=title, title_justify="left")
+    table.add_column("program")
+    table.add_column("ns a step", justify="right")
+    table.add_column(f"over {base}", justify="right")
+    table.add_column("middle half", justify="right")
+    for name, values in times.items():
+        ratios = [a / b for a, b in zip(values, times[base], strict=True)]
+        low, middle, high = statistics.quantiles(ratios, n=4)
+        nanoseconds = 1e9 * statistics.median(values) / steps
+        table.add_row(name, f"{nanoseconds:.1f}", f"{middle:.2f}", f"{low:.2f} to {high:.2f}")
+    return table
+
+
+def _compile_times() -> Table:
+    y0, inertia = _initial()
+    ode = diffrax.ODETerm(_ode)
+    programs = {
+        "cfjax.integrate, CF4": lambda y, i: _integrate(y, i, 100),
+        "cfjax.integrate, CG5 (9 stages, 43 flows)": lambda y, i: (
+            cfjax.integrate(_term(), cfjax.CG5(), 0.0, 1.0, y, i, num_steps=100).ys
+        ),
+        "diffrax, CF4": lambda y, i: _solve(_term(), cfjax.CF4(), y, i, 100),
+        "diffrax, Tsit5": lambda y, i: _solve(ode, diffrax.Tsit5(), y, i, 100),
+    }
+    table = Table(title="Trace and compile one solve", title_justify="left")
+    table.add_column("program")
+    table.add_column("seconds, first", justify="right")
+    table.add_column("again, median of 5", justify="right")
+    for name, program in programs.items():
+        times = []
+        for _ in range(6):
+            # A new function each time, or jax would remember the old program.
+            fresh = jax.jit(lambda y, i, program=program: program(y, i))
+            start = time.perf_counter()
+            fresh.lower(y0, inertia).compile()
+            times.append(time.perf_counter() - start)
+        table.add_row(name, f"{times[0]:.2f}", f"{statistics.median(times[1:]):.2f}")
+    return table
+
+
+if __name__ == "__main__":
+    main()

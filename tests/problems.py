@@ -1,0 +1,192 @@
+"""Problems and small tools that several test files share. No answer here comes from cfjax."""
+
+from collections.abc import Callable, Sequence
+from typing import Any, cast
+
+import diffrax
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import jax.tree_util as jtu
+import numpy as np
+from jax import lax
+from scipy.integrate import solve_ivp
+
+import cfjax
+
+# Rigid body: y is the angular momentum, args the three moments of inertia.
+
+INERTIA = np.array([1.0, 2.0, 3.5])
+MOMENTUM = np.array([0.48, 0.6, 0.64])
+
+
+def rigid_body(t, y, args):
+    del t
+    return cfjax.Rotation(-y / args)
+
+
+def driven_body(t, y, args):
+    """The rigid body with a turning torque: depends on state and time."""
+    drive = jnp.stack([jnp.sin(2 * t), jnp.cos(t), t])
+    return cfjax.Rotation(drive - y / args)
+
+
+def driven_body_ode(t, y, args):
+    """The same field as a plain ordinary differential equation, in NumPy."""
+    return np.cross(np.array([np.sin(2 * t), np.cos(t), t]) - y / args, y)
+
+
+# Matrices: y' = A(t, y) y or y A(t, y), with A skew, so y stays orthogonal.
+
+_RNG = np.random.default_rng(20)
+GENERATORS = _RNG.standard_normal((4, 4, 4))
+ORTHOGONAL = np.linalg.qr(_RNG.standard_normal((4, 4)))[0]
+
+
+def generator(xp: Any, t, y, args):
+    """A skew matrix that depends on time and state, and commutes with itself at no two times.
+
+    `xp` is NumPy for reference answers and `jax.numpy` for cfjax.
+    """
+    g = args
+    a = xp.cos(t) * g[0] + xp.sin(2 * t) * g[1] + g[2] @ y @ g[3] / 2
+    return (a - a.T) / 2
+
+
+def left_matrix(t, y, args):
+    return cfjax.LeftMatrix(generator(jnp, t, y, args))
+
+
+def right_matrix(t, y, args):
+    return cfjax.RightMatrix(generator(jnp, t, y, args))
+
+
+# A product of manifolds with every kind of part: an attitude, a momentum and a position.
+
+
+def body_in_flight(t, y, args):
+    """A driven rigid body that moves along its own first axis."""
+    inertia, drag = args
+    spin = y["momentum"] / inertia
+    push = jnp.stack([jnp.cos(2 * t), jnp.sin(t), jnp.ones_like(t)])
+    return {
+        "attitude": cfjax.Rotation(spin),
+        "momentum": cfjax.Rotation(push - spin),
+        "position": y["attitude"][:, 0] - drag * y["position"],
+    }
+
+
+def body_in_flight_ode(t, y, args):
+    inertia, drag = args
+    attitude, momentum, position = y[:9].reshape(3, 3), y[9:12], y[12:]
+    spin = momentum / inertia
+    push = np.array([np.cos(2 * t), np.sin(t), 1.0])
+    return np.concatenate(
+        [
+            np.cross(spin, attitude.T).T.ravel(),
+            np.cross(push - spin, momentum),
+            attitude[:, 0] - drag * position,
+        ]
+    )
+
+
+FLIGHT_START = {
+    "attitude": np.eye(3),
+    "momentum": MOMENTUM,
+    "position": np.array([0.1, -0.2, 0.3]),
+}
+FLIGHT_ARGS = (INERTIA, 0.3)
+
+
+def flat(y: Any) -> np.ndarray:
+    """All entries of a state as one vector, in the order of its structure."""
+    return np.concatenate([np.ravel(leaf) for leaf in jtu.tree_leaves(y)])
+
+
+def arrays(tree: Any) -> Any:
+    """The same pytree with JAX arrays, so that new values never trace again."""
+    return jtu.tree_map(jnp.asarray, tree)
+
+
+# Reference answers: DOP853 in the linear space, at the tightest tolerance SciPy takes.
+# The right sides are smooth with derivatives of order 1, so what it leaves is about 1e-13.
+REFERENCE_ERROR = 1e-12
+
+
+def reference(ode: Callable[[float, np.ndarray], np.ndarray], t0, t1, y0) -> np.ndarray:
+    answer = solve_ivp(ode, (t0, t1), y0, method="DOP853", rtol=2.3e-14, atol=1e-15)
+    assert answer.success
+    return answer.y[:, -1]
+
+
+# A loop of steps that knows nothing of cfjax.integrate or diffrax.diffeqsolve.
+
+
+@eqx.filter_jit
+def many_steps(field, solver, t0, t1, y0, args, num_steps, ignore_stage_times=False):
+    """The end of `num_steps` equal steps; their number is traced, so one program serves all.
+
+    `ignore_stage_times` makes the mistake of solvers that evaluate every stage at the start of
+    the step.
+    """
+    h = (t1 - t0) / num_steps
+
+    def step(n, y):
+        start, end = t0 + n * h, t0 + (n + 1) * h
+
+        def mistaken(t, y, args):
+            del t
+            return field(start, y, args)
+
+        term = cfjax.LieTerm(mistaken if ignore_stage_times else field)
+        return solver.step(term, start, end, y, args, None, made_jump=False)[0]
+
+    return lax.fori_loop(0, num_steps, step, y0)
+
+
+def errors(field, solver, t1, y0, args, answer, steps: Sequence[int], **kwargs) -> np.ndarray:
+    """Distances of the end points from `answer`, for each number of steps from t = 0 to `t1`."""
+    y0, args = arrays(y0), arrays(args)
+    ends = [
+        many_steps(
+            field, solver, jnp.asarray(0.0), jnp.asarray(t1), y0, args, jnp.asarray(n), **kwargs
+        )
+        for n in steps
+    ]
+    return np.array([np.linalg.norm(flat(end) - answer) for end in ends])
+
+
+def slope(steps: Sequence[int], errors: np.ndarray) -> float:
+    """The observed order: the slope of the regression line of log error over log step size."""
+    return -float(np.polyfit(np.log(steps), np.log(errors), 1)[0])
+
+
+# Derivatives.
+
+
+def central_difference(fun: Callable[[Any], Any], x: Any, direction: Any, step: float) -> Any:
+    """Of order 4: error of about step^4 (fifth derivative) / 30 and 1.5 rounding / step."""
+    f = [
+        fun(jtu.tree_map(lambda a, d, k=k: a + k * step * d, x, direction)) for k in (-2, -1, 1, 2)
+    ]
+    return jtu.tree_map(lambda a, b, c, d: ((a - d) - 8 * (b - c)) / (12 * step), *f)
+
+
+def inner(a: Any, b: Any) -> jax.Array:
+    """The pairing of two pytrees of real arrays, which is what a gradient is defined by."""
+    return cast(jax.Array, sum(jnp.vdot(x, y) for x, y in _pairs(a, b)))
+
+
+def _pairs(a, b):
+    return zip(jtu.tree_leaves(a), jtu.tree_leaves(b), strict=True)
+
+
+def random_like(tree: Any, seed: int) -> Any:
+    """A fixed random direction, shaped like `tree`."""
+    rng = np.random.default_rng(seed)
+    return jtu.tree_map(lambda x: jnp.asarray(rng.standard_normal(jnp.shape(x))), tree)
+
+
+def lie_methods() -> dict[str, diffrax.AbstractSolver]:
+    """One method of each kind, for tests that are not about the coefficients."""
+    return {"CF4": cfjax.CF4(), "RKMK4": cfjax.RKMK4(), "CG3": cfjax.CG3()}

@@ -1,0 +1,389 @@
+"""Munthe-Kaas methods: order, brackets, what they refuse, and that they never trace twice."""
+
+from typing import Any
+
+import cfjax
+import diffrax
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+import problems
+import pytest
+import scipy.linalg
+
+METHODS: dict[str, Any] = {
+    "RKMK3": cfjax.RKMK3(),
+    "RKMK4": cfjax.RKMK4(),
+    "Heun": cfjax.RKMK(diffrax.Heun.tableau),
+    "Bosh3": cfjax.RKMK(diffrax.Bosh3.tableau),
+    "Dopri5": cfjax.RKMK(diffrax.Dopri5.tableau),
+    "Tsit5": cfjax.RKMK(diffrax.Tsit5.tableau),
+}
+ORDERS = {"RKMK3": 3, "RKMK4": 4, "Heun": 2, "Bosh3": 3, "Dopri5": 5, "Tsit5": 5}
+names = pytest.mark.parametrize("name", METHODS)
+
+# As in test_commutator_free.py. Steps down to 1/128 leave 5e-11 for order 5, 50 times the error
+# of the reference.
+STEPS = (16, 32, 64, 128)
+TOLERANCE = 0.15
+
+
+# Order
+
+
+def observed_order(problem, solver, **kwargs) -> float:
+    field, y0, args, answer = problem
+    found = problems.errors(field, solver, 1.0, y0, args, answer, STEPS, **kwargs)
+    assert found.min() > 20 * problems.REFERENCE_ERROR
+    assert found.max() < 1
+    return problems.slope(STEPS, found)
+
+
+@names
+@pytest.mark.parametrize("side", ["left", "right"])
+def test_order_on_matrices(matrix_problems, side, name):
+    solver = METHODS[name]
+    assert solver.order(None) == ORDERS[name]
+    assert abs(observed_order(matrix_problems[side], solver) - ORDERS[name]) < TOLERANCE
+
+
+@pytest.mark.parametrize("name", ["RKMK3", "RKMK4", "Bosh3"])
+def test_order_on_a_product_of_manifolds(flight_problem, name):
+    assert abs(observed_order(flight_problem, METHODS[name]) - ORDERS[name]) < TOLERANCE
+
+
+class WrongSide(cfjax.LeftMatrix):
+    """A matrix that acts from the left with the bracket of one that acts from the right."""
+
+    def bracket(self, other):
+        return type(self)(-(cfjax.LeftMatrix.bracket(self, other).a))
+
+
+@pytest.mark.parametrize("name", ["RKMK3", "RKMK4", "Bosh3"])
+def test_a_mistaken_sign_of_the_bracket_loses_the_order(matrix_problems, name):
+    """The problem sees it: with the other sign every method here is of order 2."""
+    _, y0, args, answer = matrix_problems["left"]
+
+    def field(t, y, args):
+        return WrongSide(problems.generator(jnp, t, y, args))
+
+    order = observed_order((field, y0, args, answer), METHODS[name])
+    assert abs(order - 2) < TOLERANCE
+
+
+@pytest.mark.parametrize("name", ["RKMK4", "Tsit5"])
+def test_a_mistaken_stage_time_loses_the_order(matrix_problems, name):
+    order = observed_order(matrix_problems["left"], METHODS[name], ignore_stage_times=True)
+    assert abs(order - 1) < TOLERANCE
+
+
+@pytest.mark.parametrize(
+    "tableau, order",
+    [
+        (diffrax.Midpoint.tableau, 2),
+        (diffrax.Ralston.tableau, 2),
+        (diffrax.Heun.tableau, 2),
+        (diffrax.Dopri8.tableau, 8),
+    ],
+)
+def test_the_order_is_the_tableaus(tableau, order):
+    assert cfjax.RKMK(tableau).order(None) == order
+
+
+# One step against formulas written by hand, with SciPy's exponential
+
+
+def one_step(solver, field, y0, t0=0.3, h=0.25, args=None, term=cfjax.LieTerm):
+    @jax.jit
+    def step(t0, t1, y0, args):
+        return solver.step(term(field), t0, t1, y0, args, None, made_jump=False)[0]
+
+    return step(jnp.asarray(t0), jnp.asarray(t0 + h), problems.arrays(y0), problems.arrays(args))
+
+
+def commutator(a, b):
+    return a @ b - b @ a
+
+
+def by_hand(name, f, t, y, h):
+    """The increment v of the step exp(v) y; `f(t, y)` is a matrix."""
+
+    def at(c, u):
+        return h * f(t + c * h, scipy.linalg.expm(u) @ y)
+
+    if name in ("RKMK3", "RKMK4"):
+        k1 = at(0, 0 * y)
+        k2 = at(1 / 2, k1 / 2)
+        q1, q2 = k1, k2 - k1
+        if name == "RKMK3":
+            k3 = at(1, -k1 + 2 * k2)
+            q3 = k3 - 2 * k2 + k1
+            return q1 + q2 + q3 / 6 - commutator(q1, q2) / 6
+        k3 = at(1 / 2, q1 / 2 + q2 / 2 - commutator(q1, q2) / 8)
+        q3 = k3 - k2
+        k4 = at(1, q1 + q2 + q3)
+        q4 = k4 - 2 * k2 + k1
+        linear = q1 + q2 + q3 / 3 + q4 / 6
+        return linear - commutator(q1, q2) / 6 - commutator(q1, q4) / 12
+
+    tableau = getattr(diffrax, name).tableau
+    order = ORDERS[name]
+    bernoulli = [1, -1 / 2, 1 / 6, 0]
+    stages = []
+    rows = [[], *tableau.a_lower]
+    for row in rows:
+        u = sum((a * k for a, k in zip(row, stages, strict=True)), start=0 * y)
+        c = sum(row)
+        term, k, factorial = at(c, u), 0 * y, 1
+        for j in range(order - 1):
+            factorial *= max(j, 1)
+            k = k + bernoulli[j] / factorial * term
+            term = commutator(u, term)
+        stages.append(k)
+    return sum(b * k for b, k in zip(tableau.b_sol, stages, strict=True))
+
+
+@names
+def test_one_step_is_the_published_formula(name):
+    y0, t0, h = problems.ORTHOGONAL, 0.3, 0.25
+
+    def f(t, y):
+        return problems.generator(np, t, y, problems.GENERATORS)
+
+    expected = scipy.linalg.expm(by_hand(name, f, t0, y0, h)) @ y0
+    found = one_step(METHODS[name], problems.left_matrix, y0, args=problems.GENERATORS)
+    # At most 7 stages of a few rounded products of size 4. The terms that a wrong coefficient
+    # would change are of order (h |A|)^5 / 720, or 1e-3.
+    np.testing.assert_allclose(found, expected, rtol=0, atol=2e-14)
+
+
+@names
+def test_one_step_from_the_right_is_the_transposed_one(name):
+    def transposed(t, x, args):
+        return cfjax.RightMatrix(problems.generator(jnp, t, x.T, args).T)
+
+    y0, args = problems.ORTHOGONAL, problems.GENERATORS
+    left = one_step(METHODS[name], problems.left_matrix, y0, args=args)
+    right = one_step(METHODS[name], transposed, y0.T, args=args)
+    # As above: both are one formula, evaluated in another order.
+    np.testing.assert_allclose(right, left.T, rtol=0, atol=2e-14)
+
+
+@names
+def test_rotations_agree_with_their_matrices(name):
+    def as_matrices(t, y, args):
+        x, y, z = problems.driven_body(t, y, args).omega
+        o = jnp.zeros_like(x)
+        rows = [[o, -z, y], [z, o, -x], [-y, x, o]]
+        return cfjax.LeftMatrix(jnp.stack([jnp.stack(row) for row in rows]))
+
+    y0, args = problems.MOMENTUM, problems.INERTIA
+    found = one_step(METHODS[name], problems.driven_body, y0, args=args)
+    expected = one_step(METHODS[name], as_matrices, y0, args=args)
+    np.testing.assert_allclose(found, expected, rtol=0, atol=1e-14)
+
+
+def classical(tableau, f, t, y, h):
+    stages = []
+    for row in [[], *tableau.a_lower]:
+        point = y + sum((a * k for a, k in zip(row, stages, strict=True)), start=0 * y)
+        stages.append(h * f(t + sum(row) * h, point))
+    return y + sum(b * k for b, k in zip(tableau.b_sol, stages, strict=True))
+
+
+@pytest.mark.parametrize("term", [cfjax.LieTerm, diffrax.ODETerm])
+@pytest.mark.parametrize("shape", [(3,), (9,), (2, 3)])
+@pytest.mark.parametrize("name", ["Heun", "Bosh3", "Dopri5", "Tsit5"])
+def test_in_a_linear_space_it_is_the_classical_method(name, shape, term):
+    def ode(xp, t, y):
+        return xp.sin(y * t) - y[::-1] ** 2 / 2 + xp.cos(t)
+
+    y0 = np.random.default_rng(2).standard_normal(shape)
+    found = one_step(METHODS[name], lambda t, y, args: ode(jnp, t, y), y0, term=term)
+    tableau = getattr(diffrax, name).tableau
+    expected = classical(tableau, lambda t, y: ode(np, t, y), 0.3, y0, 0.25)
+    # Coefficients up to 12 enlarge the rounding of about 7 stages of order 1.
+    np.testing.assert_allclose(found, expected, rtol=0, atol=100 * np.finfo(float).eps)
+
+
+@pytest.mark.parametrize("h", [0.0, 0.25, -1.0, 8.0])
+@names
+def test_a_constant_field_is_followed_exactly(name, h):
+    a = problems.GENERATORS[0] - problems.GENERATORS[0].T
+    found = one_step(METHODS[name], lambda t, y, args: cfjax.LeftMatrix(args), np.eye(4), h=h, args=a)
+    # Brackets of an element with its multiples vanish up to rounding: |h a|^2 eps, and up to two
+    # brackets inside each other. The norm of a is 5.3.
+    atol = 1e-14 * (1 + 6 * abs(h)) ** 3
+    np.testing.assert_allclose(found, scipy.linalg.expm(h * a), rtol=0, atol=atol)
+
+
+# The end of the step
+
+
+def inexact_end() -> tuple[float, float]:
+    """Times with t0 + (t1 - t0) above t1 in floating point, as most steps have somewhere."""
+    rng = np.random.default_rng(0)
+    while True:
+        t0, t1 = np.sort(rng.uniform(size=2))
+        if t0 + (t1 - t0) > t1:
+            return float(t0), float(t1)
+
+
+@pytest.mark.parametrize("name", ["RKMK4", "Heun", "Dopri5", "Tsit5", "Dopri8"])
+def test_the_last_stage_is_at_the_end_exactly(name):
+    """A field that jumps at the end of the step must not be evaluated behind the jump.
+
+    The stage times of these methods are at most 1, with several stages at 1. The rows of a
+    tableau in floating point sum to it up to rounding only.
+    """
+    solver = METHODS[name] if name in METHODS else cfjax.RKMK(getattr(diffrax, name).tableau)
+    for t0, t1 in [(0.0, 1.0), inexact_end()]:
+
+        def field(t, y, args, t1=t1):
+            return jnp.where(t > t1, jnp.nan, y)
+
+        time = jnp.asarray(t0), jnp.asarray(t1)
+        y1 = solver.step(cfjax.LieTerm(field), *time, jnp.ones(2), None, None, False)[0]
+        assert np.all(np.isfinite(y1))
+
+
+# Cost
+
+
+class Counting(cfjax.AbstractAlgebraElement):
+    """A translation that counts its flows and brackets."""
+
+    v: jax.Array
+    counts: dict = eqx.field(static=True)
+
+    def flow(self, point):
+        self.counts["flows"] += 1
+        return point + self.v
+
+    def tangent(self, point):
+        return self.v
+
+    def bracket(self, other):
+        self.counts["brackets"] += 1
+        return type(self)(jnp.zeros_like(self.v), self.counts)
+
+
+@pytest.mark.parametrize(
+    "name, evaluations, flows, brackets",
+    [("RKMK3", 3, 3, 1), ("RKMK4", 4, 4, 2), ("Heun", 2, 2, 0), ("Bosh3", 3, 3, 2)],
+)
+@pytest.mark.parametrize("shape", [(3,), (4, 4)])
+def test_a_step_costs_what_its_docstring_says(name, evaluations, flows, brackets, shape):
+    counts = {"evaluations": 0, "flows": 0, "brackets": 0}
+
+    def field(t, y, args):
+        counts["evaluations"] += 1
+        return Counting(-y, counts)
+
+    def step(y):
+        time = jnp.asarray(0.0), jnp.asarray(0.1)
+        return METHODS[name].step(cfjax.LieTerm(field), *time, y, None, None, False)[0]
+
+    jax.eval_shape(step, jnp.ones(shape))
+    assert counts == {"evaluations": evaluations, "flows": flows, "brackets": brackets}
+
+
+@pytest.mark.parametrize("name", ["Dopri5", "Tsit5"])
+def test_a_method_of_order_five_keeps_within_its_brackets(name):
+    """`(s - 1)(q - 2)` at most, and no evaluation for a stage without weight."""
+    counts = {"evaluations": 0, "flows": 0, "brackets": 0}
+
+    def field(t, y, args):
+        counts["evaluations"] += 1
+        return Counting(-y, counts)
+
+    time = jnp.asarray(0.0), jnp.asarray(0.1)
+    METHODS[name].step(cfjax.LieTerm(field), *time, jnp.ones((4, 4)), None, None, False)
+    assert counts["evaluations"] == 6
+    assert counts["flows"] == 6
+    assert counts["brackets"] <= 5 * 3
+
+
+# Refusals
+
+
+class Shear(cfjax.AbstractFrozenField):
+    """A frozen field without a bracket."""
+
+    v: jax.Array
+
+    def flow(self, point):
+        return point + self.v
+
+    def tangent(self, point):
+        return self.v
+
+
+@names
+@pytest.mark.parametrize("nested", [False, True])
+def test_a_field_without_bracket_is_refused_by_name(name, nested):
+    def field(t, y, args):
+        return {"a": y["a"], "b": Shear(-y["b"])} if nested else Shear(-y)
+
+    y0 = {"a": jnp.ones(3), "b": jnp.ones(3)} if nested else jnp.ones(3)
+    term = cfjax.LieTerm(field)
+    with pytest.raises(TypeError, match=r"Shear has none.*commutator-free.*cfjax\.CF4\(\)"):
+        diffrax.diffeqsolve(term, METHODS[name], 0.0, 1.0, 0.1, y0)
+    # The method it recommends takes the field. y' = -y on the step (0, 1) by the classical method.
+    y1 = cfjax.integrate(term, cfjax.CF4(), 0.0, 1.0, y0, num_steps=1).ys
+    for leaf in jax.tree_util.tree_leaves(y1):
+        np.testing.assert_allclose(leaf, np.full((1, 3), 3 / 8), rtol=1e-15)
+
+
+@pytest.mark.parametrize("solver", [diffrax.Kvaerno3, diffrax.KenCarp4, diffrax.ImplicitEuler])
+def test_an_implicit_tableau_is_refused(solver):
+    tableau = solver.tableau
+    with pytest.raises((ValueError, TypeError), match="tableau must be"):
+        cfjax.RKMK(tableau)
+
+
+def test_an_implicit_tableau_is_a_wrong_value():
+    with pytest.raises(ValueError, match="tableau must be explicit"):
+        cfjax.RKMK(diffrax.Kvaerno3.tableau)
+
+
+@pytest.mark.parametrize(
+    "tableau", [None, 4, cfjax.CF4.tableau, diffrax.Dopri5(), diffrax.Dopri5, [[0.5]]]
+)
+def test_only_a_diffrax_tableau_makes_a_method(tableau):
+    with pytest.raises(TypeError, match=r"tableau must be a diffrax\.ButcherTableau"):
+        cfjax.RKMK(tableau)
+
+
+# Tracing
+
+
+def test_equal_tableaus_give_equal_solvers():
+    a, b = cfjax.RKMK(diffrax.Dopri5.tableau), cfjax.RKMK(diffrax.Dopri5.tableau)
+    assert a == b and hash(a) == hash(b)
+    assert a != cfjax.RKMK(diffrax.Tsit5.tableau)
+    assert jax.tree_util.tree_structure(a) == jax.tree_util.tree_structure(b)
+    assert hash(jax.tree_util.tree_structure(a)) == hash(jax.tree_util.tree_structure(b))
+    # Coefficients are no leaves, so no gradient or batch reaches them.
+    assert jax.tree_util.tree_leaves(a) == []
+
+
+def test_equal_solvers_do_not_trace_again():
+    traces = 0
+
+    def field(t, y, args):
+        nonlocal traces
+        traces += 1
+        return -y
+
+    term = cfjax.LieTerm(field)
+
+    def solve(solver, y):
+        cfjax.integrate(term, solver, 0.0, 1.0, jnp.asarray([y]), num_steps=2)
+        return traces
+
+    first = solve(cfjax.RKMK(diffrax.Dopri5.tableau), 1.0)
+    assert first > 0
+    assert solve(cfjax.RKMK(diffrax.Dopri5.tableau), 2.0) == first
+    assert solve(cfjax.RKMK(diffrax.Tsit5.tableau), 2.0) > first

@@ -1,0 +1,308 @@
+import os
+import subprocess
+import sys
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from jax import lax
+from matplotlib.backends.backend_agg import FigureCanvasAgg
+from rich.progress import Progress
+
+from cfjax import _paper
+from cfjax.__main__ import main
+from cfjax._flops import count_flops
+
+FILES = ["figure1.pdf", "figure1.png", "figure2.pdf", "figure2.png"]
+
+
+@pytest.fixture(scope="module")
+def trajectories():
+    methods = _paper.METHODS | _paper.series_in_full()
+    return {name: _paper.trajectory(method) for name, method in methods.items()}
+
+
+@pytest.fixture(scope="module")
+def work():
+    with Progress(disable=True) as progress:
+        return _paper.efficiencies((1000, 2000, 4000), 3, progress)
+
+
+# What the paper finds, and what it does not find here.
+
+
+def test_fourth_order_is_far_better_than_third(trajectories):
+    for quantity in ("error", "energy_error"):
+        last = {name: getattr(run, quantity)[-1] for name, run in trajectories.items()}
+        assert 100 * max(last["CF4"], last["RKMK4"]) < min(last["CF3"], last["RKMK3"])
+
+
+def test_cf4_and_rkmk4_are_close(trajectories, work):
+    # At h = 0.1 and t = 100 the factor is 2.03; at h = 0.05 and h = 0.025 it is 1.3 at most.
+    ratio = trajectories["RKMK4"].error[-1] / trajectories["CF4"].error[-1]
+    assert 1 < ratio < 2.1
+    ratios = work["RKMK4"].error[1:] / work["CF4"].error[1:]
+    assert np.all((ratios > 1 / 1.5) & (ratios < 1.5))
+
+
+def test_third_order_ranking_is_not_the_papers(trajectories):
+    # The paper has RKMK3 better than CF3 in energy. The captions and the table say this.
+    assert trajectories["CF3"].energy_error[-1] < trajectories["RKMK3"].energy_error[-1]
+    assert trajectories["CF3"].error[-1] < trajectories["RKMK3"].error[-1]
+
+
+def test_ranking_with_every_commutator_is_the_papers(trajectories):
+    last = {name: run.energy_error[-1] for name, run in trajectories.items()}
+    assert last["RKMK3, full series"] < last["CF3"]
+    last = {name: run.error[-1] for name, run in trajectories.items()}
+    assert 0.9 * last["CF4"] < last["RKMK4, full series"] < last["CF4"]
+
+
+def test_flops_of_a_step(work):
+    flops = {name: _paper.flops_of_step(method) for name, method in _paper.METHODS.items()}
+    assert flops["CF3"] < flops["RKMK3"] < flops["RKMK4"] < flops["CF4"] < 1.25 * flops["RKMK4"]
+    for name, cost in work.items():
+        np.testing.assert_array_equal(cost.flops, flops[name] * np.array([1000, 2000, 4000]))
+
+
+def test_efficiency_has_the_errors_of_the_trajectories(trajectories, work):
+    for name, cost in work.items():
+        np.testing.assert_allclose(cost.error[0], trajectories[name].error[-1], rtol=1e-9)
+        assert cost.seconds.shape == (3, 3)
+        assert np.all(cost.seconds > 0)
+
+
+# Figures and files.
+
+
+def test_text_in_figures_is_neither_cut_nor_covered(trajectories, work):
+    for figure in (_paper.figure_1(trajectories), _paper.figure_2(work)):
+        FigureCanvasAgg(figure).draw()
+        (caption,) = (text.get_window_extent() for text in figure.texts)
+        panels = [box for axes in figure.axes if (box := axes.get_tightbbox()) is not None]
+        assert len(panels) == 2
+        for box in (caption, *panels):
+            assert 0 <= box.x0 < box.x1 <= figure.bbox.width
+            assert 0 <= box.y0 < box.y1 <= figure.bbox.height
+        assert caption.y1 < min(box.y0 for box in panels)
+
+
+def check_files(output):
+    assert sorted(os.listdir(output)) == FILES
+    for name in FILES:
+        content = (output / name).read_bytes()
+        assert len(content) > 10_000
+        assert content.startswith(b"\x89PNG" if name.endswith("png") else b"%PDF")
+        if name.endswith("png"):
+            width, height = (int.from_bytes(content[i : i + 4], "big") for i in (16, 20))
+            assert width == 1400
+            assert 900 < height < 1600
+
+
+def test_a_failure_keeps_the_old_files(tmp_path, monkeypatch):
+    (tmp_path / "figure1.png").write_bytes(b"old")
+
+    def fail(method):
+        raise RuntimeError("no errors today")
+
+    monkeypatch.setattr(_paper, "trajectory", fail)
+    with pytest.raises(RuntimeError, match="no errors today"):
+        _paper.run(tmp_path)
+    assert os.listdir(tmp_path) == ["figure1.png"]
+    assert (tmp_path / "figure1.png").read_bytes() == b"old"
+
+
+# The command line.
+
+
+def command_line(*arguments, code="from cfjax.__main__ import main; raise SystemExit(main())"):
+    # Without the settings of this test suite, as a user has it.
+    return subprocess.run([sys.executable, "-c", code, *arguments], capture_output=True, text=True)
+
+
+def test_command_as_a_user_runs_it_and_a_second_run(tmp_path, capsys):
+    command = [sys.executable, "-m", "cfjax", "paper"]
+    done = subprocess.run(command, cwd=tmp_path, capture_output=True, text=True)
+    assert (done.returncode, done.stderr) == (0, "")
+    output = tmp_path / "figures"
+    check_files(output)
+    for name in FILES:
+        (output / name).write_bytes(b"old")
+    _paper.run(output, step_counts=(500, 1000), repeats=2)
+    check_files(output)
+    for printed in (done.stdout, capsys.readouterr().out):
+        for text in ("RKMK3", "RKMK4", "5.1e-04", "0.970252535114", "The paper finds"):
+            assert text in printed
+
+
+@pytest.mark.parametrize("extra", ["matplotlib", "rich"])
+def test_missing_extra(extra):
+    code = f"""
+import sys
+sys.modules["{extra}"] = None
+from cfjax.__main__ import main
+main(["paper"])
+"""
+    done = command_line(code=code)
+    assert done.returncode == 2
+    assert done.stderr == (
+        f"python -m cfjax paper: error: {extra} is missing: pip install cfjax[paper]\n"
+    )
+
+
+def test_no_command_prints_the_help(capsys):
+    assert main([]) == 0
+    assert "paper" in capsys.readouterr().out
+
+
+@pytest.mark.parametrize("arguments", [["--help"], ["paper", "--help"]])
+def test_help(arguments, capsys):
+    with pytest.raises(SystemExit) as exit_:
+        main(arguments)
+    assert exit_.value.code == 0
+    assert "usage: python -m cfjax" in capsys.readouterr().out
+
+
+def test_bad_command_has_status_2():
+    done = command_line("chess")
+    assert done.returncode == 2
+    assert done.stdout == ""
+    assert done.stderr.count("\n") == 1
+    assert "'chess'" in done.stderr
+
+
+@pytest.mark.parametrize(
+    "arguments", [["paper", "--output"], ["paper", "x"], ["paper", "--step=3"]]
+)
+def test_bad_arguments(arguments, capsys):
+    check_one_line_error(arguments, capsys)
+
+
+def test_output_that_is_a_file(tmp_path, capsys):
+    path = tmp_path / "file"
+    path.write_text("mine")
+    for output in (path, path / "folder"):
+        error = check_one_line_error(["paper", "--output", str(output)], capsys)
+        assert str(output) in error
+    assert path.read_text() == "mine"
+
+
+@pytest.mark.skipif(not hasattr(os, "geteuid") or os.geteuid() == 0, reason="root may write")
+def test_output_without_permission(tmp_path, capsys):
+    tmp_path.chmod(0o500)
+    error = check_one_line_error(["paper", "--output", str(tmp_path)], capsys)
+    assert "Permission denied" in error
+
+
+def check_one_line_error(arguments, capsys):
+    with pytest.raises(SystemExit) as exit_:
+        main(arguments)
+    out, error = capsys.readouterr()
+    assert exit_.value.code == 2
+    assert out == ""
+    assert error.startswith("python -m cfjax")
+    assert error.count("\n") == 1
+    return error
+
+
+# Counting flops.
+
+X = jnp.ones(10)
+SCALAR = jnp.ones(())
+
+
+def matrix(*shape):
+    return jax.ShapeDtypeStruct(shape, float)
+
+
+def horner(x):
+    return ((2.0 * x + 3.0) * x + 5.0) * x + 7.0
+
+
+def steps(x):
+    return lax.scan(lambda y, _: (2.0 * y + 1.0, None), x, length=5)[0]
+
+
+def either(x):
+    return lax.cond(x[0] > 0, jnp.sin, lambda x: x * x + 1.0, x)
+
+
+@jax.custom_jvp
+def own_derivative(x):
+    return x * 3.0
+
+
+own_derivative.defjvp(lambda primals, tangents: (own_derivative(*primals), tangents[0] * 3.0))
+
+
+@pytest.mark.parametrize(
+    "fun, arguments, flops",
+    [
+        (jnp.matmul, (matrix(3, 4), matrix(4, 5)), 2 * 3 * 4 * 5),
+        (jnp.matmul, (matrix(6, 3, 4), matrix(6, 4, 5)), 6 * 2 * 3 * 4 * 5),
+        (jnp.dot, (X, X), 20),
+        (jnp.cross, (matrix(3), matrix(3)), 9),
+        (horner, (X,), 60),
+        (steps, (SCALAR,), 10),
+        (lambda x: lax.fori_loop(0, 4, lambda i, y: jnp.sin(y) / 2.0, x), (X,), 80),
+        (either, (X,), 20),
+        (jnp.sum, (X,), 9),
+        (jnp.prod, (matrix(4, 5),), 19),
+        (lambda x: jnp.sum(x, axis=0), (matrix(4, 5),), 15),
+        (jnp.cumsum, (X,), 9),
+        (lambda x: x**5, (X,), 30),
+        (lambda x: x**8, (SCALAR,), 3),
+        (lambda x: x**-2, (SCALAR,), 2),
+        (lambda x: jnp.sqrt(x) + jnp.exp(x), (X,), 30),
+        (own_derivative, (X,), 10),
+        (jax.grad(lambda x: own_derivative(x)), (SCALAR,), 1),
+        (jax.checkpoint(horner), (X,), 60),
+        (jax.jit(horner), (X,), 60),
+        (lambda x: horner(x)[0], (X,), 60),
+    ],
+)
+def test_flops_of_known_programs(fun, arguments, flops):
+    assert count_flops(fun, *arguments) == flops
+
+
+def test_moves_signs_and_comparisons_are_free():
+    def fun(x):
+        y = jnp.where(x > 0, -x, jnp.maximum(x, 2.0))
+        y = jnp.concatenate([y[3:], jnp.round(abs(y[:3]))]).reshape(5, 2).T
+        return y, jnp.max(y), y.astype(jnp.float32)
+
+    assert count_flops(fun, X) == 0
+
+
+def test_integer_arithmetic_is_free():
+    assert count_flops(lambda n: n * n + 1, jnp.arange(3)) == 0
+
+
+def test_what_is_not_needed_is_not_counted():
+    def fun(x):
+        unused = jnp.sin(x) * 3.0
+        return x + 1.0, jax.jit(lambda a, b: (a, b * 2.0))(x, unused)[0]
+
+    assert count_flops(fun, X) == 10
+
+
+def test_what_is_computed_twice_counts_once():
+    def twice(x, y):
+        return jax.jit(horner)(x) + jax.jit(horner)(x), horner(x) * 2.0, horner(y)
+
+    assert count_flops(twice, X, X) == 60 + 10 + 10 + 60
+
+
+@pytest.mark.parametrize(
+    "fun, message",
+    [
+        (jnp.linalg.cholesky, "cholesky"),
+        (lax.lgamma, "lgamma"),
+        (lambda x: lax.complex(x, x), "complex"),
+        (lambda x: lax.while_loop(lambda y: y[0, 0] < 9.0, lambda y: y + 1.0, x), "while loop"),
+    ],
+)
+def test_what_has_no_rule_raises(fun, message):
+    with pytest.raises(NotImplementedError, match=message):
+        count_flops(fun, matrix(3, 3))
