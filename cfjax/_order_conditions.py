@@ -48,7 +48,8 @@ class _Rounded:
     __rmul__ = __mul__
 
 
-Word: TypeAlias = tuple["Word", ...]
+# Of words again. Written without recursion, which run-time type checkers cannot follow.
+Word: TypeAlias = tuple[Any, ...]
 Number: TypeAlias = Fraction | _Rounded
 Weights: TypeAlias = dict[Word, Number]
 # How far each weight of one order is off, and how far it may be.

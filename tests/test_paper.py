@@ -147,7 +147,7 @@ main(["paper"])
     done = command_line(code=code)
     assert done.returncode == 2
     assert done.stderr == (
-        f"python -m cfjax paper: error: {extra} is missing: pip install cfjax[paper]\n"
+        f"cfjax paper: error: {extra} is missing: pip install cfjax[paper]\n"
     )
 
 
@@ -161,7 +161,7 @@ def test_help(arguments, capsys):
     with pytest.raises(SystemExit) as exit_:
         main(arguments)
     assert exit_.value.code == 0
-    assert "usage: python -m cfjax" in capsys.readouterr().out
+    assert "usage: cfjax" in capsys.readouterr().out
 
 
 def test_bad_command_has_status_2():
@@ -201,7 +201,7 @@ def check_one_line_error(arguments, capsys):
     out, error = capsys.readouterr()
     assert exit_.value.code == 2
     assert out == ""
-    assert error.startswith("python -m cfjax")
+    assert error.startswith("cfjax")
     assert error.count("\n") == 1
     return error
 

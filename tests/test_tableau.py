@@ -229,6 +229,7 @@ def test_excluded_parameters_raise(family, alpha, shown, divisor):
 
 
 @pytest.mark.parametrize("family", [third_order_a, third_order_b])
+@pytest.mark.usefixtures("no_shape_hook")
 def test_other_bad_parameters_raise(family):
     with pytest.raises(ValueError, match="alpha must be finite, got nan"):
         family(float("nan"))
@@ -300,6 +301,7 @@ def test_bad_values_raise(alpha, beta, message):
         ([[], [[[1]]]], [[1]], r"alpha\[1\]\[0\]\[0\] must be an int, .*, got \[1\] of type list"),
     ],
 )
+@pytest.mark.usefixtures("no_shape_hook")
 def test_bad_types_raise(alpha, beta, message):
     with pytest.raises(TypeError, match=message):
         Tableau(alpha, beta)

@@ -114,7 +114,7 @@ class RKMK(AbstractMuntheKaas):
         stages: list[PyTree] = []
         for row in self.a:
             u = _combine_nonzero(row, stages) if any(row) else None
-            value = field(sum(row), u)
+            value = field(float(sum(row)), u)
             stages.append(value if u is None else _dexpinv(u, value, degree))
         return _combine_nonzero(self.b, stages)
 

@@ -1,0 +1,216 @@
+"""Frozen fields on pytrees, and classes a user writes."""
+
+from typing import ClassVar
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+import scipy.linalg
+
+import cfjax
+from cfjax import AbstractAlgebraElement, AbstractFrozenField, LeftMatrix, Rotation
+
+EPS = 2.0**-52
+W = np.array([0.3, -0.7, 1.1])
+V = np.array([1.0, 0.5, -2.0])
+
+
+def hat(w):
+    return jnp.array([[0, -w[2], w[1]], [w[2], 0, -w[0]], [-w[1], w[0], 0]])
+
+
+class Screw(AbstractAlgebraElement):
+    """A rigid motion of an attitude and a position together: SE(3) from the left."""
+
+    omega: jax.Array
+    velocity: jax.Array
+    acts_on_subtree: ClassVar[bool] = True
+
+    def flow(self, point):
+        top = jnp.concatenate([hat(self.omega), self.velocity[:, None]], axis=1)
+        e = jax.scipy.linalg.expm(jnp.concatenate([top, jnp.zeros((1, 4))]))
+        return dict(Q=e[:3, :3] @ point["Q"], x=e[:3, :3] @ point["x"] + e[:3, 3])
+
+    def tangent(self, point):
+        a = hat(self.omega)
+        return dict(Q=a @ point["Q"], x=a @ point["x"] + self.velocity)
+
+    def bracket(self, other):
+        return Screw(
+            jnp.cross(self.omega, other.omega),
+            jnp.cross(self.omega, other.velocity) - jnp.cross(other.omega, self.velocity),
+        )
+
+
+class Phases(AbstractFrozenField):
+    """Unit complex numbers that turn at one rate times a spectrum, which is structure."""
+
+    rate: jax.Array
+    spectrum: jax.Array
+
+    def flow(self, point):
+        return point * jnp.exp(self.exponent())
+
+    def tangent(self, point):
+        return point * self.exponent()
+
+    def exponent(self):
+        return 1j * (self.rate * self.spectrum).astype(complex)
+
+    @classmethod
+    def combine(cls, weights, fields):
+        rate = sum((w * f.rate for w, f in zip(weights[1:], fields[1:], strict=True)),
+                   start=weights[0] * fields[0].rate)
+        return cls(rate, fields[0].spectrum)
+
+
+@pytest.fixture
+def mixed():
+    """Fields and a point with every kind of part, nested."""
+    spectrum = np.array([1.0, 4.0, 9.0])
+
+    def field(s):
+        return {
+            "body": Screw(s * W, s * V),
+            "pair": (Rotation(s * V), jnp.asarray(s * W)),
+            "phase": [Phases(jnp.asarray(s * 0.4), jnp.asarray(spectrum))],
+        }
+
+    point = {
+        "body": dict(Q=jnp.eye(3), x=jnp.asarray(V)),
+        "pair": (jnp.asarray(W), jnp.asarray(V)),
+        "phase": [jnp.exp(1j * jnp.arange(3, dtype=complex))],
+    }
+    return field, point
+
+
+def test_arrays_are_translations():
+    point = {"a": jnp.arange(3.0), "b": (jnp.ones((2, 2)), jnp.asarray(1 + 2j))}
+    field = jax.tree.map(lambda x: 2 * x + 1, point)
+    for got, p, f in zip(*map(jax.tree.leaves, (cfjax.flow(field, point), point, field)),
+                         strict=True):
+        np.testing.assert_array_equal(got, p + f)
+    jax.tree.map(np.testing.assert_array_equal, cfjax.tangent(field, point), field)
+    zero = cfjax.bracket(field, point)
+    jax.tree.map(lambda z, p: np.testing.assert_array_equal(z, 0 * p), zero, point)
+    assert [z.dtype for z in jax.tree.leaves(zero)] == [p.dtype for p in jax.tree.leaves(point)]
+
+
+def test_mixed_pytree_flows_part_by_part(mixed):
+    field, point = mixed
+    end = cfjax.flow(field(1.0), point)
+    assert jax.tree.structure(end) == jax.tree.structure(point)
+    e = scipy.linalg.expm(np.block([[hat(W), V[:, None]], [np.zeros((1, 4))]]))
+    # Norms below 3 and exponentials of rotations: a few tens of units of rounding.
+    close = lambda a, b: np.testing.assert_allclose(a, b, rtol=0, atol=100 * EPS)  # noqa: E731
+    close(end["body"]["Q"], e[:3, :3])
+    close(end["body"]["x"], e[:3, :3] @ V + e[:3, 3])
+    close(end["pair"][0], scipy.linalg.expm(np.array(hat(V))) @ W)
+    np.testing.assert_array_equal(end["pair"][1], V + W)
+    close(end["phase"][0], np.exp(1j * (np.arange(3) + 0.4 * np.array([1, 4, 9]))))
+
+
+def test_tangent_is_the_velocity_of_the_flow(mixed):
+    field, point = mixed
+    want = jax.jvp(lambda t: cfjax.flow(field(t), point), (0.0,), (1.0,))[1]
+    got = cfjax.tangent(field(1.0), point)
+    assert jax.tree.structure(got) == jax.tree.structure(point)
+    jax.tree.map(lambda a, b: np.testing.assert_allclose(a, b, rtol=0, atol=40 * EPS), got, want)
+
+
+@pytest.mark.parametrize("traced", [False, True])
+def test_combine_is_linear_and_carries_structure(mixed, traced):
+    field, _ = mixed
+    fields = (field(1.0), field(-2.0), field(0.5))
+    combine = lambda *weights: cfjax.combine(weights, fields)  # noqa: E731
+    got = (jax.jit(combine) if traced else combine)(0.5, 0.25, -3.0)
+    want = field(0.5 - 0.5 - 1.5)
+    assert jax.tree.structure(got) == jax.tree.structure(want)
+    # The spectrum stays as it is, all else is a sum of three exact products.
+    jax.tree.map(lambda a, b: np.testing.assert_allclose(a, b, rtol=4 * EPS), got, want)
+    np.testing.assert_array_equal(got["phase"][0].spectrum, [1, 4, 9])
+
+
+def test_one_weight():
+    got = cfjax.combine((2.0,), (Rotation(W),))
+    assert isinstance(got, Rotation)
+    np.testing.assert_array_equal(got.omega, 2 * W)
+
+
+@pytest.mark.parametrize("weight", [0.5, jnp.asarray(0.5), np.float64(0.5)])
+@pytest.mark.parametrize("dtype", [np.float32, np.float64, np.complex64, np.complex128])
+def test_weights_take_the_precision_of_the_field(weight, dtype):
+    a = jnp.ones((3, 3), dtype)
+    for field in (a, LeftMatrix(a)):
+        got = cfjax.combine((weight, weight), (field, field))
+        (leaf,) = jax.tree.leaves(got)
+        assert leaf.dtype == dtype
+        np.testing.assert_array_equal(leaf, a)
+
+
+def test_translation_by_a_numpy_array():
+    got = cfjax.combine((0.5, 2.0), (np.ones(3), np.ones(3)))
+    np.testing.assert_array_equal(got, 2.5 * np.ones(3))
+
+
+def test_gradients_with_respect_to_weights_and_fields():
+    # combine is bilinear, so the derivatives are the other factor.
+    a, b = jnp.asarray(W), jnp.asarray(V)
+    loss = lambda w, fs: jnp.vdot(V, cfjax.combine(w, fs)[0].omega)  # noqa: E731
+    by_weights, by_fields = jax.grad(loss, argnums=(0, 1))(
+        (2.0, -3.0), ((Rotation(a),), (Rotation(b),))
+    )
+    np.testing.assert_allclose(by_weights, [V @ W, V @ V], rtol=4 * EPS)
+    np.testing.assert_allclose(by_fields[0][0].omega, 2 * V, rtol=4 * EPS)
+    np.testing.assert_allclose(by_fields[1][0].omega, -3 * V, rtol=4 * EPS)
+
+
+def test_bracket_of_mixed_pytrees():
+    a = {"r": Rotation(W), "s": (Screw(W, V), jnp.asarray(V))}
+    b = {"r": Rotation(V), "s": (Screw(V, -W), jnp.asarray(W))}
+    got = cfjax.bracket(a, b)
+    np.testing.assert_allclose(got["r"].omega, np.cross(W, V), rtol=0, atol=8 * EPS)
+    np.testing.assert_array_equal(got["s"][1], np.zeros(3))
+    lift = lambda w, v: np.block([[np.array(hat(w)), v[:, None]], [np.zeros((1, 4))]])  # noqa: E731
+    x, y = lift(W, V), lift(V, -W)
+    want = x @ y - y @ x
+    np.testing.assert_allclose(lift(got["s"][0].omega, np.asarray(got["s"][0].velocity)), want,
+                               rtol=0, atol=20 * EPS)
+
+
+def test_bracket_refuses_a_field_without_one():
+    phase = Phases(jnp.asarray(1.0), jnp.ones(3))
+    with pytest.raises(TypeError, match=r"Phases has none.*commutator-free.*CF4") as error:
+        cfjax.bracket((Rotation(W), phase), (Rotation(W), phase))
+    assert "Munthe-Kaas" in str(error.value)
+
+
+def test_structures_that_do_not_match():
+    with pytest.raises(ValueError):
+        cfjax.flow({"a": Rotation(W)}, {"b": jnp.asarray(W)})
+    with pytest.raises(ValueError):
+        cfjax.combine((1.0, 1.0), ((jnp.ones(2), jnp.ones(2)), (jnp.ones(2),)))
+
+
+def test_abstract_methods_are_required():
+    with pytest.raises(TypeError, match="abstract"):
+        AbstractFrozenField()  # pyright: ignore
+    with pytest.raises(TypeError, match="abstract"):
+        AbstractAlgebraElement()  # pyright: ignore
+
+
+def test_a_class_of_the_user_under_every_solver_kind():
+    """A constant field on SE(3): y(t) = exp(t xi) y0."""
+
+    def field(t, y, args):
+        return Screw(jnp.asarray(W), jnp.asarray(V))
+
+    start = dict(Q=jnp.eye(3), x=jnp.asarray(V))
+    e = scipy.linalg.expm(2 * np.block([[hat(W), V[:, None]], [np.zeros((1, 4))]]))
+    for solver in (cfjax.CF4(), cfjax.RKMK4()):
+        end = cfjax.integrate(cfjax.LieTerm(field), solver, 0.0, 2.0, start, num_steps=2)
+        # A constant field is solved exactly by every method here: rounding of two steps only.
+        ys = jax.tree.map(lambda y: y[-1], end.ys)
+        np.testing.assert_allclose(ys["Q"], e[:3, :3], rtol=0, atol=100 * EPS)
+        np.testing.assert_allclose(ys["x"], e[:3, :3] @ V + e[:3, 3], rtol=0, atol=400 * EPS)

@@ -1,0 +1,118 @@
+"""The public face of the package: names, docstrings, and what an import does not do."""
+
+import inspect
+import json
+import subprocess
+import sys
+
+import diffrax
+import pytest
+
+import cfjax
+
+PROMISED = [
+    "LieTerm",
+    "Rotation",
+    "LeftMatrix",
+    "RightMatrix",
+    "Tableau",
+    "CommutatorFree",
+    "LieEuler",
+    "CF2",
+    "CF3",
+    "CF4",
+    "CG3",
+    "CG4",
+    "CG5",
+    "RKMK3",
+    "RKMK4",
+    "RKMK",
+    "integrate",
+]
+SOLVERS = ["LieEuler", "CF2", "CF3", "CF4", "CG3", "CG4", "CG5", "RKMK3", "RKMK4"]
+PUBLIC = [
+    name
+    for name, value in vars(cfjax).items()
+    if not name.startswith("_") and not inspect.ismodule(value)
+]
+
+
+@pytest.mark.parametrize("name", PROMISED)
+def test_promised_names_exist(name):
+    assert name in PUBLIC
+
+
+@pytest.mark.parametrize("name", PUBLIC)
+def test_every_public_name_has_its_own_docstring(name):
+    value = getattr(cfjax, name)
+    # `__dict__`: a docstring that a class inherits says nothing of the class.
+    text = vars(value).get("__doc__") if inspect.isclass(value) else value.__doc__
+    assert text and text.strip()
+    # A dataclass without a docstring gets its own signature as one.
+    assert not text.startswith(f"{name}(")
+
+
+@pytest.mark.parametrize("name", PUBLIC)
+def test_public_methods_have_docstrings(name):
+    value = getattr(cfjax, name)
+    if inspect.isclass(value):
+        for attribute, member in vars(value).items():
+            if not attribute.startswith("_") and inspect.isfunction(member):
+                # `getdoc` takes it from the abstract class or from diffrax where it is overridden.
+                assert inspect.getdoc(getattr(value, attribute)), attribute
+
+
+def test_nothing_but_the_package_is_public():
+    for name in PUBLIC:
+        assert getattr(cfjax, name).__module__.startswith("cfjax"), name
+
+
+@pytest.mark.parametrize("name", SOLVERS)
+def test_solvers_are_hashable_values_of_diffrax(name):
+    cls = getattr(cfjax, name)
+    assert issubclass(cls, diffrax.AbstractSolver)
+    assert cls() == cls()
+    assert hash(cls()) == hash(cls())
+
+
+@pytest.fixture(scope="module")
+def fresh():
+    """What a fresh interpreter says after the import alone."""
+    program = """
+import json, os, sys, warnings
+warnings.simplefilter("error")
+for name in ("JAX_ENABLE_X64", "JAX_NUMPY_DTYPE_PROMOTION"):
+    os.environ.pop(name, None)
+import jax
+settings = {k: str(v) for k, v in jax.config.values.items()}
+import cfjax
+
+from jax._src import xla_bridge
+print(json.dumps({
+    "changed": [k for k, v in jax.config.values.items() if settings.get(k) != str(v)],
+    "x64": bool(jax.config.jax_enable_x64),
+    "backends": len(xla_bridge._backends),
+    "modules": [m for m in ("matplotlib", "rich", "pytest", "hypothesis")
+                if m in sys.modules],
+}))
+import numpy as np
+print(str(cfjax.Rotation(np.ones(3)).omega.dtype))
+"""
+    done = subprocess.run([sys.executable, "-c", program], capture_output=True, text=True)
+    assert done.returncode == 0, done.stderr
+    facts, dtype = done.stdout.splitlines()
+    return {**json.loads(facts), "dtype": dtype}
+
+
+def test_import_changes_no_setting(fresh):
+    assert fresh["x64"] is False
+    assert fresh["changed"] == []
+    assert fresh["dtype"] == "float32"
+
+
+def test_import_starts_no_backend(fresh):
+    assert fresh["backends"] == 0
+
+
+def test_import_loads_no_extra(fresh):
+    assert not {"matplotlib", "rich", "pytest", "hypothesis"} & set(fresh["modules"])

@@ -1,0 +1,249 @@
+"""`LieTerm`: what it refuses, what it costs, and how diffrax uses it."""
+
+import diffrax
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+import scipy.linalg
+
+import cfjax
+from cfjax import CF4, LeftMatrix, LieTerm, Rotation
+
+INERTIA = np.array([1.0, 2.0, 3.0])
+Y0 = np.array([0.6, -0.7, 0.4])
+
+
+def rigid_body(t, y, args):
+    del t
+    return Rotation(-y / args)
+
+
+def vf(value, y):
+    """What the term makes of a field that returns `value` at the state y."""
+    return LieTerm(lambda t, y, args: value).vf(0.0, y, None)
+
+
+class Doubling(cfjax.AbstractFrozenField):
+    """A field whose tangent can be made wrong in shape, dtype or by an error of its own."""
+
+    rate: jax.Array
+    fault: str = "none"
+
+    def flow(self, point):
+        return jnp.exp(self.rate) * point
+
+    def tangent(self, point):
+        if self.fault == "shape":
+            return self.rate * point[:1]
+        if self.fault == "dtype":
+            return (self.rate * point).astype(jnp.float32)
+        if self.fault == "structure":
+            return (point, point)
+        if self.fault == "branch" and point[0] > 0:
+            return point
+        return self.rate * point
+
+
+V3 = jnp.ones(3)
+F32 = jnp.ones(3, jnp.float32)
+PAIR = {"q": V3, "p": (V3, V3)}
+
+
+@pytest.mark.parametrize(
+    ("value", "y", "text"),
+    [
+        # Structure.
+        ({"q": V3}, PAIR, "prefix"),
+        ({"q": V3, "r": (V3, V3)}, PAIR, "prefix"),
+        ({"q": V3, "p": [V3, V3]}, PAIR, "prefix"),
+        ({"q": V3, "p": (V3, V3, V3)}, PAIR, "prefix"),
+        ({"q": V3, "p": None}, PAIR, "prefix"),
+        (None, V3, "prefix"),
+        ([1.0, 2.0, 3.0], V3, "prefix"),
+        # Translations.
+        ({"q": V3, "p": (V3, V3[:2])}, PAIR, r"y\['p'\]\[1\]"),
+        ({"q": V3[:, None], "p": (V3, V3)}, PAIR, r"y\['q'\]"),
+        ({"q": V3.astype(jnp.float32), "p": (V3, V3)}, PAIR, r"y\['q'\]"),
+        (V3, PAIR, "for y,"),
+        ({"q": V3, "p": V3}, PAIR, r"y\['p'\]"),
+        (V3, F32, "for y,"),
+        (V3.astype(complex), V3, "for y,"),
+        (jnp.zeros(()), V3, "for y,"),
+        (1.0, V3, "for y,"),
+        ("text", V3, "for y,"),
+        (jnp.array([True, False, True]), V3, "for y,"),
+        # Python and numpy scalars that are not of the state's kind.
+        (1j, jnp.asarray(1.0), "for y,"),
+        (True, jnp.asarray(1.0), "for y,"),
+        (np.float64(1.0), jnp.asarray(1.0, jnp.float32), "for y,"),
+        # States that do not move.
+        (jnp.arange(3), jnp.arange(3), "for y,"),
+        (1.0, jnp.arange(3), "for y,"),
+        (Rotation(V3), jnp.arange(3), "for y,"),
+        # Fields.
+        (Rotation(V3), jnp.ones(4), "for y,"),
+        ({"q": Rotation(V3), "p": (V3, Rotation(V3))}, {"q": V3, "p": (V3, jnp.ones((2, 3)))},
+         r"y\['p'\]\[1\]"),
+        ({"q": Rotation(V3), "p": Rotation(V3)}, PAIR, r"y\['p'\]"),
+        (Rotation(V3), PAIR, "for y[.,]"),
+        (Rotation(V3), F32, "for y[.,]"),
+        (Rotation(V3), V3.astype(complex), "for y,"),
+        (LeftMatrix(jnp.eye(4)), V3, "for y,"),
+        (LeftMatrix(jnp.eye(3, dtype=complex)), V3, "for y[.,]"),
+        (Doubling(jnp.asarray(1.0), "shape"), V3, "for y[.,]"),
+        (Doubling(jnp.asarray(1.0), "dtype"), V3, "for y[.,]"),
+        (Doubling(jnp.asarray(1.0), "structure"), V3, "for y[.,]"),
+        # A tangent that branches on a value cannot be traced. Its error needs more than a text.
+        (Doubling(jnp.asarray(1.0), "branch"), V3, "for y[.,]"),
+    ],
+)
+def test_wrong_values_are_refused_with_their_place(value, y, text):
+    with pytest.raises((TypeError, ValueError), match=text):
+        vf(value, y)
+
+
+@pytest.mark.parametrize("solver", [CF4(), cfjax.RKMK4()])
+def test_wrong_values_are_refused_inside_diffrax(solver):
+    # A translation of shape () would broadcast, and one of shape (3, 3) is what ODETerm lets pass.
+    for value, y in ((jnp.ones(()), V3), (V3, jnp.eye(3))):
+        term = LieTerm(lambda t, y, args, value=value: value)
+        with pytest.raises(ValueError, match="translation"):
+            diffrax.diffeqsolve(term, solver, 0.0, 1.0, 0.5, y)
+
+
+@pytest.mark.parametrize("value", [1, 2.5])
+@pytest.mark.parametrize("dtype", [np.float32, np.float64, np.complex64])
+def test_python_scalars_take_the_dtype_of_a_scalar_state(value, dtype):
+    got = vf(value, jnp.asarray(1.0, dtype))
+    assert got.dtype == dtype
+    assert got == value
+    if dtype == np.complex64:
+        assert vf(1j, jnp.asarray(1.0, dtype)) == 1j
+
+
+def test_numpy_translation():
+    # A constant field is naturally written with numpy.
+    y = diffrax.diffeqsolve(
+        LieTerm(lambda t, y, args: np.array([1.0, 2.0, 3.0])), CF4(), 0.0, 1.0, 0.5, V3
+    ).ys
+    assert y is not None
+    # Two steps of 1/2: exact up to the rounding of the weights 1/6, 1/4 and 1/12.
+    np.testing.assert_allclose(y[-1], 1 + np.array([1.0, 2.0, 3.0]), rtol=1e-15)
+
+
+@pytest.mark.parametrize("name", ["rotation", "tree"])
+def test_the_checks_leave_nothing_in_the_program(name):
+    if name == "rotation":
+        field, y = rigid_body, jnp.asarray(Y0)
+        args = jnp.asarray(INERTIA)
+    else:
+        field = lambda t, y, args: {"a": (LeftMatrix(y["a"][1]), y["a"][1]), "b": 2 * y["b"]}  # noqa: E731
+        y, args = {"a": (jnp.ones((2, 2)), jnp.ones((2, 2))), "b": jnp.asarray(1.0)}, None
+    # A cached jit inside the tangent must not matter either: the texts are compared whole.
+    with_checks = jax.make_jaxpr(lambda y: LieTerm(field).vf(0.0, y, args))(y)
+    without = jax.make_jaxpr(lambda y: field(0.0, y, args))(y)
+    assert str(with_checks) == str(without)
+
+
+def test_prod_is_linear_in_the_control_and_keeps_float32():
+    term = LieTerm(rigid_body)
+    y = jnp.asarray(Y0, jnp.float32)
+    args = jnp.asarray(INERTIA, jnp.float32)
+    value = term.vf(0.0, y, args)
+    for control in (0.25, jnp.asarray(0.25), jnp.asarray(0.25, jnp.float32)):
+        got = term.prod(value, control)
+        assert got.omega.dtype == jnp.float32
+        np.testing.assert_array_equal(got.omega, 0.25 * value.omega)
+        velocity = term.vf_prod(0.0, y, args, control)
+        # omega x y in float32, a product and a difference: a few units of rounding.
+        want = 0.25 * np.cross(-Y0 / INERTIA, Y0)
+        np.testing.assert_allclose(velocity, want, rtol=0, atol=4e-7)
+    assert term.contr(1.0, 0.25) == -0.75
+
+
+def solve(term, solver, dt0, y0=Y0, args=INERTIA, t1=1.0, **kwargs):
+    y0, args = jax.tree.map(jnp.asarray, (y0, args))
+    ys = diffrax.diffeqsolve(term, solver, 0.0, t1, dt0, y0, args, max_steps=256, **kwargs).ys
+    return jax.tree.map(lambda y: y[-1], ys)
+
+
+def test_vf_prod_is_the_ambient_tangent():
+    """The midpoint rule of a linear space has its order 2, against an exact solution.
+
+    y' = w(t) x y with w(t) = (1 + t) w turns by |w| (t + t^2/2) about one axis.
+    """
+    w = np.array([0.5, -1.0, 1.0])
+    term = LieTerm(lambda t, y, args: Rotation((1 + t) * args))
+    hat = np.array([[0, -w[2], w[1]], [w[2], 0, -w[0]], [-w[1], w[0], 0]])
+    want = scipy.linalg.expm(1.5 * hat) @ Y0
+    errors = [
+        np.linalg.norm(solve(term, diffrax.Midpoint(), h, args=w) - want) for h in (0.05, 0.025)
+    ]
+    # The next term changes the slope by O(h).
+    assert np.log2(errors[0] / errors[1]) == pytest.approx(2, abs=0.15)
+    assert errors[1] > 1e-6
+
+
+@pytest.mark.parametrize(
+    "solver", [diffrax.Euler(), diffrax.Tsit5(), diffrax.Dopri5(), diffrax.ReversibleHeun()]
+)
+def test_solvers_of_linear_spaces_refuse_a_rotation(solver):
+    with pytest.raises((TypeError, ValueError)):
+        solve(LieTerm(rigid_body), solver, 0.1)
+
+
+def test_translations_are_an_ordinary_equation():
+    def ordinary(t, y, args):
+        return {"a": jnp.cross(-y["a"] / args, y["a"]), "b": -t * y["b"]}
+
+    y0 = {"a": Y0, "b": np.asarray(2.0)}
+    for solver in (diffrax.Tsit5(), diffrax.Euler(), diffrax.ReversibleHeun()):
+        got = solve(LieTerm(ordinary), solver, 0.25, y0)
+        want = solve(diffrax.ODETerm(ordinary), solver, 0.25, y0)
+        # The same operations, up to the order in which XLA fuses them.
+        jax.tree.map(lambda a, b: np.testing.assert_allclose(a, b, rtol=1e-14, atol=1e-14), got, want)
+
+
+def test_multi_term_is_the_sum():
+    drift = lambda t, y, args: Rotation(jnp.stack([t, y[0], y[1] * y[2]]))  # noqa: E731
+    total = lambda t, y, args: Rotation(rigid_body(t, y, args).omega + drift(t, y, args).omega)  # noqa: E731
+    terms = diffrax.MultiTerm(LieTerm(rigid_body), LieTerm(drift))
+    got, want = solve(terms, CF4(), 0.25), solve(LieTerm(total), CF4(), 0.25)
+    # Sums in another order: four steps of a few units of rounding.
+    np.testing.assert_allclose(got, want, rtol=0, atol=1e-14)
+    assert np.linalg.norm(got - solve(LieTerm(rigid_body), CF4(), 0.25)) > 0.01
+
+
+def test_backsolve_adjoint():
+    def loss(y0, args, adjoint):
+        y = solve(LieTerm(rigid_body), CF4(), 0.02, y0, args, adjoint=adjoint)
+        return jnp.vdot(np.array([1.0, -2.0, 0.5]), y)
+
+    gradient = jax.jit(jax.grad(loss, argnums=(0, 1)), static_argnums=2)
+    got = gradient(Y0, INERTIA, diffrax.BacksolveAdjoint(solver=diffrax.Tsit5()))
+    want = gradient(Y0, INERTIA, diffrax.RecursiveCheckpointAdjoint())
+    # One is the gradient of the solution, the other of the fourth-order approximation with
+    # h = 0.02: they differ by about h^4 = 1.6e-7 times an error constant of 0.02.
+    for a, b in zip(got, want, strict=True):
+        np.testing.assert_allclose(a, b, rtol=0, atol=2e-8)
+        assert np.linalg.norm(b) > 0.1
+
+
+def test_gradient_with_respect_to_arrays_of_the_field():
+    """A field that is a module: its arrays are parameters, here the matrix of y' = a y."""
+
+    class Linear(eqx.Module):
+        a: jax.Array
+
+        def __call__(self, t, y, args):
+            return LeftMatrix(self.a)
+
+    a = np.array([[0.1, -1.0], [0.8, -0.2]])
+    y0, direction = np.array([1.0, 2.0]), np.array([[0.5, 0.1], [-0.3, 1.0]])
+    loss = lambda a: jnp.sum(solve(LieTerm(Linear(a)), CF4(), 0.5, y0, None))  # noqa: E731
+    got = np.vdot(jax.grad(loss)(jnp.asarray(a)), direction)
+    # One flow of a constant field is exact in every method, so is its derivative.
+    want = np.sum(scipy.linalg.expm_frechet(a, direction, compute_expm=False) @ y0)
+    assert got == pytest.approx(want, rel=1e-13)
