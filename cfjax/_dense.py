@@ -6,7 +6,7 @@ import diffrax
 import equinox as eqx
 import jax.numpy as jnp
 import jax.tree_util as jtu
-from jaxtyping import Array, PyTree, Real
+from jaxtyping import PyTree
 
 
 class NodeInterpolation(diffrax.AbstractLocalInterpolation):
@@ -16,8 +16,8 @@ class NodeInterpolation(diffrax.AbstractLocalInterpolation):
     without an interpolation on the manifold refuses instead.
     """
 
-    t0: Real[Array, ""]
-    t1: Real[Array, ""]
+    t0: Any
+    t1: Any
     y0: PyTree
     y1: PyTree
 
@@ -31,9 +31,10 @@ class NodeInterpolation(diffrax.AbstractLocalInterpolation):
             start, end = self.evaluate(t0), self.evaluate(t1)
             return jtu.tree_map(jnp.subtract, end, start)
         # A few units of rounding in the times themselves: they are sums of step sizes.
-        slack = 8 * jnp.finfo(self.t1.dtype).eps * jnp.maximum(abs(self.t0), abs(self.t1))
-        at_start = abs(t0 - self.t0) <= slack
-        at_end = abs(t0 - self.t1) <= slack
+        eps = jnp.finfo(jnp.result_type(self.t1)).eps
+        slack = 8 * eps * jnp.maximum(jnp.abs(self.t0), jnp.abs(self.t1))
+        at_start = jnp.abs(t0 - self.t0) <= slack
+        at_end = jnp.abs(t0 - self.t1) <= slack
         y = jtu.tree_map(lambda a, b: jnp.where(at_end, b, a), self.y0, self.y1)
         return eqx.error_if(
             y,
