@@ -66,7 +66,8 @@ def _solve(term, solver, y0, inertia, num_steps):
 
 def _integrate(y0, inertia, num_steps):
     t1 = num_steps * STEP
-    return cfjax.integrate(_term(), cfjax.CF4(), 0.0, t1, y0, inertia, num_steps=num_steps).ys
+    sol = cfjax.integrate(_term(), cfjax.CF4(), 0.0, t1, y0, inertia, num_steps=num_steps)
+    return jax.tree.map(lambda ys: ys[-1], sol.ys)
 
 
 def _initial(batch: int | None = None):
@@ -141,7 +142,7 @@ def _c_single(library: ctypes.CDLL) -> Callable[[], object]:
         library.cf4(_pointer(y), _pointer(inertia), STEP, STEPS)
         return y
 
-    _check(run(), _integrate(*_initial(), STEPS)[0])
+    _check(run(), _integrate(*_initial(), STEPS))
     return run
 
 
@@ -154,7 +155,7 @@ def _c_batch(library: ctypes.CDLL) -> Callable[[], object]:
         return y
 
     some = jnp.asarray(y0[:3])
-    _check(run()[:3], jax.vmap(lambda y: _integrate(y, inertia, BATCH_STEPS)[0])(some))
+    _check(run()[:3], jax.vmap(lambda y: _integrate(y, inertia, BATCH_STEPS))(some))
     return run
 
 

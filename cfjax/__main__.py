@@ -15,9 +15,7 @@ class _Parser(argparse.ArgumentParser):
 
 def main(argv: Sequence[str] | None = None) -> int:
     """Runs one command and returns the exit status. Bad arguments exit with status 2."""
-    parser = _Parser(
-        prog="cfjax", description="Commutator-free Lie group integrators for JAX."
-    )
+    parser = _Parser(prog="cfjax", description="Commutator-free Lie group integrators for JAX.")
     commands = parser.add_subparsers(dest="command", metavar="COMMAND", title="commands")
     paper = commands.add_parser(
         "paper",

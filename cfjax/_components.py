@@ -12,9 +12,10 @@ import jax
 import jax.numpy as jnp
 import jax.tree_util as jtu
 import numpy as np
+from jax import lax
 from jax.custom_batching import custom_vmap
 from jax.extend.core import ClosedJaxpr, DropVar, Jaxpr, JaxprEqn, Literal, jaxpr_as_fun
-from jaxtyping import PyTree
+from jaxtyping import Array, PyTree
 
 # Longer vectors fuse well as they are, and the program grows with the number of components.
 _MAX_LENGTH = 6
@@ -52,10 +53,13 @@ def by_components(fun: Callable[[PyTree], PyTree], y: PyTree) -> PyTree:
 def _evaluate(jaxpr: Jaxpr, consts: Sequence[Any], args: Sequence[Any]) -> list[Any]:
     env: dict[Any, Any] = {}
 
-    def read(v):
-        return v.val if isinstance(v, Literal) else env[v]
+    def read(v: Any) -> Any:
+        return jnp.asarray(v.val, v.aval.dtype) if isinstance(v, Literal) else env[v]
 
     for variable, value in zip((*jaxpr.constvars, *jaxpr.invars), (*consts, *args), strict=True):
+        if not isinstance(value, _Vector):
+            # What is known before the program runs may still be NumPy's.
+            value = jnp.asarray(value)
         env[variable] = _entries(value) if _is_short(value) else value
     for eqn in jaxpr.eqns:
         values = [read(v) for v in eqn.invars]
@@ -90,7 +94,7 @@ def _in_components(eqn: JaxprEqn, name: str, values: list[Any]) -> Any:
             return _Vector(entry for v in values for entry in _entries(v))
         if name == "dot_general" and _is_plain_product(eqn, values):
             return _product(eqn, *values)
-    elif shape == () and isinstance(values[0], _Vector):
+    elif shape == () and values and isinstance(values[0], _Vector):
         if name in ("squeeze", "reshape"):
             return values[0][0]
         if name == "reduce_sum":
@@ -124,25 +128,25 @@ def _expensive(eqn: JaxprEqn, rows: Sequence[tuple]) -> _Vector:
     def by_component(rows):
         return tuple(eqn.primitive.bind(*row, **eqn.params) for row in rows)
 
-    @custom_vmap
     def whole(rows):
         columns = (jnp.stack(column) for column in zip(*rows, strict=True))
         return tuple(eqn.primitive.bind(*columns, **eqn.params))
 
-    @whole.def_vmap
-    def _(axis_size, in_batched, rows):
-        axes = jtu.tree_map(lambda batched: 0 if batched else None, in_batched)
-        out = jax.vmap(by_component, in_axes=axes, axis_size=axis_size)(rows)
-        return out, (True,) * len(out)
+    rows = jtu.tree_map(jnp.asarray, tuple(rows))
+    # A constant by the time XLA sees it, so only one of the two is compiled.
+    batched = _is_batched(jtu.tree_map(lambda x: x != x, rows))
+    return _Vector(lax.cond(batched, by_component, whole, rows))
 
-    # `custom_vmap` has no reverse mode, so the derivative goes around it.
-    differentiable = jax.custom_jvp(whole)
 
-    @differentiable.defjvp
-    def _(primals, tangents):
-        return whole(*primals), jax.jvp(by_component, primals, tangents)[1]
+@custom_vmap
+def _is_batched(values: PyTree) -> Array:
+    """Whether any of the values, which are not differentiable, is batched by a `vmap`."""
+    return jnp.asarray(False)
 
-    return _Vector(differentiable(tuple(rows)))
+
+@_is_batched.def_vmap
+def _(axis_size: int, in_batched: PyTree, values: PyTree) -> tuple[Array, bool]:
+    return jnp.asarray(True), False
 
 
 def _is_plain_product(eqn: JaxprEqn, values: Sequence[Any]) -> bool:
@@ -179,12 +183,11 @@ def _ndim(x: Any) -> int:
 
 
 def _entries(x: Any, length: int | None = None) -> _Vector:
-    """The components of a vector; `length` copies of a scalar."""
-    if isinstance(x, _Vector):
-        return x
-    if jnp.ndim(x) == 0:
+    """The components of a vector; `length` copies of a scalar or of the only entry."""
+    if _ndim(x) == 0:
         return _Vector([x] * (length or 1))
-    return _Vector(x[i] for i in range(len(x)))
+    entries = _Vector(x[i] for i in range(len(x)))
+    return _Vector(entries * length) if length and len(entries) == 1 else entries
 
 
 def _whole(x: Any) -> Any:

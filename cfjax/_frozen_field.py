@@ -5,9 +5,9 @@ from collections.abc import Sequence
 from typing import Any, ClassVar
 
 import equinox as eqx
-import jax
 import jax.numpy as jnp
 import jax.tree_util as jtu
+import numpy as np
 from jaxtyping import Array, Inexact, PyTree, Real
 
 Weight = float | Real[Array, ""]
@@ -120,7 +120,7 @@ def without_bracket(field: AbstractFrozenField) -> str:
 
 
 def _linear_combination(
-    weights: Sequence[Weight], arrays: Sequence[Inexact[Array, "..."]]
+    weights: Sequence[Weight], arrays: Sequence[Inexact[Array | np.ndarray, "..."]]
 ) -> Inexact[Array, "..."]:
     total = _scale(weights[0], arrays[0])
     for weight, array in zip(weights[1:], arrays[1:], strict=True):
@@ -128,7 +128,5 @@ def _linear_combination(
     return total
 
 
-def _scale(weight: Weight, array: Inexact[Array, "..."]) -> Inexact[Array, "..."]:
-    if isinstance(weight, jax.Array):
-        weight = weight.astype(array.dtype)
-    return weight * array
+def _scale(weight: Weight, array: Inexact[Array | np.ndarray, "..."]) -> Inexact[Array, "..."]:
+    return jnp.asarray(weight, array.dtype) * array

@@ -20,8 +20,8 @@ def integrate(
     y0: PyTree,
     args: PyTree = None,
     *,
-    num_steps: int,
-    save_every: int | None = None,
+    num_steps: int | np.integer,
+    save_every: int | np.integer | None = None,
 ) -> diffrax.Solution:
     """Integrates from `t0` to `t1` with `num_steps` equal steps of any diffrax solver.
 
@@ -45,14 +45,17 @@ def integrate(
     `y0` has an entry that is not finite, or if the solver reports a failure.
     """
     _check_types(term, solver, y0)
-    _check_counts(num_steps, save_every)
+    num_steps = _count("num_steps", num_steps)
+    save_every = num_steps if save_every is None else _count("save_every", save_every)
+    if num_steps % save_every:
+        raise ValueError(f"save_every must divide num_steps={num_steps}, got {save_every}.")
     y0 = jtu.tree_map(jnp.asarray, y0)
     # Times in the state's precision, so that they do not promote it.
     with jax.numpy_dtype_promotion("standard"):
         dtype = jnp.finfo(jnp.result_type(*jtu.tree_leaves(y0))).dtype
     t0, t1 = jnp.asarray(t0, dtype), jnp.asarray(t1, dtype)
     args = jtu.tree_map(lambda x: jnp.asarray(x) if isinstance(x, float | complex) else x, args)
-    return _integrate(term, solver, t0, t1, y0, args, num_steps, save_every or num_steps)
+    return _integrate(term, solver, t0, t1, y0, args, num_steps, save_every)
 
 
 @eqx.filter_jit
@@ -108,11 +111,15 @@ def _integrate(
 
 def _check_types(term: Any, solver: Any, y0: PyTree) -> None:
     is_term = lambda x: isinstance(x, diffrax.AbstractTerm)  # noqa: E731
-    if not all(map(is_term, jtu.tree_leaves(term, is_leaf=is_term))):
+    terms = jtu.tree_leaves(term, is_leaf=is_term)
+    if not terms or not all(map(is_term, terms)):
         raise TypeError(f"term must be a diffrax term, such as cfjax.LieTerm(field), got {term!r}.")
     if not isinstance(solver, diffrax.AbstractSolver):
         raise TypeError(f"solver must be a diffrax solver, such as cfjax.CF4(), got {solver!r}.")
-    for path, leaf in jtu.tree_leaves_with_path(y0):
+    leaves = jtu.tree_leaves_with_path(y0)
+    if not leaves:
+        raise TypeError(f"y0 must have at least one array, got {y0!r}.")
+    for path, leaf in leaves:
         is_array = isinstance(leaf, jax.Array | np.ndarray | np.generic | float | complex)
         if not is_array or not jnp.issubdtype(jnp.result_type(leaf), jnp.inexact):
             raise TypeError(
@@ -120,13 +127,7 @@ def _check_types(term: Any, solver: Any, y0: PyTree) -> None:
             )
 
 
-def _check_counts(num_steps: Any, save_every: Any) -> None:
-    if not isinstance(num_steps, int) or num_steps < 1:
-        raise ValueError(f"num_steps must be an integer of at least 1, got {num_steps!r}.")
-    if save_every is None:
-        return
-    if not isinstance(save_every, int) or save_every < 1 or num_steps % save_every:
-        raise ValueError(
-            f"save_every must be a positive integer that divides num_steps={num_steps}, "
-            f"got {save_every!r}."
-        )
+def _count(name: str, value: Any) -> int:
+    if isinstance(value, bool) or not isinstance(value, int | np.integer) or value < 1:
+        raise ValueError(f"{name} must be an integer of at least 1, got {value!r}.")
+    return int(value)

@@ -33,9 +33,11 @@ class LieTerm(diffrax.AbstractTerm):
     wrong structure, shape or dtype raises a `TypeError` or `ValueError` that names its place in
     the state. A Python scalar is taken in the state's dtype.
 
-    Solvers of linear spaces refuse the term, with one exception: where every part is a translation
-    the term is an ordinary one, and every diffrax solver runs it. `vf_prod` is the tangent vector
-    in the ambient space, so `diffrax.BacksolveAdjoint(solver=diffrax.Tsit5())` works.
+    Where every part is a translation this is an ordinary term, and every diffrax solver runs it.
+    With frozen fields diffrax's own solvers either refuse it (Tsit5, Dopri5 and most others) or
+    make ordinary steps in the ambient space, which leave the manifold (Euler, Heun, Midpoint):
+    `vf_prod` is the tangent vector there. So `diffrax.BacksolveAdjoint(solver=diffrax.Tsit5())`
+    works.
     """
 
     field: Callable[[Any, Any, Any], PyTree]
@@ -79,7 +81,9 @@ def _checked_part(place: str, part: Any, point: PyTree) -> Any:
         try:
             velocity = eqx.filter_eval_shape(type(part).tangent, part, point)
         except (TypeError, ValueError) as error:
-            raise type(error)(
+            # Not the error's own class: some of JAX's are not made from a text.
+            kind = TypeError if isinstance(error, TypeError) else ValueError
+            raise kind(
                 f"The field returned {name} for {place}, where the state is {_describe(point)}. "
                 f"It does not act there: {error}"
             ) from error
@@ -95,14 +99,20 @@ def _checked_part(place: str, part: Any, point: PyTree) -> Any:
             f"{_describe(point)}. Expected a frozen field, or an array of the state's shape and "
             "dtype (a translation)."
         )
-    if isinstance(part, int | float | complex):
-        part = jnp.asarray(part, jnp.result_type(part, jnp.result_type(point)))
+    if _is_scalar_for(part, jnp.result_type(point)):
+        part = jnp.asarray(part, jnp.result_type(point))
     if _struct(part) != _struct(point) or not jnp.issubdtype(jnp.result_type(part), jnp.inexact):
         raise ValueError(
             f"The field returned a translation of type {_describe(part)} for {place}, where the "
             f"state is {_describe(point)}. Shape and dtype must agree, and be floating or complex."
         )
-    return part
+    return jnp.asarray(part)
+
+
+def _is_scalar_for(part: Any, dtype: Any) -> bool:
+    """Whether `part` is a Python number without a precision of its own that `dtype` can hold."""
+    kind = jnp.complexfloating if type(part) is complex else jnp.inexact
+    return type(part) in (int, float, complex) and jnp.issubdtype(dtype, kind)
 
 
 def _struct(x: PyTree) -> PyTree:

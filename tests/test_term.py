@@ -1,5 +1,7 @@
 """`LieTerm`: what it refuses, what it costs, and how diffrax uses it."""
 
+from typing import Any
+
 import diffrax
 import equinox as eqx
 import jax
@@ -84,8 +86,11 @@ PAIR = {"q": V3, "p": (V3, V3)}
         (Rotation(V3), jnp.arange(3), "for y,"),
         # Fields.
         (Rotation(V3), jnp.ones(4), "for y,"),
-        ({"q": Rotation(V3), "p": (V3, Rotation(V3))}, {"q": V3, "p": (V3, jnp.ones((2, 3)))},
-         r"y\['p'\]\[1\]"),
+        (
+            {"q": Rotation(V3), "p": (V3, Rotation(V3))},
+            {"q": V3, "p": (V3, jnp.ones((2, 3)))},
+            r"y\['p'\]\[1\]",
+        ),
         ({"q": Rotation(V3), "p": Rotation(V3)}, PAIR, r"y\['p'\]"),
         (Rotation(V3), PAIR, "for y[.,]"),
         (Rotation(V3), F32, "for y[.,]"),
@@ -163,7 +168,7 @@ def test_prod_is_linear_in_the_control_and_keeps_float32():
     assert term.contr(1.0, 0.25) == -0.75
 
 
-def solve(term, solver, dt0, y0=Y0, args=INERTIA, t1=1.0, **kwargs):
+def solve(term, solver, dt0, y0: Any = Y0, args: Any = INERTIA, t1=1.0, **kwargs):
     y0, args = jax.tree.map(jnp.asarray, (y0, args))
     ys = diffrax.diffeqsolve(term, solver, 0.0, t1, dt0, y0, args, max_steps=256, **kwargs).ys
     return jax.tree.map(lambda y: y[-1], ys)
@@ -186,8 +191,9 @@ def test_vf_prod_is_the_ambient_tangent():
     assert errors[1] > 1e-6
 
 
+# Euler, Heun and Midpoint ask for nothing but `vf_prod`, which is the ambient tangent.
 @pytest.mark.parametrize(
-    "solver", [diffrax.Euler(), diffrax.Tsit5(), diffrax.Dopri5(), diffrax.ReversibleHeun()]
+    "solver", [diffrax.Tsit5(), diffrax.Dopri5(), diffrax.Bosh3(), diffrax.ReversibleHeun()]
 )
 def test_solvers_of_linear_spaces_refuse_a_rotation(solver):
     with pytest.raises((TypeError, ValueError)):
@@ -203,7 +209,8 @@ def test_translations_are_an_ordinary_equation():
         got = solve(LieTerm(ordinary), solver, 0.25, y0)
         want = solve(diffrax.ODETerm(ordinary), solver, 0.25, y0)
         # The same operations, up to the order in which XLA fuses them.
-        jax.tree.map(lambda a, b: np.testing.assert_allclose(a, b, rtol=1e-14, atol=1e-14), got, want)
+        for part in ("a", "b"):
+            np.testing.assert_allclose(got[part], want[part], rtol=1e-14, atol=1e-14)
 
 
 def test_multi_term_is_the_sum():
@@ -221,9 +228,11 @@ def test_backsolve_adjoint():
         y = solve(LieTerm(rigid_body), CF4(), 0.02, y0, args, adjoint=adjoint)
         return jnp.vdot(np.array([1.0, -2.0, 0.5]), y)
 
-    gradient = jax.jit(jax.grad(loss, argnums=(0, 1)), static_argnums=2)
-    got = gradient(Y0, INERTIA, diffrax.BacksolveAdjoint(solver=diffrax.Tsit5()))
-    want = gradient(Y0, INERTIA, diffrax.RecursiveCheckpointAdjoint())
+    def gradient(adjoint):
+        return jax.jit(jax.grad(lambda y0, args: loss(y0, args, adjoint), (0, 1)))(Y0, INERTIA)
+
+    got = gradient(diffrax.BacksolveAdjoint(solver=diffrax.Tsit5()))
+    want = gradient(diffrax.RecursiveCheckpointAdjoint())
     # One is the gradient of the solution, the other of the fourth-order approximation with
     # h = 0.02: they differ by about h^4 = 1.6e-7 times an error constant of 0.02.
     for a, b in zip(got, want, strict=True):

@@ -4,6 +4,7 @@ from typing import Any
 
 import equinox as eqx
 import jax.numpy as jnp
+import numpy as np
 from jax import lax
 from jaxtyping import Array, Inexact
 
@@ -89,7 +90,7 @@ def _check_square(a: Array) -> None:
 def _product(a: Array, b: Array) -> Array:
     # A real matrix may meet a complex one of its own precision.
     if jnp.finfo(a.dtype).dtype == jnp.finfo(b.dtype).dtype:
-        dtype = jnp.promote_types(a.dtype, b.dtype)
+        dtype = np.promote_types(a.dtype, b.dtype)
         a, b = a.astype(dtype), b.astype(dtype)
     # The default precision drops digits of float32 on GPU and TPU.
     return jnp.matmul(a, b, precision=lax.Precision.HIGHEST)

@@ -33,12 +33,17 @@ class Rotation(AbstractAlgebraElement):
             raise TypeError(f"omega must be float32 or float64, got {self.omega.dtype}.")
 
     def flow(self, point: Float[Array, "3 *k"]) -> Float[Array, "3 *k"]:
+        _check_point(point)
         return rotate(self.omega, point)
 
     def tangent(self, point: Float[Array, "3 *k"]) -> Float[Array, "3 *k"]:
-        if point.ndim not in (1, 2) or point.shape[0] != 3:
-            raise ValueError(f"Rotation acts on shapes (3,) and (3, k), got {point.shape}.")
+        _check_point(point)
         return cross(self.omega, point)
 
     def bracket(self, other: Any) -> "Rotation":
         return type(self)(cross(self.omega, other.omega))
+
+
+def _check_point(point: Array) -> None:
+    if point.ndim not in (1, 2) or point.shape[0] != 3:
+        raise ValueError(f"Rotation acts on shapes (3,) and (3, k), got {point.shape}.")

@@ -11,7 +11,7 @@ from cfjax import LeftMatrix, RightMatrix, Rotation
 BOTH = pytest.mark.parametrize("cls", [LeftMatrix, RightMatrix])
 
 
-def random(shape, dtype=np.float64, seed=0):
+def random(shape, dtype: type = np.float64, seed=0):
     rng = np.random.default_rng(seed)
     x = rng.normal(size=shape)
     if np.issubdtype(dtype, np.complexfloating):
@@ -121,9 +121,7 @@ def test_gradient(cls, norm):
     want = np.vdot(weight, act(cls, frechet, point))
     assert np.vdot(gradient, direction) == pytest.approx(want, abs=atol)
     forward = jax.jit(lambda a, d: jax.jvp(lambda a: flow(cls(a), point), (a,), (d,))[1])
-    np.testing.assert_allclose(
-        forward(a, direction), act(cls, frechet, point), rtol=0, atol=atol
-    )
+    np.testing.assert_allclose(forward(a, direction), act(cls, frechet, point), rtol=0, atol=atol)
     if norm == 0:
         # d/da of w . (exp(a) p) at zero is w p^T from the left and p^T w from the right.
         by_hand = weight @ point.T if cls is LeftMatrix else point.T @ weight
@@ -170,9 +168,8 @@ def test_bracket_by_composition_of_flows(cls):
         both = cls(y).flow(cls(x).flow(jnp.asarray(point)))
         second = x + y - xy / 2
         third = second + (bracket(x, xy) - bracket(y, xy)) / 12
-        return jnp.stack(
-            [jnp.linalg.norm(both - cls(u).flow(jnp.asarray(point))) for u in (x + y, second, third)]
-        )
+        ends = [cls(u).flow(jnp.asarray(point)) for u in (x + y, second, third)]
+        return jnp.stack([jnp.linalg.norm(both - end) for end in ends])
 
     sizes = defects(np.array([0.04, 0.02]))
     slopes = np.log2(sizes[0] / sizes[1])

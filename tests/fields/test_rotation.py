@@ -10,10 +10,8 @@ import scipy.linalg
 from cfjax import Rotation
 
 EPS = 2.0**-52
-ANGLES = np.array(
-    [0, 1e-160, 1e-12, 1e-4, 0.1, 1, np.pi - 1e-9, np.pi, np.pi + 1e-9, 6, 2 * np.pi]
-    + [10, 50, 100, 1e4]
-)
+SMALL = [0, 1e-160, 1e-12, 1e-4, 0.1, 1]
+ANGLES = np.array([*SMALL, np.pi - 1e-9, np.pi, np.pi + 1e-9, 6, 2 * np.pi, 10, 50, 100, 1e4])
 AXIS = np.array([2.0, -3.0, 6.0]) / 7
 OMEGAS = ANGLES[:, None] * AXIS
 POINT = np.array([0.3, -1.1, 0.7])
@@ -60,7 +58,8 @@ def hessian(w, p):
         slices = []
         for k in range(3):
             ends = [[mpmath.mpf(x) + s * h * (i == k) for i, x in enumerate(w)] for s in (1, -1)]
-            slices.append(to_numpy((jacobian(ends[0], p, 120) - jacobian(ends[1], p, 120)) / (2 * h)))
+            right, left = (jacobian(end, p, 120) for end in ends)
+            slices.append(to_numpy((right - left) / (2 * h)))
     return np.stack(slices, axis=-1)
 
 
@@ -93,9 +92,9 @@ def test_flow_in_float32():
     assert got.dtype == np.float32
     for w, y in zip(OMEGAS.astype(np.float32), got, strict=True):
         # The reference gets the rounded inputs, so the angle's rounding counts once.
-        angle = np.linalg.norm(w.astype(float))
-        want = np.ravel(to_numpy(exact(w.tolist(), 200)[0] * mpmath.matrix(
-            POINT.astype(np.float32).tolist())))
+        angle = float(np.linalg.norm(w.astype(float)))
+        point = mpmath.matrix(POINT.astype(np.float32).tolist())
+        want = np.ravel(to_numpy(exact(w.tolist(), 200)[0] * point))
         np.testing.assert_allclose(y, want, rtol=0, atol=4 * eps * (1 + angle))
 
 

@@ -138,7 +138,9 @@ def test_many_turns(dtype):
 def test_taylor_coefficients_at_zero(n):
     # d^k c_n(0) = (-1)^k k! / (n + 2k)!, in reverse mode. One rounding for each of two operations
     # an order.
-    f = lambda s: stumpff(n, s)
+    def f(s):
+        return stumpff(n, s)
+
     for k in range(ORDERS + 1):
         want = (-1) ** k * math.factorial(k) / math.factorial(n + 2 * k)
         assert float(f(jnp.zeros(()))) == pytest.approx(want, rel=(2 * k + 1) * 2.0**-52)

@@ -1,8 +1,9 @@
 """Munthe-Kaas methods: order, brackets, what they refuse, and that they never trace twice."""
 
+import subprocess
+import sys
 from typing import Any
 
-import cfjax
 import diffrax
 import equinox as eqx
 import jax
@@ -11,6 +12,8 @@ import numpy as np
 import problems
 import pytest
 import scipy.linalg
+
+import cfjax
 
 METHODS: dict[str, Any] = {
     "RKMK3": cfjax.RKMK3(),
@@ -23,7 +26,7 @@ METHODS: dict[str, Any] = {
 ORDERS = {"RKMK3": 3, "RKMK4": 4, "Heun": 2, "Bosh3": 3, "Dopri5": 5, "Tsit5": 5}
 names = pytest.mark.parametrize("name", METHODS)
 
-# As in test_commutator_free.py. Steps down to 1/128 leave 5e-11 for order 5, 50 times the error
+# As in test_commutator_free.py. Steps down to 1/128 leave 2e-12 for order 5, 20 times the error
 # of the reference.
 STEPS = (16, 32, 64, 128)
 TOLERANCE = 0.15
@@ -35,7 +38,7 @@ TOLERANCE = 0.15
 def observed_order(problem, solver, **kwargs) -> float:
     field, y0, args, answer = problem
     found = problems.errors(field, solver, 1.0, y0, args, answer, STEPS, **kwargs)
-    assert found.min() > 20 * problems.REFERENCE_ERROR
+    assert found.min() > 10 * problems.REFERENCE_ERROR
     assert found.max() < 1
     return problems.slope(STEPS, found)
 
@@ -211,7 +214,9 @@ def test_in_a_linear_space_it_is_the_classical_method(name, shape, term):
 @names
 def test_a_constant_field_is_followed_exactly(name, h):
     a = problems.GENERATORS[0] - problems.GENERATORS[0].T
-    found = one_step(METHODS[name], lambda t, y, args: cfjax.LeftMatrix(args), np.eye(4), h=h, args=a)
+    found = one_step(
+        METHODS[name], lambda t, y, args: cfjax.LeftMatrix(args), np.eye(4), h=h, args=a
+    )
     # Brackets of an element with its multiples vanish up to rounding: |h a|^2 eps, and up to two
     # brackets inside each other. The norm of a is 5.3.
     atol = 1e-14 * (1 + 6 * abs(h)) ** 3
@@ -222,30 +227,40 @@ def test_a_constant_field_is_followed_exactly(name, h):
 
 
 def inexact_end() -> tuple[float, float]:
-    """Times with t0 + (t1 - t0) above t1 in floating point, as most steps have somewhere."""
+    """Times with t0 + (t1 - t0) above t1 in floating point, as steps across zero often have."""
     rng = np.random.default_rng(0)
     while True:
-        t0, t1 = np.sort(rng.uniform(size=2))
+        t0, t1 = rng.uniform(-1, 0), rng.uniform(0, 0.1)
         if t0 + (t1 - t0) > t1:
             return float(t0), float(t1)
 
 
-@pytest.mark.parametrize("name", ["RKMK4", "Heun", "Dopri5", "Tsit5", "Dopri8"])
-def test_the_last_stage_is_at_the_end_exactly(name):
+@pytest.mark.parametrize(
+    "name, stages",
+    [
+        *[("RKMK3", 1), ("RKMK4", 1), ("Heun", 1), ("Bosh3", 0)],
+        *[("Dopri5", 1), ("Tsit5", 1), ("Dopri8", 2)],
+    ],
+)
+def test_the_last_stage_is_at_the_end_exactly(name, stages):
     """A field that jumps at the end of the step must not be evaluated behind the jump.
 
-    The stage times of these methods are at most 1, with several stages at 1. The rows of a
-    tableau in floating point sum to it up to rounding only.
+    The rows of a tableau in floating point sum to their stage time up to rounding only.
     """
     solver = METHODS[name] if name in METHODS else cfjax.RKMK(getattr(diffrax, name).tableau)
-    for t0, t1 in [(0.0, 1.0), inexact_end()]:
+    t0, t1 = inexact_end()
+    times = []
 
-        def field(t, y, args, t1=t1):
-            return jnp.where(t > t1, jnp.nan, y)
+    def field(t, y, args):
+        times.append(float(t))
+        return y
 
-        time = jnp.asarray(t0), jnp.asarray(t1)
-        y1 = solver.step(cfjax.LieTerm(field), *time, jnp.ones(2), None, None, False)[0]
-        assert np.all(np.isfinite(y1))
+    # Not a short vector, so the step runs operation by operation and the times are numbers.
+    y0, time = jnp.ones((7, 7)), (jnp.asarray(t0), jnp.asarray(t1))
+    solver.step(cfjax.LieTerm(field), *time, y0, None, None, made_jump=False)
+    assert times[0] == t0
+    assert max(times) <= t1
+    assert times.count(t1) == stages
 
 
 # Cost
@@ -324,7 +339,7 @@ class Shear(cfjax.AbstractFrozenField):
 @pytest.mark.parametrize("nested", [False, True])
 def test_a_field_without_bracket_is_refused_by_name(name, nested):
     def field(t, y, args):
-        return {"a": y["a"], "b": Shear(-y["b"])} if nested else Shear(-y)
+        return {"a": -y["a"], "b": Shear(-y["b"])} if nested else Shear(-y)
 
     y0 = {"a": jnp.ones(3), "b": jnp.ones(3)} if nested else jnp.ones(3)
     term = cfjax.LieTerm(field)
@@ -336,24 +351,33 @@ def test_a_field_without_bracket_is_refused_by_name(name, nested):
         np.testing.assert_allclose(leaf, np.full((1, 3), 3 / 8), rtol=1e-15)
 
 
-@pytest.mark.parametrize("solver", [diffrax.Kvaerno3, diffrax.KenCarp4, diffrax.ImplicitEuler])
+@pytest.mark.parametrize("solver", [diffrax.Kvaerno3, diffrax.Kvaerno5])
 def test_an_implicit_tableau_is_refused(solver):
-    tableau = solver.tableau
-    with pytest.raises((ValueError, TypeError), match="tableau must be"):
-        cfjax.RKMK(tableau)
-
-
-def test_an_implicit_tableau_is_a_wrong_value():
-    with pytest.raises(ValueError, match="tableau must be explicit"):
-        cfjax.RKMK(diffrax.Kvaerno3.tableau)
+    with pytest.raises(ValueError, match="tableau must be explicit, got one of an implicit method"):
+        cfjax.RKMK(solver.tableau)
 
 
 @pytest.mark.parametrize(
-    "tableau", [None, 4, cfjax.CF4.tableau, diffrax.Dopri5(), diffrax.Dopri5, [[0.5]]]
+    "tableau", [None, 4, cfjax.CF4.tableau, diffrax.Dopri5(), [[0.5]], diffrax.KenCarp4.tableau]
 )
 def test_only_a_diffrax_tableau_makes_a_method(tableau):
-    with pytest.raises(TypeError, match=r"tableau must be a diffrax\.ButcherTableau"):
+    # The import hook of the test suite may answer first, see below.
+    with pytest.raises(TypeError, match="tableau"):
         cfjax.RKMK(tableau)
+
+
+def test_the_refusals_in_the_words_of_the_package():
+    """In a Python without the import hook, which otherwise answers before the package does."""
+    script = r"""
+import cfjax, diffrax, pytest
+for tableau in (None, 4, cfjax.CF4.tableau, diffrax.Dopri5(), diffrax.KenCarp4.tableau):
+    with pytest.raises(TypeError, match=r"tableau must be a diffrax\.ButcherTableau, got "):
+        cfjax.RKMK(tableau)
+for tableau in (None, [[[]], [[1]]], diffrax.Tsit5.tableau, cfjax.CF4()):
+    with pytest.raises(TypeError, match=r"tableau must be a cfjax\.Tableau, got "):
+        cfjax.CommutatorFree(tableau)
+"""
+    subprocess.run([sys.executable, "-W", "error", "-c", script], check=True)
 
 
 # Tracing

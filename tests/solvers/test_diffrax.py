@@ -1,0 +1,540 @@
+"""Every feature of `diffrax.diffeqsolve`, with a commutator-free and a Munthe-Kaas method."""
+
+import warnings
+from typing import Any
+
+import diffrax
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import jax.tree_util as jtu
+import numpy as np
+import problems
+import pytest
+
+import cfjax
+
+SOLVERS: dict[str, diffrax.AbstractSolver] = {
+    "CF4": cfjax.CF4(),
+    "RKMK4": cfjax.RKMK4(),
+}
+solvers = pytest.mark.parametrize("solver", SOLVERS.values(), ids=SOLVERS.keys())
+directions = pytest.mark.parametrize("direction", [1, -1], ids=["forwards", "backwards"])
+
+Y0 = jnp.asarray(problems.MOMENTUM)
+ARGS = jnp.asarray(problems.INERTIA)
+TERM = cfjax.LieTerm(problems.driven_body)
+# 20 steps to t = 1. The errors of both methods there are below 1e-5, and the solution moves
+# by 0.3 or more within any two steps, so a value from a wrong time cannot pass.
+STEPS = 20
+ERROR = 1e-5
+
+
+def solve(solver, t1=1.0, dt0=1.0 / STEPS, y0=Y0, args=ARGS, term=TERM, **kwargs):
+    return diffrax.diffeqsolve(term, solver, 0.0, t1, dt0, y0, args, **kwargs)
+
+
+def by_steps(solver, times, y0=Y0, args=ARGS, field=problems.driven_body) -> Any:
+    """The states at `times`, by calls of `step` alone."""
+    return _by_steps(solver, jnp.asarray(times), y0, args, field)
+
+
+@eqx.filter_jit
+def _by_steps(solver, times, y0, args, field):
+    def step(y, interval):
+        term = cfjax.LieTerm(field)
+        y1 = solver.step(term, *interval, y, args, None, made_jump=False)[0]
+        return y1, y1
+
+    _, ys = jax.lax.scan(step, y0, (times[:-1], times[1:]))
+    return jtu.tree_map(lambda first, rest: jnp.concatenate([first[None], rest]), y0, ys)
+
+
+def nodes(direction=1, n=STEPS):
+    return direction * np.arange(n + 1) / STEPS
+
+
+def close(found, expected, atol=1e-14):
+    """Equal to rounding: 20 steps, each with a few units of 1e-16 for entries below 1.
+
+    The times that diffrax adds up differ from multiples of the step by about 1e-16 a step.
+    """
+    for a, b in zip(jtu.tree_leaves(found), jtu.tree_leaves(expected), strict=True):
+        np.testing.assert_allclose(a, b, rtol=0, atol=atol)
+
+
+@pytest.fixture(scope="module")
+def answers():
+    """The driven body at t = 1 and t = -1, not by cfjax."""
+
+    def ode(t, y):
+        return problems.driven_body_ode(t, y, problems.INERTIA)
+
+    return {d: problems.reference(ode, 0.0, float(d), problems.MOMENTUM) for d in (1, -1)}
+
+
+# Output
+
+
+@directions
+@solvers
+def test_the_end_is_the_solution(answers, solver, direction):
+    sol = solve(solver, float(direction), direction / STEPS)
+    assert sol.ts is not None and sol.ys is not None
+    assert sol.ts.tolist() == [float(direction)]
+    assert sol.stats["num_accepted_steps"] == STEPS
+    assert np.linalg.norm(sol.ys[-1] - answers[direction]) < ERROR
+    close(sol.ys[-1], by_steps(solver, nodes(direction))[-1])
+
+
+@directions
+@solvers
+def test_save_every_kind_at_once(solver, direction):
+    """t0, t1, steps, every n-th step, a function, and several of them in a pytree."""
+
+    def energy(t, y, args):
+        return {"t": t, "E": jnp.sum(y**2 / args) / 2}
+
+    saveat = diffrax.SaveAt(
+        subs={
+            "ends": diffrax.SubSaveAt(t0=True, t1=True),
+            "steps": diffrax.SubSaveAt(steps=True),
+            "with start": diffrax.SubSaveAt(t0=True, steps=True),
+            "third": diffrax.SubSaveAt(t0=True, t1=True, steps=3),
+            "energy": diffrax.SubSaveAt(steps=2, fn=energy),
+        }
+    )
+    sol = solve(solver, float(direction), direction / STEPS, saveat=saveat, max_steps=STEPS)
+    ts, ys = sol.ts, sol.ys
+    assert ts is not None and ys is not None
+    times = nodes(direction)
+    exact = by_steps(solver, times)
+    close((ts["ends"], ys["ends"]), (times[[0, -1]], exact[jnp.array([0, -1])]))
+    close((ts["steps"], ys["steps"]), (times[1:], exact[1:]))
+    close((ts["with start"], ys["with start"]), (times, exact))
+    third = np.array([0, 3, 6, 9, 12, 15, 18, 20])
+    close((ts["third"][: len(third)], ys["third"][: len(third)]), (times[third], exact[third]))
+    # Diffrax fills what is left with infinity.
+    assert np.all(np.isinf(ys["third"][len(third) :]))
+    close(ys["energy"]["t"], times[2::2])
+    close(ys["energy"]["E"], np.sum(np.asarray(exact)[2::2] ** 2 / problems.INERTIA, axis=1) / 2)
+
+
+@directions
+@solvers
+def test_save_at_times_that_the_steps_end_at(solver, direction):
+    ts = direction * np.array([0.0, 0.03, 0.1, 0.17, 0.5, 0.51, 1.0])
+    sol = diffrax.diffeqsolve(
+        TERM,
+        solver,
+        ts[0],
+        ts[-1],
+        None,
+        Y0,
+        ARGS,
+        saveat=diffrax.SaveAt(ts=ts),
+        stepsize_controller=diffrax.StepTo(ts),
+    )
+    assert sol.ts is not None and sol.ys is not None
+    assert sol.ts.tolist() == ts.tolist()
+    close(sol.ys, by_steps(solver, ts))
+
+
+@solvers
+def test_save_at_nodes_of_a_regular_grid(solver):
+    """Times that the steps meet up to rounding only."""
+    ts = np.array([0.1, 0.3, 0.35, 0.7, 1.0])
+    sol = solve(solver, saveat=diffrax.SaveAt(ts=ts))
+    assert sol.ys is not None
+    close(sol.ys, by_steps(solver, nodes())[np.round(ts * STEPS).astype(int)])
+
+
+BETWEEN = r"no output between steps.*StepTo"
+
+
+@pytest.mark.parametrize("ts", [(0.075, 1.0), (0.05, 0.05 + 1e-9), (0.05, 0.999)])
+@solvers
+def test_output_between_steps_is_an_error_and_no_number(solver, ts):
+    ts = np.array(ts)
+    with pytest.raises(eqx.EquinoxRuntimeError, match=BETWEEN):
+        solve(solver, saveat=diffrax.SaveAt(ts=ts))
+    # Also where diffrax itself is told not to throw: the error is the solver's.
+    with pytest.raises(eqx.EquinoxRuntimeError, match=BETWEEN):
+        solve(solver, saveat=diffrax.SaveAt(ts=ts), throw=False)
+
+
+@directions
+@solvers
+def test_dense_output_is_right_at_nodes_and_an_error_between(solver, direction):
+    saveat = diffrax.SaveAt(dense=True)
+    sol = solve(solver, float(direction), direction / STEPS, saveat=saveat, max_steps=STEPS)
+    times = nodes(direction)
+    close(jax.vmap(sol.evaluate)(jnp.asarray(times)), by_steps(solver, times))
+    for left in (True, False):
+        for k in (0, 1, 7, STEPS):
+            close(sol.evaluate(times[k], left=left), by_steps(solver, times)[k])
+    exact = by_steps(solver, times)
+    close(sol.evaluate(times[3], times[11]), exact[11] - exact[3])
+    for t in (0.3 * times[1], times[5] + 0.01 * direction, times[-1] - 1e-6 * direction):
+        with pytest.raises(eqx.EquinoxRuntimeError, match=BETWEEN):
+            sol.evaluate(t)
+    with pytest.raises(eqx.EquinoxRuntimeError, match=BETWEEN):
+        jax.vmap(sol.evaluate)(jnp.asarray([times[1], times[1] / 2]))
+
+
+# Fields and states
+
+
+@solvers
+def test_a_product_of_manifolds(flight_problem, solver):
+    field, y0, args, answer = flight_problem
+    y0, args = problems.arrays(y0), problems.arrays(args)
+    saveat = diffrax.SaveAt(steps=True)
+    sol = solve(solver, y0=y0, args=args, term=cfjax.LieTerm(field), saveat=saveat, max_steps=STEPS)
+    close(sol.ys, jtu.tree_map(lambda x: x[1:], by_steps(solver, nodes(), y0, args, field)))
+    end = jtu.tree_map(lambda x: x[-1], sol.ys)
+    assert np.linalg.norm(problems.flat(end) - answer) < ERROR
+
+
+@pytest.mark.filterwarnings("ignore:Complex dtype support in Diffrax:UserWarning")
+@solvers
+def test_a_complex_state(solver):
+    """A unitary matrix. The problem commutes, so the answer is an exponential in closed form."""
+    rng = np.random.default_rng(5)
+    a = rng.standard_normal((3, 3)) + 1j * rng.standard_normal((3, 3))
+    hermitian = (a + a.conj().T) / 2
+
+    def field(t, y, args):
+        return cfjax.LeftMatrix(-1j * jnp.cos(t).astype(args.dtype) * args)
+
+    y0 = jnp.eye(3, dtype=complex)
+    sol = solve(solver, y0=y0, args=jnp.asarray(hermitian), term=cfjax.LieTerm(field))
+    assert sol.ys is not None
+    y1 = np.asarray(sol.ys[-1])
+    values, vectors = np.linalg.eigh(hermitian)
+    answer = (vectors * np.exp(-1j * np.sin(1.0) * values)) @ vectors.conj().T
+    assert y1.dtype == np.complex128
+    # The quadrature behind both methods errs by about h^4 / 2880.
+    assert np.linalg.norm(y1 - answer) < ERROR
+    # 20 steps of at most 5 flows, each with a rounding of the unit.
+    assert np.linalg.norm(y1.conj().T @ y1 - np.eye(3)) < 1e-13
+
+
+@solvers
+def test_single_precision_stays_single(solver):
+    y0, args = Y0.astype(jnp.float32), ARGS.astype(jnp.float32)
+    times = [jnp.asarray(t, jnp.float32) for t in (0.0, 1.0, 1 / STEPS)]
+    sol = diffrax.diffeqsolve(TERM, solver, *times, y0, args)
+    assert sol.ts is not None and sol.ys is not None
+    assert sol.ts.dtype == sol.ys.dtype == jnp.float32
+    # 20 steps with roundings of 6e-8 each, and times that diffrax adds up in single precision.
+    close(sol.ys[-1], by_steps(solver, nodes())[-1].astype(jnp.float32), atol=5e-6)
+
+
+@solvers
+def test_a_jump_in_the_field_costs_no_order_when_steps_end_there(solver):
+    """A field that changes at t = 0.37 for another one. Order measured across the jump."""
+    jump = 0.37
+
+    def field(t, y, args):
+        # The stage at the end of a step is before the jump, the one at a start is behind it,
+        # and they have the same time: a jump belongs between two floating-point numbers.
+        drive = jnp.where(t < jump, 1.0, -2.0)
+        return cfjax.Rotation(jnp.stack([drive, t, -drive]) - y / args)
+
+    def ode(drive):
+        return lambda t, y: np.cross(np.array([drive, t, -drive]) - y / problems.INERTIA, y)
+
+    before = problems.reference(ode(1.0), 0.0, jump, problems.MOMENTUM)
+    answer = problems.reference(ode(-2.0), jump, 1.0, before)
+    before_jump = np.nextafter(jump, 0)
+
+    @jax.jit
+    def error(ts):
+        sol = diffrax.diffeqsolve(
+            cfjax.LieTerm(field),
+            solver,
+            ts[0],
+            ts[-1],
+            None,
+            Y0,
+            ARGS,
+            stepsize_controller=diffrax.StepTo(ts),
+        )
+        assert sol.ys is not None
+        return jnp.linalg.norm(sol.ys[-1] - answer)
+
+    counts = (8, 16, 32, 64)
+    found = []
+    for n in counts:
+        first, last = np.linspace(0, before_jump, n + 1), np.linspace(jump, 1, n + 1)
+        found.append(float(error(jnp.asarray(np.concatenate([first, last])))))
+    assert min(found) > 10 * problems.REFERENCE_ERROR
+    assert abs(problems.slope(counts, np.array(found)) - solver.order(None)) < 0.2
+
+
+# Events
+
+
+@solvers
+def test_a_boolean_event_ends_on_the_step_where_it_holds(solver):
+    exact = np.asarray(by_steps(solver, nodes(n=40)))
+    # Between two values that the first component takes on its way.
+    level = (exact[9, 0] + exact[10, 0]) / 2
+    below = exact[10, 0] < level
+
+    def condition(t, y, args, **kwargs):
+        return (y[0] < level) if below else (y[0] > level)
+
+    first = int(np.argmax((exact[:, 0] < level) if below else (exact[:, 0] > level)))
+    sol = solve(solver, t1=2.0, event=diffrax.Event(condition))
+    assert sol.ts is not None and sol.ys is not None
+    assert sol.result == diffrax.RESULTS.event_occurred
+    close((sol.ts[-1], sol.ys[-1]), (nodes(n=40)[first], exact[first]))
+
+
+@solvers
+def test_a_continuous_event_ends_on_the_step_where_its_sign_changes(solver):
+    exact = np.asarray(by_steps(solver, nodes(n=40)))
+    level = (exact[9, 0] + exact[10, 0]) / 2
+
+    def condition(t, y, args, **kwargs):
+        return y[0] - level
+
+    signs = np.sign(exact[:, 0] - level)
+    first = int(np.argmax(signs != signs[0]))
+    sol = solve(solver, t1=2.0, event=diffrax.Event(condition))
+    assert sol.ts is not None and sol.ys is not None
+    close((sol.ts[-1], sol.ys[-1]), (nodes(n=40)[first], exact[first]))
+
+
+# Progress meters
+
+
+@solvers
+def test_a_text_progress_meter(solver, capfd):
+    meter = diffrax.TextProgressMeter(minimum_increase=0.25)
+    sol = solve(solver, progress_meter=meter)
+    jax.block_until_ready(sol.ys)
+    jax.effects_barrier()
+    lines = capfd.readouterr().out.split()
+    assert lines[0] == "0.00%" and lines[-1] == "100.00%" and 4 <= len(lines) <= 6
+    close(sol.ys[-1], by_steps(solver, nodes())[-1])
+
+
+def test_a_bar_as_progress_meter(capfd):
+    pytest.importorskip("tqdm")
+    sol = solve(cfjax.CF4(), progress_meter=diffrax.TqdmProgressMeter())
+    jax.block_until_ready(sol.ys)
+    jax.effects_barrier()
+    assert "100.00%" in capfd.readouterr().err
+
+
+# Derivatives
+
+
+class Driven(eqx.Module):
+    """The driven body with parameters inside the field."""
+
+    strength: jax.Array
+
+    def __call__(self, t, y, args):
+        drive = jnp.stack([jnp.sin(2 * t), jnp.cos(t), t])
+        return cfjax.Rotation(self.strength * drive - y / args)
+
+
+def functional(solver, adjoint, x):
+    strength, y0, args = x
+    term = cfjax.LieTerm(Driven(strength))
+    saveat = diffrax.SaveAt(t1=True, steps=5)
+    sol = solve(
+        solver, 0.5, y0=y0, args=args, term=term, adjoint=adjoint, max_steps=16, saveat=saveat
+    )
+    assert sol.ys is not None
+    # Only finite rows count: diffrax fills up with infinity.
+    rows = sol.ys[:2]
+    return jnp.sum(jnp.sin(rows * jnp.arange(1.0, 7.0).reshape(2, 3)))
+
+
+X = (jnp.asarray(np.array([1.0, -0.5, 2.0])), Y0, ARGS)
+ADJOINTS = {
+    "checkpointed": diffrax.RecursiveCheckpointAdjoint(),
+    "direct": diffrax.DirectAdjoint(),
+    "forward": diffrax.ForwardMode(),
+}
+
+
+# Differences of order 4 with step 1e-3 err by 1e-12 times a fifth derivative below 1e3 here, and
+# by 1e-15 / 1e-3 for rounding.
+DIFFERENCE_STEP, DIFFERENCE_ERROR = 1e-3, 2e-9
+
+
+@pytest.mark.parametrize("adjoint", ADJOINTS.values(), ids=ADJOINTS.keys())
+@pytest.mark.parametrize("name", ["CF4", "RKMK4"])
+def test_derivatives_in_start_args_and_field(name, adjoint):
+    fun = jax.jit(lambda x: functional(SOLVERS[name], adjoint, x))
+    direction = problems.random_like(X, 3)
+    expected = problems.central_difference(fun, X, direction, DIFFERENCE_STEP)
+    assert abs(expected) > 0.1
+    forward = not isinstance(adjoint, diffrax.RecursiveCheckpointAdjoint)
+    if forward:
+        _, tangent = jax.jvp(fun, (X,), (direction,))
+        np.testing.assert_allclose(tangent, expected, rtol=0, atol=DIFFERENCE_ERROR)
+    if not isinstance(adjoint, diffrax.ForwardMode):
+        gradient = jax.jit(jax.grad(fun))(X)
+        found = problems.inner(gradient, direction)
+        np.testing.assert_allclose(found, expected, rtol=0, atol=DIFFERENCE_ERROR)
+        # Each of the three groups on its own, so that no error of one hides in another.
+        for k in range(3):
+            part = tuple(d if i == k else jnp.zeros_like(d) for i, d in enumerate(direction))
+            found = problems.inner(gradient, part)
+            expected = problems.central_difference(fun, X, part, DIFFERENCE_STEP)
+            np.testing.assert_allclose(found, expected, rtol=0, atol=DIFFERENCE_ERROR)
+
+
+def test_batches_of_gradients_and_gradients_of_batches():
+    fun = lambda x: functional(cfjax.CF4(), ADJOINTS["checkpointed"], x)  # noqa: E731
+    batch = jtu.tree_map(lambda x: jnp.stack([x, 0.5 * x, x + 0.1]), X)
+    single = jax.jit(jax.grad(fun))
+    one_by_one = [single(jtu.tree_map(lambda x, i=i: x[i], batch)) for i in range(3)]
+    expected = jtu.tree_map(lambda *leaves: jnp.stack(leaves), *one_by_one)
+    # A gradient is a sum of about 100 products of order 1 to 10 in another order.
+    close(jax.jit(jax.vmap(jax.grad(fun)))(batch), expected, atol=1e-12)
+    total = jax.jit(jax.grad(lambda x: jnp.sum(jax.vmap(fun)(x))))(batch)
+    close(total, expected, atol=1e-12)
+
+
+def test_the_backsolve_adjoint_with_a_linear_solver_for_the_way_back():
+    """`vf_prod` is the tangent in the ambient space, which Tsit5 integrates backwards."""
+    adjoint = diffrax.BacksolveAdjoint(solver=diffrax.Tsit5())
+
+    def fun(x, adjoint):
+        y0, args = x
+        sol = solve(cfjax.CF4(), y0=y0, args=args, adjoint=adjoint, dt0=0.01)
+        assert sol.ys is not None
+        return jnp.sum(jnp.sin(sol.ys[-1]))
+
+    expected = jax.grad(fun)((Y0, ARGS), diffrax.RecursiveCheckpointAdjoint())
+    # Two discretisations, with errors of h^4 = 1e-8 each.
+    close(jax.grad(fun)((Y0, ARGS), adjoint), expected, atol=1e-7)
+
+
+# Transformations
+
+
+@solvers
+def test_a_batch_of_starts_and_args(solver):
+    @jax.jit
+    def end(y0, args):
+        sol = solve(solver, y0=y0, args=args)
+        assert sol.ys is not None
+        return sol.ys[-1]
+
+    y0 = jnp.stack([Y0, -Y0, Y0[::-1]])
+    args = jnp.stack([ARGS, ARGS + 1, 2 * ARGS])
+    close(jax.vmap(end)(y0, args), jnp.stack([end(*x) for x in zip(y0, args, strict=True)]))
+    close(jax.vmap(end, (0, None))(y0, ARGS), jnp.stack([end(y, ARGS) for y in y0]))
+    close(jax.vmap(end, (None, 0))(Y0, args), jnp.stack([end(Y0, a) for a in args]))
+
+
+@solvers
+def test_one_program_serves_all_values(solver):
+    @eqx.debug.assert_max_traces(max_traces=1)
+    def run(term, t1, dt0, y0, args):
+        return diffrax.diffeqsolve(term, solver, jnp.asarray(0.0), t1, dt0, y0, args).ys
+
+    compiled = eqx.filter_jit(run)
+    for scale in (1.0, 0.5, 2.0):
+        term = cfjax.LieTerm(Driven(jnp.asarray(scale)))
+        ys = compiled(term, jnp.asarray(scale), jnp.asarray(0.1), scale * Y0, scale * ARGS)
+        assert abs(float(jnp.linalg.norm(ys[-1])) - scale * float(jnp.linalg.norm(Y0))) < 1e-14
+
+
+# What does not fit
+
+
+@solvers
+def test_too_few_steps(solver):
+    with pytest.raises(eqx.EquinoxRuntimeError, match="maximum number of solver steps"):
+        solve(solver, max_steps=STEPS - 1)
+    sol = solve(solver, max_steps=STEPS - 1, throw=False)
+    assert sol.result == diffrax.RESULTS.max_steps_reached
+
+
+@solvers
+def test_error_control_without_an_estimate_is_refused(solver):
+    controller = diffrax.PIDController(rtol=0, atol=1e-6)
+    with pytest.raises(RuntimeError, match="error estimate"):
+        solve(solver, stepsize_controller=controller)
+
+
+@solvers
+def test_step_doubling_gives_an_estimate(answers, solver):
+    """The tolerance governs the error, and the manifold is kept. `atol` alone: see the README."""
+    found = []
+    for atol in (1e-5, 1e-9):
+        sol = solve(
+            diffrax.HalfSolver(solver),
+            stepsize_controller=diffrax.PIDController(rtol=0, atol=atol),
+        )
+        assert sol.ys is not None
+        error = float(np.linalg.norm(sol.ys[-1] - answers[1]))
+        # The estimate is 2^p - 1 times too large, errors of some 10 to 100 steps add up.
+        assert error < 100 * atol
+        found.append((error, int(sol.stats["num_accepted_steps"])))
+        # At most some hundred steps, with a rounding or two in each of their flows.
+        assert abs(float(jnp.linalg.norm(sol.ys[-1]) - jnp.linalg.norm(Y0))) < 1e-13
+    (loose, few), (tight, many) = found
+    assert tight < loose / 100 and few < many
+
+
+@pytest.mark.parametrize(
+    "solver",
+    [
+        *[diffrax.Euler(), diffrax.Midpoint(), diffrax.Heun(), diffrax.Ralston()],
+        *[diffrax.Bosh3(), diffrax.Dopri5(), diffrax.Tsit5(), diffrax.ReversibleHeun()],
+    ],
+    ids=lambda solver: type(solver).__name__,
+)
+def test_solvers_of_linear_spaces_refuse_frozen_fields(solver):
+    """They would leave the manifold, or take coordinates of an algebra for a tangent vector."""
+    with pytest.raises((TypeError, ValueError)):
+        solve(solver)
+
+
+@pytest.mark.parametrize("solver", [diffrax.Tsit5(), diffrax.Heun()])
+def test_solvers_of_linear_spaces_take_translations(solver):
+    def field(t, y, args):
+        return -args * y + jnp.sin(t)
+
+    expected = solve(solver, term=diffrax.ODETerm(field))
+    found = solve(solver, term=cfjax.LieTerm(field))
+    close(found.ys, expected.ys, atol=0)
+
+
+def test_no_warning_comes_from_a_plain_solve():
+    """In particular none about a missing interpolation or an unknown order."""
+    with warnings.catch_warnings(record=True) as caught:
+        warnings.simplefilter("always")
+        solve(cfjax.CF3(), saveat=diffrax.SaveAt(t0=True, t1=True))
+    assert caught == []
+
+
+def test_the_solver_carries_no_state_from_step_to_step():
+    """Two solves of half the length are one solve."""
+    saveat = diffrax.SaveAt(t1=True, solver_state=True, controller_state=True, made_jump=True)
+    first = solve(cfjax.CF4(), 0.5, saveat=saveat)
+    assert first.ys is not None
+    second = diffrax.diffeqsolve(
+        TERM,
+        cfjax.CF4(),
+        0.5,
+        1.0,
+        1 / STEPS,
+        first.ys[-1],
+        ARGS,
+        solver_state=first.solver_state,
+        made_jump=first.made_jump,
+    )
+    assert second.ys is not None
+    close(second.ys[-1], by_steps(cfjax.CF4(), nodes())[-1])
