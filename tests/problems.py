@@ -3,7 +3,6 @@
 from collections.abc import Callable, Sequence
 from typing import Any, cast
 
-import diffrax
 import equinox as eqx
 import jax
 import jax.numpy as jnp
@@ -185,8 +184,3 @@ def random_like(tree: Any, seed: int) -> Any:
     """A fixed random direction, shaped like `tree`."""
     rng = np.random.default_rng(seed)
     return jtu.tree_map(lambda x: jnp.asarray(rng.standard_normal(jnp.shape(x))), tree)
-
-
-def lie_methods() -> dict[str, diffrax.AbstractSolver]:
-    """One method of each kind, for tests that are not about the coefficients."""
-    return {"CF4": cfjax.CF4(), "RKMK4": cfjax.RKMK4(), "CG3": cfjax.CG3()}

@@ -93,6 +93,8 @@ class RKMK(AbstractMuntheKaas):
     # Tuples: unlike diffrax's tableau they compare by value, as a static field must.
     a: tuple[tuple[float, ...], ...] = eqx.field(static=True)
     b: tuple[float, ...] = eqx.field(static=True)
+    # Not the sums of the rows: rounding could put a stage behind the end of the step.
+    c: tuple[float, ...] = eqx.field(static=True)
 
     def __init__(self, tableau: diffrax.ButcherTableau):
         if not isinstance(tableau, diffrax.ButcherTableau):
@@ -105,6 +107,7 @@ class RKMK(AbstractMuntheKaas):
             b.pop()
         self.a = ((), *(tuple(row.tolist()) for row in tableau.a_lower[: len(b) - 1]))
         self.b = tuple(b)
+        self.c = (0.0, *tableau.c.tolist()[: len(b) - 1])
 
     def order(self, terms) -> int:
         return _classical_order(self.a[1:], self.b)
@@ -112,9 +115,9 @@ class RKMK(AbstractMuntheKaas):
     def increment(self, field):
         degree = self.order(None) - 2
         stages: list[PyTree] = []
-        for row in self.a:
+        for c, row in zip(self.c, self.a, strict=True):
             u = _combine_nonzero(row, stages) if any(row) else None
-            value = field(float(sum(row)), u)
+            value = field(c, u)
             stages.append(value if u is None else _dexpinv(u, value, degree))
         return _combine_nonzero(self.b, stages)
 
