@@ -82,7 +82,10 @@ def _integrate(
         y, _, _, solver_state, step_result = solver.step(
             term, time(n), time(n + 1), y, args, solver_state, made_jump=False
         )
-        result = diffrax.RESULTS.where(result == diffrax.RESULTS.successful, step_result, result)
+        # Left out where no step can fail: a loop of small steps feels every operation.
+        if step_result is not diffrax.RESULTS.successful:
+            is_first = result == diffrax.RESULTS.successful
+            result = diffrax.RESULTS.where(is_first, step_result, result)
         return (n + 1, y, solver_state, result), None
 
     def steps_and_save(carry, _):
