@@ -171,6 +171,11 @@ def central_difference(fun: Callable[[Any], Any], x: Any, direction: Any, step: 
     return jtu.tree_map(lambda a, b, c, d: ((a - d) - 8 * (b - c)) / (12 * step), *f)
 
 
+def assert_close(found: Any, expected: Any, atol: float) -> None:
+    for a, b in _pairs(found, expected):
+        np.testing.assert_allclose(a, b, rtol=0, atol=atol)
+
+
 def inner(a: Any, b: Any) -> jax.Array:
     """The pairing of two pytrees of real arrays, which is what a gradient is defined by."""
     return cast(jax.Array, sum(jnp.vdot(x, y) for x, y in _pairs(a, b)))

@@ -376,6 +376,12 @@ for tableau in (None, 4, cfjax.CF4.tableau, diffrax.Dopri5(), diffrax.KenCarp4.t
 for tableau in (None, [[[]], [[1]]], diffrax.Tsit5.tableau, cfjax.CF4()):
     with pytest.raises(TypeError, match=r"tableau must be a cfjax\.Tableau, got "):
         cfjax.CommutatorFree(tableau)
+for term in (None, lambda t, y, args: y, [1]):
+    with pytest.raises(TypeError, match="term must be a diffrax term.*LieTerm"):
+        cfjax.integrate(term, cfjax.CF4(), 0.0, 1.0, 1.0, num_steps=2)
+for solver in (None, cfjax.CF4):
+    with pytest.raises(TypeError, match="solver must be a diffrax solver.*CF4"):
+        cfjax.integrate(cfjax.LieTerm(print), solver, 0.0, 1.0, 1.0, num_steps=2)
 """
     subprocess.run([sys.executable, "-W", "error", "-c", script], check=True)
 
