@@ -54,7 +54,8 @@ def _evaluate(jaxpr: Jaxpr, consts: Sequence[Any], args: Sequence[Any]) -> list[
     env: dict[Any, Any] = {}
 
     def read(v: Any) -> Any:
-        return jnp.asarray(v.val, v.aval.dtype) if isinstance(v, Literal) else env[v]
+        aval: Any = v.aval
+        return jnp.asarray(v.val, aval.dtype) if isinstance(v, Literal) else env[v]
 
     for variable, value in zip((*jaxpr.constvars, *jaxpr.invars), (*consts, *args), strict=True):
         if not isinstance(value, _Vector):
