@@ -149,18 +149,20 @@ def test_save_at_nodes_of_a_regular_grid(solver):
     close(sol.ys, by_steps(solver, nodes())[np.round(ts * STEPS).astype(int)])
 
 
+def test_output_between_steps_is_an_error_even_where_diffrax_does_not_throw():
+    with pytest.raises(eqx.EquinoxRuntimeError, match=BETWEEN):
+        solve(cfjax.CF4(), saveat=diffrax.SaveAt(ts=np.array([0.075])), throw=False)
+
+
 BETWEEN = r"no output between steps.*StepTo"
 
 
-@pytest.mark.parametrize("ts", [(0.075, 1.0), (0.05, 0.05 + 1e-9), (0.05, 0.999)])
+@pytest.mark.parametrize("ts", [(0.05, 0.05 + 1e-9), (0.05, 0.999)])
 @solvers
 def test_output_between_steps_is_an_error_and_no_number(solver, ts):
     ts = np.array(ts)
     with pytest.raises(eqx.EquinoxRuntimeError, match=BETWEEN):
         solve(solver, saveat=diffrax.SaveAt(ts=ts))
-    # Also where diffrax itself is told not to throw: the error is the solver's.
-    with pytest.raises(eqx.EquinoxRuntimeError, match=BETWEEN):
-        solve(solver, saveat=diffrax.SaveAt(ts=ts), throw=False)
 
 
 @directions
@@ -169,17 +171,15 @@ def test_dense_output_is_right_at_nodes_and_an_error_between(solver, direction):
     saveat = diffrax.SaveAt(dense=True)
     sol = solve(solver, float(direction), direction / STEPS, saveat=saveat, max_steps=STEPS)
     times = nodes(direction)
-    close(jax.vmap(sol.evaluate)(jnp.asarray(times)), by_steps(solver, times))
-    for left in (True, False):
-        for k in (0, 1, 7, STEPS):
-            close(sol.evaluate(times[k], left=left), by_steps(solver, times)[k])
     exact = by_steps(solver, times)
+    close(jax.vmap(sol.evaluate)(jnp.asarray(times)), exact)
+    for left in (True, False):
+        for k in (0, 7, STEPS):
+            close(sol.evaluate(times[k], left=left), exact[k])
     close(sol.evaluate(times[3], times[11]), exact[11] - exact[3])
-    for t in (0.3 * times[1], times[5] + 0.01 * direction, times[-1] - 1e-6 * direction):
+    for t in (0.3 * times[1], times[-1] - 1e-6 * direction):
         with pytest.raises(eqx.EquinoxRuntimeError, match=BETWEEN):
             sol.evaluate(t)
-    with pytest.raises(eqx.EquinoxRuntimeError, match=BETWEEN):
-        jax.vmap(sol.evaluate)(jnp.asarray([times[1], times[1] / 2]))
 
 
 # Fields and states
@@ -311,15 +311,15 @@ def test_a_continuous_event_ends_on_the_step_where_its_sign_changes(solver):
 # Progress meters
 
 
-@solvers
-def test_a_text_progress_meter(solver, capfd):
+def test_a_text_progress_meter(capfd):
     meter = diffrax.TextProgressMeter(minimum_increase=0.25)
-    sol = solve(solver, progress_meter=meter)
+    sol = solve(cfjax.CF4(), progress_meter=meter)
+    assert sol.ys is not None
     jax.block_until_ready(sol.ys)
     jax.effects_barrier()
     lines = capfd.readouterr().out.split()
     assert lines[0] == "0.00%" and lines[-1] == "100.00%" and 4 <= len(lines) <= 6
-    close(sol.ys[-1], by_steps(solver, nodes())[-1])
+    close(sol.ys[-1], by_steps(cfjax.CF4(), nodes())[-1])
 
 
 def test_a_bar_as_progress_meter(capfd):
