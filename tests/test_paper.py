@@ -1,3 +1,4 @@
+import functools
 import os
 import subprocess
 import sys
@@ -9,20 +10,21 @@ from rich.progress import Progress
 
 from cfjax import _paper
 from cfjax.__main__ import main
+from cfjax._paper import rigid_body
 
 FILES = ["figure1.pdf", "figure1.png", "figure2.pdf", "figure2.png"]
 
 
 @pytest.fixture(scope="module")
 def trajectories():
-    methods = _paper.METHODS | _paper.series_in_full()
-    return {name: _paper.trajectory(method) for name, method in methods.items()}
+    methods = rigid_body.METHODS | rigid_body.series_in_full()
+    return {name: rigid_body.trajectory(method) for name, method in methods.items()}
 
 
 @pytest.fixture(scope="module")
 def work():
     with Progress(disable=True) as progress:
-        return _paper.efficiencies((1000, 2000, 4000), 3, progress)
+        return rigid_body.efficiencies((1000, 2000, 4000), 3, progress)
 
 
 # What the paper finds, and what it does not find here.
@@ -56,7 +58,7 @@ def test_ranking_with_every_commutator_is_the_papers(trajectories):
 
 
 def test_flops_of_a_step(work):
-    flops = {name: _paper.flops_of_step(method) for name, method in _paper.METHODS.items()}
+    flops = {name: rigid_body.flops_of_step(method) for name, method in rigid_body.METHODS.items()}
     assert flops["CF3"] < flops["RKMK3"] < flops["RKMK4"] < flops["CF4"] < 1.25 * flops["RKMK4"]
     for name, cost in work.items():
         np.testing.assert_array_equal(cost.flops, flops[name] * np.array([1000, 2000, 4000]))
@@ -73,7 +75,7 @@ def test_efficiency_has_the_errors_of_the_trajectories(trajectories, work):
 
 
 def test_text_in_figures_is_neither_cut_nor_covered(trajectories, work):
-    for figure in (_paper.figure_1(trajectories), _paper.figure_2(work)):
+    for figure in (rigid_body.figure_1(trajectories), rigid_body.figure_2(work)):
         FigureCanvasAgg(figure).draw()
         (caption,) = (text.get_window_extent() for text in figure.texts)
         panels = [box for axes in figure.axes if (box := axes.get_tightbbox()) is not None]
@@ -96,15 +98,14 @@ def check_files(output):
             assert 900 < height < 1600
 
 
-def test_a_failure_keeps_the_old_files(tmp_path, monkeypatch):
+def test_a_failure_keeps_the_old_files(tmp_path):
     (tmp_path / "figure1.png").write_bytes(b"old")
 
-    def fail(method):
+    def fail(progress):
         raise RuntimeError("no errors today")
 
-    monkeypatch.setattr(_paper, "trajectory", fail)
     with pytest.raises(RuntimeError, match="no errors today"):
-        _paper.run(tmp_path)
+        _paper.run(tmp_path, [fail])
     assert os.listdir(tmp_path) == ["figure1.png"]
     assert (tmp_path / "figure1.png").read_bytes() == b"old"
 
@@ -125,7 +126,8 @@ def test_command_as_a_user_runs_it_and_a_second_run(tmp_path, capsys):
     check_files(output)
     for name in FILES:
         (output / name).write_bytes(b"old")
-    _paper.run(output, step_counts=(500, 1000), repeats=2)
+    short = functools.partial(rigid_body.report, step_counts=(500, 1000), repeats=2)
+    _paper.run(output, [short])
     check_files(output)
     for printed in (done.stdout, capsys.readouterr().out):
         for text in ("RKMK3", "RKMK4", "5.1e-04", "0.970252535114", "The paper finds"):

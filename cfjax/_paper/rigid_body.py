@@ -4,12 +4,8 @@ Source: Celledoni, Marthinsen & Owren, Commutator-free Lie group methods, FGCS 1
 Section 3.1.
 """
 
-import os
-import tempfile
-import textwrap
 import time
 from collections.abc import Callable, Mapping, Sequence
-from pathlib import Path
 from typing import NamedTuple
 
 import diffrax
@@ -18,17 +14,16 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Float, Int
 from matplotlib.figure import Figure
-from matplotlib.layout_engine import ConstrainedLayoutEngine
-from rich.console import Console
 from rich.progress import Progress
 from rich.table import Table
 
-from ._flops import count_flops
-from ._integrate import integrate
-from ._solvers.commutator_free import CF3, CF4
-from ._solvers.munthe_kaas import RKMK, RKMK3, RKMK4
-from ._term import LieTerm
-from .scenes import rigid_body
+from .._flops import count_flops
+from .._integrate import integrate
+from .._solvers.commutator_free import CF3, CF4
+from .._solvers.munthe_kaas import RKMK, RKMK3, RKMK4
+from .._term import LieTerm
+from ..scenes import rigid_body
+from .figures import STYLES, Report, finish, new_figure, number
 
 METHODS: dict[str, diffrax.AbstractSolver] = {
     "CF3": CF3(),
@@ -46,14 +41,6 @@ STEP_COUNTS = tuple(500 * 2**k for k in range(7))
 REPEATS = 100
 
 _TERM = LieTerm(rigid_body.field)
-
-# Colours of Okabe & Ito that colour-blind readers tell apart; the line styles serve all others.
-_STYLES = {
-    "CF3": dict(color="#009E73", linestyle="-.", marker="^"),
-    "RKMK3": dict(color="#CC79A7", linestyle=":", marker="v", linewidth=1.9),
-    "CF4": dict(color="#0072B2", linestyle="-", marker="o"),
-    "RKMK4": dict(color="#D55E00", linestyle="--", marker="s"),
-}
 
 
 class Trajectory(NamedTuple):
@@ -73,34 +60,20 @@ class Efficiency(NamedTuple):
     seconds: Float[np.ndarray, "counts repeats"]
 
 
-def run(output: Path, *, step_counts: Sequence[int] = STEP_COUNTS, repeats: int = REPEATS) -> None:
-    """Prints the table and writes figure1 and figure2 as PNG and PDF to the folder `output`.
-
-    Needs float64. `step_counts` and `repeats` are those of Figure 2.
-
-    **Raises** `OSError` if the folder cannot be made or written to.
-    """
-    output.mkdir(parents=True, exist_ok=True)
-    # On the folder's own disk, so that each figure arrives whole by a rename. Made first, so that
-    # a folder without permission fails before the work.
-    with tempfile.TemporaryDirectory(dir=output, prefix=".paper-") as folder:
-        bar = Console(stderr=True)
-        with Progress(console=bar, transient=True, disable=not bar.is_terminal) as progress:
-            methods = METHODS | series_in_full()
-            trajectories = {
-                name: trajectory(method)
-                for name, method in progress.track(methods.items(), description="Errors in time")
-            }
-            work = efficiencies(step_counts, repeats, progress)
-        console = Console()
-        console.print(reference_table())
-        console.print(error_table(trajectories))
-        console.print(FINDINGS)
-        for name, figure in {"figure1": figure_1(trajectories), "figure2": figure_2(work)}.items():
-            for path in (f"{name}.png", f"{name}.pdf"):
-                figure.savefig(Path(folder, path), dpi=200)
-                os.replace(Path(folder, path), output / path)
-                console.print(f"Wrote {output / path}", soft_wrap=True)
+def report(
+    progress: Progress, *, step_counts: Sequence[int] = STEP_COUNTS, repeats: int = REPEATS
+) -> Report:
+    """The table of errors, and Figures 1 and 2. `step_counts` and `repeats` are Figure 2's."""
+    methods = METHODS | series_in_full()
+    trajectories = {
+        name: trajectory(method)
+        for name, method in progress.track(methods.items(), description="Rigid body")
+    }
+    work = efficiencies(step_counts, repeats, progress)
+    return Report(
+        printed=[reference_table(), error_table(trajectories), FINDINGS],
+        figures={"figure1": figure_1(trajectories), "figure2": figure_2(work)},
+    )
 
 
 def series_in_full() -> dict[str, diffrax.AbstractSolver]:
@@ -231,26 +204,26 @@ def error_table(trajectories: Mapping[str, Trajectory]) -> Table:
 def figure_1(trajectories: Mapping[str, Trajectory]) -> Figure:
     """Energy error and global error against time."""
     final = {name: run.error[-1] for name, run in trajectories.items()}
-    figure = _figure(
+    figure = new_figure(
         (7.0, 7.2),
         "Free rigid body, h = 0.1, after Figure 1 of Celledoni, Marthinsen & Owren (2003). The "
         "paper finds CF4 and RKMK4 nearly indistinguishable, with CF4 the most efficient (Figure "
         "2), and more drift in CF3 and RKMK3. Here the error at t = 100 is "
-        f"{_number(final['CF4'])} with CF4 and {_number(final['RKMK4'])} with RKMK4. In the paper "
+        f"{number(final['CF4'])} with CF4 and {number(final['RKMK4'])} with RKMK4. In the paper "
         "RKMK3 conserves energy better than CF3 and RKMK4 is slightly ahead of CF4. Here both are "
         "the other way round, unless the Munthe-Kaas methods keep every commutator of the series: "
-        f"then RKMK4 ends at {_number(final['RKMK4, full series'])}.",
+        f"then RKMK4 ends at {number(final['RKMK4, full series'])}.",
     )
     upper, lower = figure.subplots(2, 1, sharex=True)
     for name in METHODS:
-        run, style = trajectories[name], _STYLES[name] | {"marker": ""}
+        run, style = trajectories[name], STYLES[name] | {"marker": ""}
         upper.semilogy(run.t, run.energy_error, label=name, **style)
         lower.semilogy(run.t, run.error, **style)
     upper.set_ylabel("energy error")
     lower.set_ylabel("global error (2-norm)")
     lower.set_xlabel("time t (dimensionless)")
     lower.set_xlim(rigid_body.t0, rigid_body.t1)
-    _finish(figure)
+    finish(figure, len(METHODS))
     return figure
 
 
@@ -259,7 +232,7 @@ def figure_2(work: Mapping[str, Efficiency]) -> Figure:
     flops, seconds = _cost_at_equal_error(work["CF4"], work["RKMK4"], order=4)
     flops_3, seconds_3 = _cost_at_equal_error(work["CF3"], work["RKMK3"], order=3)
     steps = (rigid_body.t1 - rigid_body.t0) / work["CF4"].num_steps
-    figure = _figure(
+    figure = new_figure(
         (7.0, 5.4),
         "Global error at t = 100 against the work of the whole integration with h = "
         f"{steps[0]:g} to {steps[-1]:g}, after Figure 2 of "
@@ -273,17 +246,17 @@ def figure_2(work: Mapping[str, Efficiency]) -> Figure:
     )
     left, right = figure.subplots(1, 2, sharey=True)
     for name, cost in work.items():
-        left.loglog(cost.flops, cost.error, label=name, markersize=4, **_STYLES[name])
+        left.loglog(cost.flops, cost.error, label=name, markersize=4, **STYLES[name])
         low, median, high = 1e3 * np.percentile(cost.seconds, (25, 50, 75), axis=-1)
         spread = (median - low, high - median)
-        right.errorbar(median, cost.error, xerr=spread, capsize=3, markersize=4, **_STYLES[name])
+        right.errorbar(median, cost.error, xerr=spread, capsize=3, markersize=4, **STYLES[name])
     right.set_xscale("log")
     right.xaxis.set_major_formatter("{x:g}")
     left.set_ylabel("global error at t = 100 (2-norm)")
     left.set_xlabel("flops")
     right.set_xlabel("time (ms)")
     figure.align_xlabels()
-    _finish(figure)
+    finish(figure, len(METHODS))
     return figure
 
 
@@ -297,28 +270,3 @@ def _cost_at_equal_error(a: Efficiency, b: Efficiency, *, order: int) -> tuple[f
     flops = a.flops[-1] / b.flops[-1]
     seconds = np.median(a.seconds / b.seconds)
     return float(flops * steps), float(seconds * steps)
-
-
-def _number(x: float) -> str:
-    mantissa, exponent = f"{x:.1e}".split("e")
-    superscript = str(int(exponent)).translate(str.maketrans("-0123456789", "⁻⁰¹²³⁴⁵⁶⁷⁸⁹"))
-    return f"{mantissa} · 10{superscript}"
-
-
-def _figure(size: tuple[float, float], caption: str) -> Figure:
-    """An empty figure of `size` inches with a caption below."""
-    text = textwrap.fill(caption, 112)
-    width, height = size
-    below = (0.16 * (text.count("\n") + 1) + 0.15) / height
-    layout = ConstrainedLayoutEngine(rect=(0, below, 1, 1 - below))
-    figure = Figure(figsize=(width, height), layout=layout)
-    figure.text(0.12 / width, 0.08 / height, text, fontsize=8, linespacing=1.3, va="bottom")
-    return figure
-
-
-def _finish(figure: Figure) -> None:
-    """A grid in every panel, and one legend above them all."""
-    for axes in figure.axes:
-        axes.grid(color="0.9", linewidth=0.6)
-        axes.set_axisbelow(True)
-    figure.legend(loc="outside upper center", ncols=len(METHODS), frameon=False, handlelength=3.5)
