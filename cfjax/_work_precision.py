@@ -159,7 +159,8 @@ def absolute_tolerance(tolerance: Float[Array, ""]) -> diffrax.AbstractStepSizeC
 def distance(y: PyTree, reference: PyTree) -> float:
     """The 2-norm of the difference, all parts of the state together."""
     parts = jtu.tree_map(lambda a, b: np.ravel(np.asarray(a) - np.asarray(b)), y, reference)
-    return float(np.linalg.norm(np.concatenate(jtu.tree_leaves(parts))))
+    with np.errstate(over="ignore"):
+        return float(np.linalg.norm(np.concatenate(jtu.tree_leaves(parts))))
 
 
 def work_precision(
@@ -250,7 +251,7 @@ def work_precision(
         y, attempted, rejected, note = _first_run(program)
         distance_ = np.nan if note else float(error(y, reference))
         if not note and not np.isfinite(distance_):
-            note = "The error is not finite."
+            distance_, note = np.nan, "The error is not finite."
         tolerance = setting if is_adaptive else np.nan
         rows.append((tolerance, distance_, attempted, rejected, *cost.of(attempted), seconds))
         names.append(name)
@@ -542,5 +543,9 @@ def _about(name: str) -> Iterator[None]:
         raise
 
 
-def _track(progress: Any, items: Iterable, total: int, description: str) -> Iterable:
-    return items if progress is None else progress.track(items, total, description=description)
+def _track(progress: Any, items: Iterable, total: int, description: str) -> Iterator:
+    task = None if progress is None else progress.add_task(description, total=total)
+    for item in items:
+        yield item
+        if progress is not None:
+            progress.advance(task)
