@@ -440,6 +440,100 @@ def test_a_failure_of_the_solver_is_an_error():
         jax.block_until_ready(sol.ys)
 
 
+# A blow-up is never a number. Here y' = y^2, infinite at t = 1 / y0.
+
+
+def explosion(y0=1.0, **options):
+    # With a rotation and a matrix beside it: part of the state stays finite, and so does its field.
+    def field(t, y, args):
+        return {"a": y["a"] ** 2, "b": cfjax.Rotation(jnp.ones(3)), "c": -y["c"]}
+
+    y0 = {"a": jnp.asarray([0.1, y0]), "b": Y0, "c": jnp.eye(2)}
+    return cfjax.integrate(
+        cfjax.LieTerm(field), cfjax.CF4(), 0.0, 2.0, y0, num_steps=100, **options
+    )
+
+
+@pytest.mark.parametrize("save_every", [None, 1, 25])
+def test_a_blow_up_is_an_error(save_every):
+    with pytest.raises(eqx.EquinoxRuntimeError, match="Nonfinite"):
+        jax.block_until_ready(explosion(save_every=save_every).ys)
+
+
+def test_a_blow_up_inside_jit_is_an_error():
+    with pytest.raises(eqx.EquinoxRuntimeError, match="Nonfinite"):
+        jax.block_until_ready(eqx.filter_jit(explosion)().ys)
+
+
+def test_the_result_tells_of_a_blow_up_where_nothing_is_thrown():
+    sol = explosion(throw=False, save_every=25)
+    assert sol.result == diffrax.RESULTS.nonfinite
+    # Saved at t = 1/2, 1, 3/2 and 2.
+    finite = np.isfinite(np.asarray(sol.ys["a"][:, 1]))
+    assert finite[0] and not finite[-2:].any()
+    assert np.isfinite(np.asarray(sol.ys["b"])).all()
+    calm = explosion(0.4, throw=False)
+    assert calm.result == diffrax.RESULTS.successful
+    # y(2) = y0 / (1 - 2 y0), to the error of 100 steps of order 4.
+    close(calm.ys["a"][-1], [0.1 / 0.8, 0.4 / 0.2], atol=1e-6)
+
+
+def test_in_a_batch_the_result_tells_which_blew_up():
+    starts = jnp.asarray([0.4, 1.0, 0.2])
+    sol = jax.vmap(lambda y: explosion(y, throw=False))(starts)
+    failed = jax.vmap(lambda r: r != diffrax.RESULTS.successful)(sol.result)
+    assert failed.tolist() == [False, True, False]
+    with pytest.raises(eqx.EquinoxRuntimeError, match="Nonfinite"):
+        jax.block_until_ready(eqx.filter_vmap(explosion)(starts).ys)
+
+
+def test_a_start_that_is_not_finite_is_in_the_result():
+    assert explosion(np.nan, throw=False).result == diffrax.RESULTS.nonfinite
+
+
+@pytest.mark.parametrize(
+    "field, y0",
+    [
+        (cfjax.Rotation, jnp.ones(3)),
+        (lambda w: cfjax.LeftMatrix(jnp.diag(w)), jnp.ones(3)),
+        (lambda w: cfjax.RightMatrix(jnp.diag(w)), jnp.ones((2, 3))),
+        (lambda w: w, jnp.ones(3)),
+    ],
+    ids=["Rotation", "LeftMatrix", "RightMatrix", "translation"],
+)
+@pytest.mark.parametrize("bad", [np.inf, -np.inf, np.nan])
+def test_no_flow_leads_back_from_infinity(field, y0, bad):
+    """So what is not finite at one step is not finite at a later one, where it is looked for."""
+    lost = y0.at[..., 0].set(bad)
+    ways = [(jnp.ones(3), lost), (jnp.ones(3).at[0].set(bad), lost), (jnp.zeros(3), lost)]
+    for velocity, start in ways:
+        assert not np.isfinite(np.asarray(cfjax.flow(field(velocity), start))).all()
+    # And a field that is lost takes the state with it.
+    end = cfjax.flow(field(jnp.ones(3).at[0].set(bad)), y0)
+    assert not np.isfinite(np.asarray(end)).all()
+
+
+def test_what_diffrax_says_of_a_blow_up():
+    """diffrax leaves NaN in the state, which is visible; a controller runs out of steps."""
+    term = cfjax.LieTerm(lambda t, y, args: y**2)
+    y0 = jnp.ones(2)
+    options: Any = dict(adjoint=diffrax.ForwardMode(), throw=False)
+    fixed = diffrax.diffeqsolve(term, cfjax.CF4(), 0.0, 2.0, 0.01, y0, **options)
+    assert np.isnan(np.asarray(fixed.ys)).all()
+    adaptive = diffrax.diffeqsolve(
+        term,
+        diffrax.HalfSolver(cfjax.CF4()),
+        0.0,
+        2.0,
+        0.01,
+        y0,
+        stepsize_controller=diffrax.PIDController(rtol=0.0, atol=1e-6),
+        max_steps=500,
+        **options,
+    )
+    assert adaptive.result == diffrax.RESULTS.max_steps_reached
+
+
 # Long runs keep what they should. The bounds are those of a random walk of roundings, with room
 # of a factor of 3 over what was measured; the drift of a method off the manifold is not close.
 

@@ -1,0 +1,357 @@
+"""Where methods fail: linear stability, large rotations, near-singular tableaus, float32."""
+
+from fractions import Fraction
+from typing import Any
+
+import diffrax
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import mpmath
+import numpy as np
+import problems
+import pytest
+
+import cfjax
+from cfjax.scenes import rigid_body
+
+RNG = np.random.default_rng(5)
+
+
+# Linear stability
+
+
+class Affine(cfjax.AbstractFrozenField):
+    """The field `u -> a rate u + b`, entry by entry; `rate` is structure."""
+
+    a: jax.Array
+    b: jax.Array
+    rate: jax.Array
+
+    def flow(self, point):
+        z = self.a.astype(self.rate.dtype) * self.rate
+        safe = jnp.where(z == 0, 1, z)
+        phi = jnp.where(z == 0, 1, (jnp.exp(safe) - 1) / safe)
+        return jnp.exp(z) * point + phi * self.b
+
+    def tangent(self, point):
+        return self.a.astype(self.rate.dtype) * self.rate * point + self.b
+
+    @classmethod
+    def combine(cls, weights, fields):
+        a, b = (
+            cfjax.combine(weights, part) for part in zip(*((f.a, f.b) for f in fields), strict=True)
+        )
+        return cls(a, b, fields[0].rate)
+
+
+@eqx.filter_jit
+def one_step(solver, z, w):
+    """A step of size 1 of `u' = z u + w u` from 1 with z in the flow, for arrays of z and w."""
+
+    def field(t, u, args):
+        return Affine(jnp.ones(()), args[1] * u, args[0])
+
+    t0, t1 = jnp.zeros(()), jnp.ones(())
+    term = cfjax.LieTerm(field)
+    return solver.step(term, t0, t1, jnp.ones_like(z), (z, w), None, made_jump=False)[0]
+
+
+def random_tableau():
+    alpha = [[], [RNG.normal(size=1)], [RNG.normal(size=2), RNG.normal(size=1)]]
+    beta = RNG.normal(size=(3, 3))
+    return cfjax.Tableau(alpha, beta / beta.sum())
+
+
+SOLVERS = [
+    cfjax.LieEuler(),
+    cfjax.CF2(),
+    cfjax.CF3(),
+    cfjax.CF4(),
+    cfjax.CG3(),
+    cfjax.CG5(),
+    cfjax.CommutatorFree(cfjax.third_order_b(0.9)),
+    cfjax.CommutatorFree(random_tableau()),
+]
+
+
+@pytest.mark.parametrize("solver", SOLVERS, ids=lambda s: type(s).__name__)
+def test_the_tableau_says_what_a_real_step_does(solver):
+    z, w = RNG.normal(size=(2, 200)) + 1j * RNG.normal(size=(2, 200))
+    z[:2] = 0
+    found = cfjax.stability_function(solver.tableau, z, w)
+    expected = one_step(solver, jnp.asarray(z), jnp.asarray(w))
+    # One polynomial in products of up to 9 numbers of size 3, summed in another order. Where z is
+    # small the step's own (exp z - 1) / z loses up to 1 / |z| units.
+    scale = np.abs(found).max()
+    np.testing.assert_allclose(found, expected, rtol=0, atol=1e-13 * scale)
+
+
+@pytest.mark.parametrize("solver", SOLVERS, ids=lambda s: type(s).__name__)
+def test_without_an_explicit_part_a_step_is_exact(solver):
+    z = np.array([0, -1e-9, -1, -50, 3j, -2 + 5j])
+    found = cfjax.stability_function(solver.tableau, z, 0)
+    # At most 43 exponentials, whose exponents of up to 50 are off by a unit of rounding each.
+    np.testing.assert_allclose(found, np.exp(z), rtol=43 * 50 * 2.0**-52)
+
+
+def test_negative_rows_overflow_where_dissipation_is_strong():
+    """They go backwards in time: a Crouch-Grossman method meets exp(+|z|) on its way."""
+    z = -1e6
+    assert min(min(row) for row in cfjax.CG3.tableau.beta) < 0
+    for solver in (cfjax.CG3(), cfjax.CG5()):
+        assert not np.isfinite(cfjax.stability_function(solver.tableau, z, 1.0))
+        step = one_step(solver, jnp.full(1, z + 0j), jnp.full(1, 1 + 0j))
+        assert not np.isfinite(np.asarray(step)).any()
+    for solver in (cfjax.CF3(), cfjax.CF4()):
+        assert np.abs(cfjax.stability_function(solver.tableau, z, 1.0)) < 1e-5
+
+
+@pytest.mark.parametrize("solver, order", [(cfjax.CF3(), 3), (cfjax.CF4(), 4), (cfjax.CF2(), 2)])
+def test_without_an_exact_part_it_is_the_classical_polynomial(solver, order):
+    """A method of as many stages as its order has the truncated series of the exponential."""
+    w = 3 * (RNG.normal(size=50) + 1j * RNG.normal(size=50))
+    series = sum(w**k / float(mpmath.factorial(k)) for k in range(order + 1))
+    found = cfjax.stability_function(solver.tableau, 0, w)
+    np.testing.assert_allclose(found, series, rtol=1e-13)
+
+
+@pytest.mark.parametrize(
+    "solver, direction, limit",
+    [
+        # Hairer & Wanner, Solving Ordinary Differential Equations II, Section IV.2.
+        (cfjax.CF4(), -1, 2.785293563405282),
+        (cfjax.CF4(), 1j, np.sqrt(8)),
+        (cfjax.CF3(), -1, 2.512745326618329),
+        (cfjax.CF3(), 1j, np.sqrt(3)),
+    ],
+)
+def test_known_intervals_of_stability(solver, direction, limit):
+    def growth(x):
+        return np.abs(cfjax.stability_function(solver.tableau, 0, direction * x))
+
+    inside = np.linspace(0, limit * (1 - 1e-9), 1000)
+    assert np.all(growth(inside) <= 1 + 1e-15)
+    assert np.all(growth(limit * np.array([1 + 1e-9, 1.01, 2])) > 1)
+
+
+def test_the_limit_is_that_of_many_steps():
+    """CF4 at an exact part of z = -20: just inside the limit steps decay, outside they grow."""
+    z, tableau = -20.0, cfjax.CF4.tableau
+    w = np.linspace(-30, 0, 300_001)
+    stable = np.abs(cfjax.stability_function(tableau, z, w)) <= 1
+    limit = w[np.flatnonzero(stable)[0]]
+    # More than the 2.785 without an exact part: the flow damps what the explicit part excites.
+    assert -25 < limit < -20
+    for factor, grows in ((0.99, False), (1.01, True)):
+        u = jnp.ones(1, complex)
+        for _ in range(20):
+            step = one_step(cfjax.CF4(), jnp.full(1, z + 0j), jnp.full(1, factor * limit + 0j))
+            u = u * step
+        assert (abs(u[0]) > 1) == grows
+
+
+def test_phi_at_small_and_large_arguments():
+    """A step of the exponential Euler method is exp(z) + w (exp(z) - 1) / z."""
+    z = np.array([1e-300, 1e-17, -1e-9, 1e-5j, 1e-3 + 1e-4j, -1.0, 700j, -1e3, -1e10])
+    found = cfjax.stability_function(cfjax.LieEuler.tableau, z, 1.0)
+    with mpmath.workdps(40):
+        expected = [complex(mpmath.exp(x) + mpmath.expm1(x) / x) for x in map(mpmath.mpc, z)]
+    np.testing.assert_allclose(found, expected, rtol=1e-14)
+
+
+def test_shapes_and_mistakes():
+    tableau = cfjax.CF4.tableau
+    assert cfjax.stability_function(tableau, 0, 0).shape == ()
+    assert cfjax.stability_function(tableau, np.zeros((3, 1)), np.zeros(4)).shape == (3, 4)
+    wrong: Any = cfjax.CF4()
+    with pytest.raises(TypeError, match="tableau"):
+        cfjax.stability_function(wrong, 0, 0)
+
+
+# Large rotations
+
+
+TERM = cfjax.LieTerm(rigid_body.field)
+START, INERTIA = jnp.asarray(rigid_body.y0), jnp.asarray(rigid_body.inertia)
+LENGTH = np.linalg.norm(rigid_body.y0)
+
+
+@pytest.mark.parametrize("solver", [cfjax.CF3(), cfjax.CF4(), cfjax.RKMK4()])
+@pytest.mark.parametrize("dtype", [np.float32, np.float64])
+def test_large_steps_stay_on_the_sphere(solver, dtype):
+    """However large the angle, a rotation is one.
+
+    The commutators of RKMK4 make angles of h^2 / 12, which single precision still resolves for
+    h = 100.
+    """
+    eps = np.finfo(dtype).eps
+    for h in (0.5, 4.0, 100.0, 1e4)[: 3 if dtype is np.float32 else 4]:
+        sol = cfjax.integrate(
+            TERM,
+            solver,
+            0.0,
+            64 * h,
+            START.astype(dtype),
+            INERTIA.astype(dtype),
+            num_steps=64,
+            save_every=1,
+        )
+        length = np.linalg.norm(np.asarray(sol.ys, float), axis=1)
+        # 64 steps of two flows, each with a few roundings: a random walk of 5 sqrt(128) halves.
+        assert np.abs(length - LENGTH).max() < 5 * np.sqrt(128) * eps / 2
+
+
+@pytest.mark.parametrize("solver", [cfjax.CF3(), cfjax.CF4(), cfjax.RKMK4()])
+def test_the_error_of_large_steps_is_large_and_seen(solver):
+    """Beyond a rotation by one radian a step says nothing, and two step sizes disagree.
+
+    On the sphere no error exceeds twice its radius, so only a comparison can tell.
+    """
+
+    def solve(h, num_steps):
+        sol = cfjax.integrate(
+            TERM, solver, 0.0, h * num_steps, START, INERTIA, num_steps=num_steps, save_every=1
+        )
+        return np.asarray(sol.ys)
+
+    for h in (2.0, 4.0, 8.0, 16.0):
+        coarse, fine = solve(h, 16), solve(h / 2, 32)[1::2]
+        exact = rigid_body.reference(h * np.arange(1, 17))
+        error = np.linalg.norm(coarse - exact, axis=1).max()
+        assert 0.5 < error < 2 * LENGTH + 1e-12
+        seen = np.linalg.norm(coarse - fine, axis=1).max()
+        assert seen > error / 4
+
+
+@pytest.mark.parametrize("dt0", [0.01, 10.0, 50.0])
+def test_a_huge_first_step_is_rejected(dt0):
+    tolerance = 1e-6
+    sol = diffrax.diffeqsolve(
+        TERM,
+        diffrax.HalfSolver(cfjax.CF4()),
+        0.0,
+        50.0,
+        dt0,
+        START,
+        INERTIA,
+        stepsize_controller=diffrax.PIDController(rtol=0.0, atol=tolerance),
+    )
+    error = np.linalg.norm(np.asarray(sol.ys[-1]) - rigid_body.reference(50.0))
+    # Some 700 steps with errors below the tolerance, which the flow lets grow with time.
+    assert error < 1000 * tolerance
+    assert sol.stats["num_rejected_steps"] > 0 or dt0 == 0.01
+
+
+# Near-singular parameters of the third-order families
+
+
+@pytest.fixture(scope="module")
+def body_answer():
+    return problems.reference(
+        lambda t, y: problems.driven_body_ode(t, y, problems.INERTIA), 0.0, 1.0, problems.MOMENTUM
+    )
+
+
+def errors(tableau, answer, steps, dtype=np.float64):
+    return problems.errors(
+        problems.driven_body,
+        cfjax.CommutatorFree(tableau),
+        dtype(1.0),
+        dtype(problems.MOMENTUM),
+        dtype(problems.INERTIA),
+        answer,
+        steps,
+    )
+
+
+# At these the stages 2 and 3, or 1 and 3, come together, and the weights are a difference quotient.
+TOGETHER = [
+    (cfjax.third_order_a, Fraction(1, 3), Fraction(1, 2)),
+    (cfjax.third_order_a, Fraction(0), Fraction(1, 2)),
+    (cfjax.third_order_b, Fraction(1, 3), Fraction(1, 3)),
+]
+
+
+@pytest.mark.parametrize("family, singular, residue", TOGETHER)
+def test_weights_grow_and_the_error_constant_does_not(family, singular, residue):
+    constants = []
+    for k in (3, 4, 5, 6):
+        distance = Fraction(1, 10**k)
+        tableau = family(singular + distance)
+        assert cfjax.order(tableau) == 3
+        largest = max(abs(x) for row in tableau.beta for x in row)
+        # The weight is the residue over the distance, plus something bounded.
+        assert abs(largest * distance - residue) < 2 * distance
+        constants.append(cfjax.error_constant(tableau))
+    np.testing.assert_allclose(constants, constants[-1], rtol=2e-3)
+
+
+@pytest.mark.parametrize("family, singular, residue", TOGETHER)
+def test_close_stages_magnify_rounding(family, singular, residue, body_answer):
+    """The floor is eps over the distance; above it the order is 3 and the error no larger."""
+    near, far = (float(singular) + d for d in (1e-4, 0.1))
+    found = errors(family(near), body_answer, [16, 32, 64])
+    assert abs(problems.slope([16, 32, 64], found) - 3) < 0.15
+    assert found[-1] < 2 * errors(family(far), body_answer, [64])[0]
+    distances = np.array([1e-4, 1e-5, 1e-6, 1e-7])
+    rounding = [
+        errors(family(float(singular) + d), body_answer, [24, 32, 40, 48], np.float32)
+        for d in distances
+    ]
+    floor = np.sqrt(np.mean(np.square(rounding), axis=1))
+    # A unit of rounding in each of n stage values, times h times the weight, as a random walk.
+    expected = 2.0**-24 * float(residue) / distances / np.sqrt(36)
+    assert np.all((floor / expected > 1 / 5) & (floor / expected < 5))
+
+
+@pytest.mark.parametrize("side", [-1, 1])
+def test_a_far_stage_makes_the_error_constant_grow(side, body_answer):
+    """At alpha = 1 of family B the second stage goes to infinity, and order 3 is late to come."""
+    constants = []
+    for k in (3, 4, 5):
+        distance = Fraction(1, 10**k)
+        tableau = cfjax.third_order_b(1 + side * distance)
+        assert cfjax.order(tableau) == 3
+        # c2 = 2 (3 alpha^2 - 3 alpha + 1) / (3 (1 - alpha)), whose residue is 2/3.
+        assert abs(abs(tableau.c[1]) * distance - Fraction(2, 3)) < 3 * distance
+        constants.append(cfjax.error_constant(tableau) * float(distance))
+    # b2 c2^3 is of size 1 / distance.
+    np.testing.assert_allclose(constants, constants[-1], rtol=0.01)
+
+    near = cfjax.third_order_b(1 + side * 1e-2)
+    coarse, fine = [16, 32, 64], [2048, 4096, 8192]
+    assert problems.slope(coarse, errors(near, body_answer, coarse)) < 2.6
+    assert abs(problems.slope(fine, errors(near, body_answer, fine)) - 3) < 0.15
+
+
+# float32
+
+
+def test_the_floor_of_single_precision_is_a_random_walk():
+    """The distance to the same steps in float64, for sixteen starts."""
+    starts = RNG.normal(size=(16, 3))
+    starts /= np.linalg.norm(starts, axis=1, keepdims=True)
+
+    def ends(num_steps, dtype):
+        def solve(y0):
+            inertia = jnp.asarray(rigid_body.inertia, dtype)
+            return cfjax.integrate(
+                TERM, cfjax.CF4(), 0.0, 10.0, y0, inertia, num_steps=num_steps
+            ).ys[-1]
+
+        return np.asarray(jax.jit(jax.vmap(solve))(jnp.asarray(starts, dtype)), float)
+
+    steps = np.array([1000, 4000, 16_000, 64_000])
+    floor = np.array(
+        [
+            np.sqrt(np.mean(np.sum((ends(n, np.float32) - ends(n, np.float64)) ** 2, axis=1)))
+            for n in steps
+        ]
+    )
+    walk = 2.0**-24 * np.sqrt(steps)
+    # Two flows a step round three entries by a third of a unit on average; to t = 10 the flow
+    # itself lets an error grow some ten times.
+    assert np.all((floor > 0.3 * walk) & (floor < 10 * walk))
+    # Neither flat nor linear in the number of steps.
+    assert abs(-problems.slope(steps, floor) - 0.5) < 0.25
