@@ -238,9 +238,10 @@ def test_a_huge_first_step_is_rejected(dt0):
         stepsize_controller=diffrax.PIDController(rtol=0.0, atol=tolerance),
     )
     error = np.linalg.norm(np.asarray(sol.ys[-1]) - rigid_body.reference(50.0))
-    # Some 700 steps with errors below the tolerance, which the flow lets grow with time.
-    assert error < 1000 * tolerance
-    assert sol.stats["num_rejected_steps"] > 0 or dt0 == 0.01
+    # Some 500 steps with errors of both signs below the tolerance, which grow with time.
+    assert error < 100 * tolerance
+    # Each rejection divides the step by at most ten, down to about 0.1.
+    assert sol.stats["num_rejected_steps"] >= np.log10(dt0 / 0.1)
 
 
 # Near-singular parameters of the third-order families
@@ -330,7 +331,7 @@ def test_a_far_stage_makes_the_error_constant_grow(side, body_answer):
 
 def test_the_floor_of_single_precision_is_a_random_walk():
     """The distance to the same steps in float64, for sixteen starts."""
-    starts = RNG.normal(size=(16, 3))
+    starts = np.random.default_rng(7).normal(size=(16, 3))
     starts /= np.linalg.norm(starts, axis=1, keepdims=True)
 
     def ends(num_steps, dtype):

@@ -1,0 +1,183 @@
+"""Where methods fail: draws stability.png beside this file.
+
+Run as `python benchmarks/stability.py`; takes about a minute.
+"""
+
+from pathlib import Path
+from typing import Any
+
+import diffrax
+import jax
+import jax.numpy as jnp
+import numpy as np
+from matplotlib.axes import Axes
+from matplotlib.figure import Figure
+
+import cfjax
+from cfjax.scenes import rigid_body
+
+BLUE, RED, GREEN, PINK, GREY = "#0072B2", "#D55E00", "#009E73", "#CC79A7", "#777777"
+TERM = cfjax.LieTerm(rigid_body.field)
+# The same field in space, for methods that know nothing of the sphere.
+SPACE = diffrax.ODETerm(lambda t, y, args: jnp.cross(y, y / args))
+
+
+def main() -> None:
+    jax.config.update("jax_enable_x64", True)
+    figure = Figure(figsize=(13, 8), layout="constrained")
+    grid = figure.subplots(2, 3)
+    for axes in grid.flat[len(PANELS) :]:
+        axes.set_axis_off()
+    for panel, axes in zip(PANELS, grid.flat, strict=False):
+        panel(axes)
+        axes.title.set_fontsize(10)
+        axes.grid(color="0.9", linewidth=0.6)
+        axes.set_axisbelow(True)
+    path = Path(__file__).with_suffix(".png")
+    figure.savefig(path, dpi=110)
+    print(f"Wrote {path}")
+
+
+def regions_of_cf3(axes: Axes) -> None:
+    _regions(axes, cfjax.CF3(), "CF3")
+
+
+def regions_of_cf4(axes: Axes) -> None:
+    _regions(axes, cfjax.CF4(), "CF4")
+
+
+def _regions(axes: Axes, solver: Any, name: str) -> None:
+    """Where a step with the exact part z does not grow, in the plane of the explicit part w."""
+    w = np.linspace(-13, 19, 700) + 1j * np.linspace(-13, 13, 700)[:, None]
+    for z, color in zip((0, -2, -5, -10), (GREY, BLUE, GREEN, RED), strict=True):
+        growth = np.abs(cfjax.stability_function(solver.tableau, z, w))
+        axes.contour(w.real, w.imag, growth, levels=[1], colors=[color], linewidths=1.6)
+        axes.plot(
+            [], [], color=color, label=f"z = {z}" + (" (RK4)" if z == 0 and name == "CF4" else "")
+        )
+        if z == 0:
+            axes.contourf(w.real, w.imag, growth, levels=[0, 1], colors=[color], alpha=0.25)
+    axes.set(
+        title=f"{name} for u' = (λ + ω) u: stable inside\nz = hλ in the flow, w = hω explicit",
+        xlabel="Re w",
+        ylabel="Im w",
+        aspect="equal",
+    )
+    axes.legend(fontsize=8, loc="upper right")
+
+
+def large_rotations(axes: Axes) -> None:
+    """Error and distance from the sphere after t = 100, in ever larger steps."""
+    counts = np.unique(np.geomspace(2, 20_000, 24).astype(int))
+    exact, radius = rigid_body.reference(100.0), np.linalg.norm(rigid_body.y0)
+    methods = {
+        "CF3": (TERM, cfjax.CF3(), GREEN),
+        "CF4": (TERM, cfjax.CF4(), BLUE),
+        "RKMK4": (TERM, cfjax.RKMK4(), RED),
+        "RK4 in space": (SPACE, cfjax.CF4(), GREY),
+    }
+    for name, (term, solver, color) in methods.items():
+        ends = np.array([_rigid_body_end(term, solver, 100.0, n) for n in counts])
+        # In space the largest steps overflow.
+        ends[np.abs(ends).max(axis=1) > 1e10] = np.nan
+        error = np.linalg.norm(ends - exact, axis=1)
+        axes.loglog(100 / counts, error, color=color, label=name)
+        off = np.abs(np.linalg.norm(ends, axis=1) - radius)
+        # Zero has no place on a logarithmic axis.
+        axes.loglog(100 / counts, np.maximum(off, 1e-16), color=color, linestyle=":")
+    axes.axhline(2 * float(radius), color="0.6", linewidth=0.8)
+    axes.plot([], [], color="0.3", linestyle=":", label="distance from the sphere")
+    axes.set(
+        title="Rigid body at t = 100: on the sphere at every step,\n"
+        "but never accurate above one radian",
+        xlabel="step h (about the angle of a step)",
+        ylabel="error",
+        ylim=(1e-17, 1e2),
+    )
+    axes.legend(fontsize=8, loc="center right")
+
+
+def near_singular_parameters(axes: Axes) -> None:
+    """The error of 32 steps of the third-order families close to excluded parameters."""
+    distances = np.geomspace(0.1, 1e-9, 17)
+    families = [
+        ("first family at 1/3 + d", cfjax.third_order_a, 1 / 3, 1, BLUE),
+        ("second family at 1 - d", cfjax.third_order_b, 1.0, -1, RED),
+    ]
+    for label, family, singular, side, color in families:
+        solvers = [cfjax.CommutatorFree(family(singular + side * d)) for d in distances]
+        for dtype, style in ((np.float64, "-"), (np.float32, "--")):
+            errors = [_driven_error(solver, 32, dtype) for solver in solvers]
+            name = f"{label}, {np.dtype(dtype).name}"
+            axes.loglog(distances, errors, color=color, linestyle=style, label=name)
+    for eps in (2.0**-24, 2.0**-53):
+        walk = eps / (2 * distances) / np.sqrt(32)
+        axes.loglog(distances, walk, color="0.6", linewidth=0.8, linestyle=":")
+    axes.plot([], [], color="0.6", linestyle=":", label="rounding / 2d, as a random walk")
+    axes.invert_xaxis()
+    axes.set(
+        title="Families of order 3 near excluded parameters:\n"
+        "close stages magnify rounding, a far one errs",
+        xlabel="distance d from the excluded parameter",
+        ylabel="error",
+        ylim=(1e-10, 1e5),
+    )
+    axes.legend(fontsize=8, loc="upper left")
+
+
+def single_precision(axes: Axes) -> None:
+    """The error at t = 10 in both precisions, with the walk of roundings."""
+    counts = np.geomspace(20, 100_000, 18).astype(int)
+    exact = rigid_body.reference(10.0)
+    for dtype, color in ((np.float32, RED), (np.float64, BLUE)):
+        ends = np.array([_rigid_body_end(TERM, cfjax.CF4(), 10.0, n, dtype) for n in counts])
+        error = np.linalg.norm(ends - exact, axis=1)
+        axes.loglog(10 / counts, error, color=color, label=f"CF4, {np.dtype(dtype).name}")
+        unit = np.finfo(dtype).eps / 2
+        walk = 3 * unit * np.sqrt(counts)
+        axes.loglog(10 / counts, walk, color=color, linestyle=":", linewidth=1)
+    axes.plot([], [], color="0.3", linestyle=":", label="3 units of rounding · √steps")
+    axes.set(
+        title="Rigid body at t = 10: below h = 0.03\na smaller step gains nothing in float32",
+        xlabel="step h",
+        ylabel="error",
+    )
+    axes.legend(fontsize=8, loc="upper left")
+
+
+PANELS = (
+    regions_of_cf3,
+    regions_of_cf4,
+    large_rotations,
+    near_singular_parameters,
+    single_precision,
+)
+
+
+def _rigid_body_end(
+    term: Any, solver: Any, t1: float, num_steps: int, dtype: Any = np.float64
+) -> np.ndarray:
+    y0, inertia = jnp.asarray(rigid_body.y0, dtype), jnp.asarray(rigid_body.inertia, dtype)
+    n = int(num_steps)
+    sol = cfjax.integrate(term, solver, 0.0, t1, y0, inertia, num_steps=n, throw=False)
+    return np.asarray(jax.tree.leaves(sol.ys)[0][-1], float)
+
+
+def _driven_body(t, y, args):
+    """A rigid body with a turning torque, so that the field depends on time and state."""
+    torque = jnp.stack([jnp.sin(2 * t), jnp.cos(t), t])
+    return cfjax.Rotation(torque - y / args)
+
+
+def _driven_error(solver: Any, num_steps: int, dtype: Any) -> float:
+    def end(solver: Any, num_steps: int, dtype: Any) -> np.ndarray:
+        y0, inertia = (jnp.asarray(x, dtype) for x in ([0.48, 0.6, 0.64], [1.0, 2.0, 3.5]))
+        term = cfjax.LieTerm(_driven_body)
+        sol = cfjax.integrate(term, solver, 0.0, 1.0, y0, inertia, num_steps=num_steps, throw=False)
+        return np.asarray(jax.tree.leaves(sol.ys)[0][-1], float)
+
+    return float(np.linalg.norm(end(solver, num_steps, dtype) - end(cfjax.CG5(), 512, np.float64)))
+
+
+if __name__ == "__main__":
+    main()
