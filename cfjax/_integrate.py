@@ -48,15 +48,13 @@ def integrate(
     `y0` or a saved state has an entry that is not finite, or if the solver reports a failure.
     """
     check_term_and_solver(term, solver)
-    _check_state(y0)
+    check_state(y0)
     num_steps = count("num_steps", num_steps)
     save_every = num_steps if save_every is None else count("save_every", save_every)
     if num_steps % save_every:
         raise ValueError(f"save_every must divide num_steps={num_steps}, got {save_every}.")
     y0 = jtu.tree_map(jnp.asarray, y0)
-    # Times in the state's precision, so that they do not promote it.
-    with jax.numpy_dtype_promotion("standard"):
-        dtype = jnp.finfo(jnp.result_type(*jtu.tree_leaves(y0))).dtype
+    dtype = time_dtype(y0)
     t0, t1 = jnp.asarray(t0, dtype), jnp.asarray(t1, dtype)
     args = jtu.tree_map(lambda x: jnp.asarray(x) if isinstance(x, float | complex) else x, args)
     return _integrate(term, solver, t0, t1, y0, args, num_steps, save_every, throw)
@@ -124,6 +122,12 @@ def _integrate(
     )
 
 
+def time_dtype(y0: PyTree) -> Any:
+    """The state's precision: times of another would promote it."""
+    with jax.numpy_dtype_promotion("standard"):
+        return jnp.finfo(jnp.result_type(*jtu.tree_leaves(y0))).dtype
+
+
 def _is_finite(y: PyTree) -> Bool[Array, ""]:
     return jnp.stack([jnp.all(jnp.isfinite(leaf)) for leaf in jtu.tree_leaves(y)]).all()
 
@@ -137,7 +141,7 @@ def check_term_and_solver(term: Any, solver: Any) -> None:
         raise TypeError(f"solver must be a diffrax solver, such as cfjax.CF4(), got {solver!r}.")
 
 
-def _check_state(y0: PyTree) -> None:
+def check_state(y0: PyTree) -> None:
     leaves = jtu.tree_leaves_with_path(y0)
     if not leaves:
         raise TypeError(f"y0 must have at least one array, got {y0!r}.")

@@ -10,7 +10,6 @@ from pathlib import Path
 from typing import Any, NamedTuple
 
 import jax
-import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from matplotlib.layout_engine import ConstrainedLayoutEngine
@@ -27,8 +26,7 @@ STYLES: dict[str, dict[str, Any]] = {
     "CF4": dict(color="#0072B2", linestyle="-", marker="o"),
     "RKMK4": dict(color="#D55E00", linestyle="--", marker="s"),
 }
-
-
+# For all other methods, in turn.
 _OTHER_STYLES = [
     dict(color="#56B4E9", linestyle="-", marker="D"),
     dict(color="#E69F00", linestyle="--", marker="P"),
@@ -82,17 +80,11 @@ def chart(
     """The chart of a scene. The first line of the docstring of `measure` is in its caption."""
     work = measure(budget=budget, progress=progress)
     subject = (inspect.getdoc(measure) or name).splitlines()[0]
-    unknown = [
-        method
-        for method in dict.fromkeys(work.method)
-        if not np.any(np.isfinite(work.select(method).flops))
-    ]
     figure = new_figure(
         (7.0, 4.8),
         f"{subject} Time: the fastest of {work.seconds.shape[1]} runs in turns on one "
         f"{jax.default_backend().upper()}; bars reach to the upper quartile. Flops: operations of "
-        "one step as traced, times the steps"
-        + (f"; not known for {', '.join(unknown)}." if unknown else "."),
+        "one step as traced, times the steps.",
     )
     return Report([work.table()], {name: work.plot(figure)}, {name: work})
 

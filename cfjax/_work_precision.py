@@ -19,7 +19,7 @@ from jaxtyping import Array, Float, PyTree
 
 from ._flops import count_flops
 from ._frozen_field import AbstractAlgebraElement, bracket, combine, flow, is_field, tangent
-from ._integrate import check_term_and_solver, count, integrate
+from ._integrate import check_state, check_term_and_solver, count, integrate, time_dtype
 
 if TYPE_CHECKING:
     import matplotlib.figure
@@ -81,8 +81,9 @@ class WorkPrecision(NamedTuple):
     def plot(self, figure: "matplotlib.figure.Figure | None" = None) -> "matplotlib.figure.Figure":
         """The chart: error against time, and beside it against flops. Needs matplotlib.
 
-        A mark is the fastest run; its bar reaches to the upper quartile. Where no flops are known,
-        the second panel shows evaluations of the field. Draws into `figure` if there is one.
+        A mark is the fastest run; its bar reaches to the upper quartile. Where no flops are known
+        of any method, the second panel shows evaluations of the field. Draws into `figure` if there
+        is one.
         """
         from . import _report
 
@@ -91,15 +92,19 @@ class WorkPrecision(NamedTuple):
         counts_flops = bool(np.any(np.isfinite(self.flops)))
         work = self.flops if counts_flops else self.num_evaluations
         names = dict.fromkeys(self.method)
+        unknown = []
         for name, style in _report.styles(names).items():
             rows = np.array(self.method) == name
             best, upper = np.percentile(self.seconds[rows], (0, 75), axis=-1)
             spread = (np.zeros_like(best), upper - best)
             left.errorbar(best, self.error[rows], xerr=spread, capsize=3, label=name, **style)
             right.plot(work[rows], self.error[rows], **style)
+            if not np.any(np.isfinite(work[rows])):
+                unknown.append(name)
         left.set(yscale="log", ylabel="error of the final state")
         _report.logarithmic(left, "time", unit="s")
-        _report.logarithmic(right, "flops" if counts_flops else "evaluations of the field")
+        label = "flops" if counts_flops else "evaluations of the field"
+        _report.logarithmic(right, label + (f" (not known: {', '.join(unknown)})" * bool(unknown)))
         figure.align_xlabels()
         _report.finish(figure, 4)
         return figure
@@ -165,8 +170,8 @@ def distance(y: PyTree, reference: PyTree) -> float:
 
 def work_precision(
     term: PyTree,
-    t0: float,
-    t1: float,
+    t0: Any,
+    t1: Any,
     y0: PyTree,
     args: PyTree = None,
     *,
@@ -175,11 +180,11 @@ def work_precision(
     num_steps: Sequence[int] | None = None,
     tolerances: Sequence[float] | None = None,
     controller: Callable[[Any], diffrax.AbstractStepSizeController] = absolute_tolerance,
-    dt0: float | None = None,
+    dt0: Any = None,
     max_steps: int = 100_000,
     error: Callable[[PyTree, PyTree], float] = distance,
     repeats: int = 100,
-    budget: float = 20.0,
+    budget: int | float = 20,
     progress: "rich.progress.Progress | None" = None,
 ) -> WorkPrecision:
     """Measures what an error costs with each method.
@@ -218,20 +223,22 @@ def work_precision(
     for name, value in (("repeats", repeats), ("max_steps", max_steps)):
         if value < 1:
             raise ValueError(f"{name} must be at least 1, got {value}.")
+    if not budget > 0:
+        raise ValueError(f"budget must be a positive number of seconds, got {budget}.")
+    check_state(y0)
     y0 = jtu.tree_map(jnp.asarray, y0)
     _check_reference(reference, y0)
     is_adaptive = tolerances is not None
     if dt0 is None:
         dt0 = (t1 - t0) / (100 if is_adaptive else max(settings))
-    # In the state's precision, so that they do not promote it.
-    dtype = jnp.finfo(jtu.tree_leaves(y0)[0].dtype).dtype
+    dtype = time_dtype(y0)
     start, end, first = (jnp.asarray(t, dtype) for t in (t0, t1, dt0))
     args = jtu.tree_map(lambda x: jnp.asarray(x) if eqx.is_inexact_array_like(x) else x, args)
     # One program serves all tolerances, but only one number of steps.
     values = [jnp.asarray(x, dtype) for x in settings] if is_adaptive else settings
     solve = _adaptive_steps(controller, max_steps) if is_adaptive else _equal_steps
 
-    def cases() -> Iterator[tuple[str, float, Callable[[], tuple], "_Cost", float]]:
+    def cases() -> Iterator[tuple[str, Any, Callable[[], tuple], "_Cost", float]]:
         for name, method in methods.items():
             with _about(name):
                 own_term, solver = _term_and_solver(method, term)
@@ -249,11 +256,14 @@ def work_precision(
     for name, setting, program, cost, seconds in _track(progress, cases(), total, "Compiling"):
         # The first run also warms up.
         y, attempted, rejected, note = _first_run(program)
-        distance_ = np.nan if note else float(error(y, reference))
-        if not note and not np.isfinite(distance_):
-            distance_, note = np.nan, "The error is not finite."
+        found = np.nan if note else float(error(y, reference))
+        if not note and not np.isfinite(found):
+            found, note = np.nan, "The error is not finite."
+        if not is_adaptive:
+            # Known also where the run broke off.
+            attempted, rejected = float(setting), 0.0
         tolerance = setting if is_adaptive else np.nan
-        rows.append((tolerance, distance_, attempted, rejected, *cost.of(attempted), seconds))
+        rows.append((tolerance, found, attempted, rejected, *cost.of(attempted), seconds))
         names.append(name)
         notes.append(note)
         programs.append(program)
@@ -291,7 +301,7 @@ def take_turns(
     programs: Sequence[Callable[[], PyTree]],
     *,
     repeats: int,
-    budget: float = np.inf,
+    budget: int | float = np.inf,
     progress: "rich.progress.Progress | None" = None,
 ) -> Float[np.ndarray, "programs rounds"]:
     """Seconds of each program in each round; in a round each runs once, in the order given.
