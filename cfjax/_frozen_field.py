@@ -38,6 +38,15 @@ class AbstractFrozenField(eqx.Module):
     def tangent(self, point: Any) -> Any:
         """The ambient velocity at `point`, the derivative of the flow at time zero."""
 
+    def displacement(self, point: Any) -> Any:
+        """`flow(point) - point`, with a rounding as small as the displacement; None if not offered.
+
+        A class that offers it gets compensated summation over the steps where it acts on matrices
+        (`_solvers/base.py`). Not for a field whose flow keeps signs or relative accuracy: the sum
+        of point and displacement keeps absolute accuracy only.
+        """
+        return None
+
     @classmethod
     def combine(cls, weights: Sequence[Weight], fields: Sequence[Any]) -> Any:
         """The field `sum_i weights[i] * fields[i]`. Weights are real scalars."""
@@ -68,9 +77,36 @@ def flow(field: PyTree, point: PyTree) -> PyTree:
     field, whose flow is a translation; an `AbstractFrozenField` acts on the part of `point` that
     stands in its place.
     """
-    return jtu.tree_map(
-        lambda f, p: f.flow(p) if is_field(f) else p + f, field, point, is_leaf=is_field
-    )
+
+    def flow_leaf(f, p):
+        if isinstance(p, Displaced) and is_field(f):
+            moved = f.displacement(p.value)
+            if moved is not None:
+                return Displaced(p.start, p.displacement + moved)
+        p = value(p)
+        return f.flow(p) if is_field(f) else p + f
+
+    return jtu.tree_map(flow_leaf, field, point, is_leaf=is_field)
+
+
+class Displaced(eqx.Module):
+    """A point as a start and the displacement from it, whose rounding is as small as it is."""
+
+    start: Inexact[Array, "..."]
+    displacement: Inexact[Array, "..."]
+
+    @property
+    def value(self) -> Inexact[Array, "..."]:
+        return self.start + self.displacement
+
+
+def is_displaced(x: Any) -> bool:
+    return isinstance(x, Displaced)
+
+
+def value(point: PyTree) -> PyTree:
+    """The point with every `Displaced` in it summed up."""
+    return jtu.tree_map(lambda p: p.value if is_displaced(p) else p, point, is_leaf=is_displaced)
 
 
 def tangent(field: PyTree, point: PyTree) -> PyTree:
