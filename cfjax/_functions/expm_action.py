@@ -1,17 +1,19 @@
 """The exponential of a small skew operator, applied to a few columns."""
 
+import functools
 from collections.abc import Callable
 from math import factorial
 
+import jax
 import jax.numpy as jnp
+import numpy as np
 from jax import lax
 from jaxtyping import Array, Float
 
-from .expm import expm, max_over_batch
+from .expm import max_over_batch
 
-# Degrees of the Taylor polynomial of exp. Between two of them lies a branch: each costs compile
-# time, each term left out saves a product.
-_DEGREES = (8, 10, 12, 14, 18)
+# The highest degree of the Taylor polynomial of exp.
+_DEGREE = 18
 
 
 def phi_1_action(
@@ -37,37 +39,55 @@ def phi_1_action(
     A's norm alone, and not on `b`, the derivatives are as accurate.
     """
     bound = max_over_batch(lax.stop_gradient(bound))
+    degrees = np.arange(2, _DEGREE + 1)
+    largest = np.array([_largest(degree, b.dtype) for degree in (*(degrees - 1), _DEGREE)])
 
-    def terms(first: int, last: int) -> Callable[[tuple[Array, Array]], tuple[Array, Array]]:
-        def add(carry: tuple[Array, Array]) -> tuple[Array, Array]:
-            term, total = carry
-            for degree in range(first, last):
-                term = product(term) / jnp.asarray(degree + 1, b.dtype)
-                total = total + term
-            return term, total
+    def add(carry: tuple[Array, Array], degree: Array) -> tuple[Array, Array]:
+        term, total = carry
+        term = product(term) / degree
+        return term, total + term
 
-        return add
+    # In a loop: every product written out would be compiled by itself.
+    def step(carry: tuple[Array, Array], x: Array) -> tuple[tuple[Array, Array], None]:
+        degree, largest = x
+        return lax.cond(bound > largest, add, lambda carry, degree: carry, carry, degree), None
 
-    carry = terms(1, _DEGREES[0])((b, b))
-    for low, high in zip(_DEGREES, _DEGREES[1:], strict=False):
-        more = bound > _largest(low, b.dtype)
-        carry = lax.cond(more, terms(low, high), lambda carry: carry, carry)
-    total = carry[1]
+    xs = np.stack([degrees, largest[:-1]], axis=1).astype(b.dtype)
+    _, total = lax.scan(step, (b, b), xs)[0]
     return lax.cond(
-        bound > _largest(_DEGREES[-1], b.dtype),
-        lambda _: _phi_1(*dense(), b),
+        bound > largest[-1].astype(b.dtype),
+        jax.checkpoint(lambda total: _phi_1(*dense(), bound, b)),
         lambda total: total,
         total,
     )
 
 
-def _phi_1(a: Float[Array, "m m"], scale: Float[Array, " m"], b: Array) -> Array:
-    """`phi_1(a) b` by the exponential of `[[a, b], [0, 0]]`, for every norm."""
+def _phi_1(
+    a: Float[Array, "m m"], scale: Float[Array, " m"], bound: Float[Array, ""], b: Array
+) -> Array:
+    """`phi_1(a) b` for every norm: `exp [[a, b], [0, 0]]` by scaling and squaring."""
     m, k = b.shape
     # The result does not depend on the scales.
     scale = lax.stop_gradient(scale)[:, None]
-    top = jnp.concatenate([a * scale.T / scale, b / scale], axis=1)
-    return scale * expm(jnp.pad(top, ((0, k), (0, 0))))[:m, m:]
+    s = jnp.maximum(jnp.ceil(jnp.log2(bound)), 0)
+    top = jnp.concatenate([a * scale.T / scale, b / scale], axis=1) * jnp.exp2(-s)
+    x = jnp.pad(top, ((0, k), (0, 0)))
+    product = functools.partial(jnp.matmul, precision=lax.Precision.HIGHEST)
+
+    def add(carry: tuple[Array, Array], degree: Array) -> tuple[tuple[Array, Array], None]:
+        term, total = carry
+        term = product(x, term) / degree
+        return (term, total + term), None
+
+    def square(x: Array, n: Array) -> tuple[Array, None]:
+        return lax.cond(n < s, lambda x: product(x, x), lambda x: x, x), None
+
+    one = jnp.eye(m + k, dtype=b.dtype)
+    (_, e), _ = lax.scan(add, (x, one + x), np.arange(2, _DEGREE + 1).astype(b.dtype))
+    # Every squaring doubles the error: after as many as there are digits, none is left.
+    nmant = jnp.finfo(b.dtype).nmant
+    e, _ = lax.scan(square, e, np.arange(nmant).astype(b.dtype))
+    return jnp.where(s <= nmant, scale * e[:m, m:], jnp.nan)
 
 
 def _largest(degree: int, dtype: jnp.dtype) -> float:
