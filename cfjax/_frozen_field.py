@@ -25,6 +25,9 @@ class AbstractFrozenField(eqx.Module):
       an array is structure (a spectrum, a factor) instead of a coordinate.
 
     `flow` and `tangent` must accept the zero field.
+
+    A class may also work in coordinates of its own within a step, where that is what makes it
+    cheap. Then it overrides `enter` and `leave` too.
     """
 
     # Whether the point that the field acts on is a pytree instead of one array.
@@ -51,6 +54,20 @@ class AbstractFrozenField(eqx.Module):
     def combine(cls, weights: Sequence[Weight], fields: Sequence[Any]) -> Any:
         """The field `sum_i weights[i] * fields[i]`. Weights are real scalars."""
         return jtu.tree_map(lambda *leaves: _linear_combination(weights, leaves), *fields)
+
+    def enter(self, point: Any, earlier: Sequence[Any]) -> tuple["AbstractFrozenField", Any]:
+        """This field and the point where it is frozen, in the coordinates of the step.
+
+        A solver calls it after every evaluation. `earlier` holds the fields that have entered in
+        this step; where there is none, `point` is the state itself. All flows of the step start
+        from the point returned then, so drift can be corrected there. By default nothing changes.
+        """
+        del earlier
+        return self, point
+
+    def leave(self, point: Any) -> Any:
+        """The state at a point of a step, for a field that has entered. By default the point."""
+        return point
 
 
 class AbstractAlgebraElement(AbstractFrozenField):
@@ -145,6 +162,25 @@ def bracket(a: PyTree, b: PyTree) -> PyTree:
         return jnp.zeros_like(x)
 
     return jtu.tree_map(bracket_leaf, a, b, is_leaf=is_field)
+
+
+def enter(field: PyTree, point: PyTree, earlier: Sequence[PyTree]) -> tuple[PyTree, PyTree]:
+    """`field` and the point where it is frozen, in the coordinates of a step, part by part."""
+    parts, treedef = jtu.tree_flatten(field, is_leaf=is_field)
+    columns = [treedef.flatten_up_to(tree) for tree in (point, *earlier)]
+    entered = [
+        f.enter(p, before) if is_field(f) else (f, p)
+        for f, p, *before in zip(parts, *columns, strict=True)
+    ]
+    fields, points = zip(*entered, strict=True)
+    return treedef.unflatten(fields), treedef.unflatten(points)
+
+
+def leave(field: PyTree, point: PyTree) -> PyTree:
+    """The state at a point of a step, for a field that has entered."""
+    return jtu.tree_map(
+        lambda f, p: f.leave(p) if is_field(f) else p, field, point, is_leaf=is_field
+    )
 
 
 def without_bracket(field: AbstractFrozenField) -> str:

@@ -1,3 +1,4 @@
 """Problems with known answers, one to a module."""
 
 from . import rigid_body as rigid_body
+from . import stiefel as stiefel
