@@ -1,6 +1,8 @@
 from rich.progress import Progress
+from rich.table import Table
 
 from cfjax._paper import complexity
+from cfjax._solvers.commutator_free import AbstractCommutatorFree
 
 
 def test_counts_are_the_papers_but_for_order_five():
@@ -22,10 +24,12 @@ def test_counts_are_the_papers_but_for_order_five():
 def test_counts_are_those_of_the_tableaus():
     for methods in (complexity.METHODS["C-G"], complexity.METHODS["this paper"]):
         for _, method in methods.values():
+            assert isinstance(method, AbstractCommutatorFree)
             assert complexity.flows_and_brackets(method) == (method.tableau.num_flows, 0)
 
 
 def test_report():
     (table,) = complexity.report(Progress(disable=True)).printed
+    assert isinstance(table, Table)
     assert [column.header for column in table.columns][2] == "method"
     assert len(table.rows) == 8
