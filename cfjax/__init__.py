@@ -1,6 +1,8 @@
 """Commutator-free Lie group integrators for JAX."""
 
 from . import scenes as scenes
+from ._batch import BatchResult as BatchResult
+from ._batch import map_batch as map_batch
 from ._fields.low_rank import BorderedSkew as BorderedSkew
 from ._fields.low_rank import LowRankSkew as LowRankSkew
 from ._fields.matrix import LeftMatrix as LeftMatrix
