@@ -32,5 +32,7 @@ from ._tableau import Tableau as Tableau
 from ._tableau import third_order_a as third_order_a
 from ._tableau import third_order_b as third_order_b
 from ._term import LieTerm as LieTerm
+from ._work_precision import WorkPrecision as WorkPrecision
+from ._work_precision import work_precision as work_precision
 
 __version__ = "0.1.0"

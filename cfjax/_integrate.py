@@ -9,7 +9,7 @@ import jax.numpy as jnp
 import jax.tree_util as jtu
 import numpy as np
 from jax import lax
-from jaxtyping import Array, PyTree, Real
+from jaxtyping import Array, Bool, PyTree, Real
 
 
 def integrate(
@@ -22,6 +22,7 @@ def integrate(
     *,
     num_steps: int | np.integer,
     save_every: int | np.integer | None = None,
+    throw: bool = True,
 ) -> diffrax.Solution:
     """Integrates from `t0` to `t1` with `num_steps` equal steps of any diffrax solver.
 
@@ -36,17 +37,20 @@ def integrate(
     - `num_steps`: how many steps, at least 1.
     - `save_every`: saves the state after every so many steps; must divide `num_steps`. By default
       only the final state is saved.
+    - `throw`: whether a failure is an error, as in diffrax. If not, `result` of the solution says
+      what happened. In a batch made by `jax.vmap` one failure is an error for all.
 
     **Returns:** a `diffrax.Solution`. Its `ts` has shape `(num_saves,)`, and each leaf of `ys` has
     one more axis of that length in front; the last entry is the state at `t1`. The initial state
     is not repeated there.
 
     **Raises:** `TypeError` or `ValueError` for arguments of wrong type or value. A runtime error if
-    `y0` has an entry that is not finite, or if the solver reports a failure.
+    `y0` or a saved state has an entry that is not finite, or if the solver reports a failure.
     """
-    _check_types(term, solver, y0)
-    num_steps = _count("num_steps", num_steps)
-    save_every = num_steps if save_every is None else _count("save_every", save_every)
+    check_term_and_solver(term, solver)
+    _check_state(y0)
+    num_steps = count("num_steps", num_steps)
+    save_every = num_steps if save_every is None else count("save_every", save_every)
     if num_steps % save_every:
         raise ValueError(f"save_every must divide num_steps={num_steps}, got {save_every}.")
     y0 = jtu.tree_map(jnp.asarray, y0)
@@ -55,7 +59,7 @@ def integrate(
         dtype = jnp.finfo(jnp.result_type(*jtu.tree_leaves(y0))).dtype
     t0, t1 = jnp.asarray(t0, dtype), jnp.asarray(t1, dtype)
     args = jtu.tree_map(lambda x: jnp.asarray(x) if isinstance(x, float | complex) else x, args)
-    return _integrate(term, solver, t0, t1, y0, args, num_steps, save_every)
+    return _integrate(term, solver, t0, t1, y0, args, num_steps, save_every, throw)
 
 
 @eqx.filter_jit
@@ -68,9 +72,11 @@ def _integrate(
     args: PyTree,
     num_steps: int,
     save_every: int,
+    throw: bool,
 ) -> diffrax.Solution:
-    finite = [jnp.all(jnp.isfinite(leaf)) for leaf in jtu.tree_leaves(y0)]
-    y0 = eqx.error_if(y0, ~jnp.stack(finite), "y0 must be finite, got an entry that is not.")
+    if throw:
+        message = "y0 must be finite, got an entry that is not."
+        y0 = eqx.error_if(y0, ~_is_finite(y0), message)
 
     def time(n):
         # From the step's number, so that rounding does not add up, and t1 is met exactly.
@@ -96,7 +102,13 @@ def _integrate(
     carry = (jnp.asarray(0), y0, solver_state, diffrax.RESULTS.successful)
     carry, (ts, ys) = lax.scan(steps_and_save, carry, length=num_steps // save_every)
     result = carry[3]
-    ys = result.error_if(ys, result != diffrax.RESULTS.successful)
+    # Of the saved states alone, outside the loop: sums and products keep infinity and NaN, so a
+    # blow-up shows in what is saved after it.
+    is_lost = (result == diffrax.RESULTS.successful) & ~_is_finite(ys)
+    nonfinite: Any = diffrax.RESULTS.nonfinite
+    result = diffrax.RESULTS.where(is_lost, nonfinite, result)
+    if throw:
+        ys = result.error_if(ys, result != diffrax.RESULTS.successful)
     return diffrax.Solution(
         t0=t0,
         t1=t1,
@@ -112,13 +124,20 @@ def _integrate(
     )
 
 
-def _check_types(term: Any, solver: Any, y0: PyTree) -> None:
+def _is_finite(y: PyTree) -> Bool[Array, ""]:
+    return jnp.stack([jnp.all(jnp.isfinite(leaf)) for leaf in jtu.tree_leaves(y)]).all()
+
+
+def check_term_and_solver(term: Any, solver: Any) -> None:
     is_term = lambda x: isinstance(x, diffrax.AbstractTerm)  # noqa: E731
     terms = jtu.tree_leaves(term, is_leaf=is_term)
     if not terms or not all(map(is_term, terms)):
         raise TypeError(f"term must be a diffrax term, such as cfjax.LieTerm(field), got {term!r}.")
     if not isinstance(solver, diffrax.AbstractSolver):
         raise TypeError(f"solver must be a diffrax solver, such as cfjax.CF4(), got {solver!r}.")
+
+
+def _check_state(y0: PyTree) -> None:
     leaves = jtu.tree_leaves_with_path(y0)
     if not leaves:
         raise TypeError(f"y0 must have at least one array, got {y0!r}.")
@@ -130,7 +149,7 @@ def _check_types(term: Any, solver: Any, y0: PyTree) -> None:
             )
 
 
-def _count(name: str, value: Any) -> int:
+def count(name: str, value: Any) -> int:
     if isinstance(value, bool) or not isinstance(value, int | np.integer) or value < 1:
         raise ValueError(f"{name} must be an integer of at least 1, got {value!r}.")
     return int(value)

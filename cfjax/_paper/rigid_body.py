@@ -4,26 +4,25 @@ Source: Celledoni, Marthinsen & Owren, Commutator-free Lie group methods, FGCS 1
 Section 3.1.
 """
 
-import time
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from typing import NamedTuple
 
 import diffrax
 import jax
-import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Float, Int
+from jaxtyping import Float
 from matplotlib.figure import Figure
 from rich.progress import Progress
 from rich.table import Table
 
 from .._flops import count_flops
 from .._integrate import integrate
+from .._report import STYLES, Report, finish, new_figure, number
 from .._solvers.commutator_free import CF3, CF4
 from .._solvers.munthe_kaas import RKMK, RKMK3, RKMK4
 from .._term import LieTerm
+from .._work_precision import WorkPrecision, work_precision
 from ..scenes import rigid_body
-from .figures import STYLES, Report, finish, new_figure, number
 
 METHODS: dict[str, diffrax.AbstractSolver] = {
     "CF3": CF3(),
@@ -49,15 +48,6 @@ class Trajectory(NamedTuple):
     t: Float[np.ndarray, " steps"]
     energy_error: Float[np.ndarray, " steps"]
     error: Float[np.ndarray, " steps"]
-
-
-class Efficiency(NamedTuple):
-    """Global errors at t = 100 and what they cost, for each number of steps."""
-
-    num_steps: Int[np.ndarray, " counts"]
-    error: Float[np.ndarray, " counts"]
-    flops: Int[np.ndarray, " counts"]
-    seconds: Float[np.ndarray, "counts repeats"]
 
 
 def report(
@@ -128,44 +118,21 @@ def flops_of_step(method: diffrax.AbstractSolver) -> int:
     return count_flops(step, scalar, scalar, vector, vector)
 
 
-def efficiencies(
-    step_counts: Sequence[int], repeats: int, progress: Progress
-) -> dict[str, Efficiency]:
+def efficiencies(step_counts: Sequence[int], repeats: int, progress: Progress) -> WorkPrecision:
     """The cost and error at t = 100 of every method, for every number of steps."""
-    y0, exact = jnp.asarray(rigid_body.y0), rigid_body.reference(rigid_body.t1)
-    cases = [(name, n) for n in step_counts for name in METHODS]
-    programs, errors = [], []
-    for name, n in progress.track(cases, description="Compiling"):
-        # The call also warms up.
-        programs.append(_program(METHODS[name], n))
-        errors.append(float(np.linalg.norm(programs[-1](y0) - exact)))
-    seconds = []
-    # All programs in turn, so that what else the machine does falls on all alike.
-    for _ in progress.track(range(repeats), description="Measuring time"):
-        for program in programs:
-            start = time.perf_counter()
-            program(y0).block_until_ready()
-            seconds.append(time.perf_counter() - start)
-    # From the order of measurement to one row for each method.
-    shape = (len(step_counts), len(METHODS))
-    error = np.reshape(errors, shape).T
-    taken = np.reshape(seconds, (repeats, *shape)).T
-    num_steps = np.array(step_counts)
-    return {
-        name: Efficiency(num_steps, error[i], flops_of_step(method) * num_steps, taken[i])
-        for i, (name, method) in enumerate(METHODS.items())
-    }
-
-
-def _program(method: diffrax.AbstractSolver, num_steps: int) -> Callable[[jax.Array], jax.Array]:
-    # Compiled as a whole: checking and sorting the arguments of `integrate` in Python takes as
-    # long as a thousand steps.
-    def solve(y0):
-        interval, inertia = (rigid_body.t0, rigid_body.t1), rigid_body.inertia
-        solution = integrate(_TERM, method, *interval, y0, inertia, num_steps=num_steps)
-        return jax.tree.map(lambda ys: ys[-1], solution.ys)
-
-    return jax.jit(solve)
+    return work_precision(
+        _TERM,
+        rigid_body.t0,
+        rigid_body.t1,
+        rigid_body.y0,
+        rigid_body.inertia,
+        methods=METHODS,
+        reference=rigid_body.reference(rigid_body.t1),
+        num_steps=step_counts,
+        repeats=repeats,
+        budget=np.inf,
+        progress=progress,
+    )
 
 
 def reference_table() -> Table:
@@ -227,46 +194,34 @@ def figure_1(trajectories: Mapping[str, Trajectory]) -> Figure:
     return figure
 
 
-def figure_2(work: Mapping[str, Efficiency]) -> Figure:
+def figure_2(work: WorkPrecision) -> Figure:
     """Global error against flops and against time."""
-    flops, seconds = _cost_at_equal_error(work["CF4"], work["RKMK4"], order=4)
-    flops_3, seconds_3 = _cost_at_equal_error(work["CF3"], work["RKMK3"], order=3)
-    steps = (rigid_body.t1 - rigid_body.t0) / work["CF4"].num_steps
+    flops, seconds = _cost_at_equal_error(work, "CF4", "RKMK4", order=4)
+    flops_3, seconds_3 = _cost_at_equal_error(work, "CF3", "RKMK3", order=3)
+    steps = (rigid_body.t1 - rigid_body.t0) / work.num_steps
     figure = new_figure(
         (7.0, 5.4),
         "Global error at t = 100 against the work of the whole integration with h = "
-        f"{steps[0]:g} to {steps[-1]:g}, after Figure 2 of "
+        f"{max(steps):g} to {min(steps):g}, after Figure 2 of "
         "Celledoni, Marthinsen & Owren (2003). Flops: operations of one step as traced, times the "
-        f"steps. Times: median and quartiles of {work['CF4'].seconds.shape[-1]} runs in turns on "
-        f"one {jax.default_backend().upper()}. The paper finds CF4 the best, "
-        "and CF3 and RKMK3 roughly the same. Here, at the smallest step and for equal error, CF4 "
-        f"takes {flops:.2f} times the flops and {seconds:.2f} times the time of RKMK4, and CF3 "
-        f"{flops_3:.2f} times the flops and {seconds_3:.2f} times the time of RKMK3. RKMK4 "
+        f"steps. Times: the fastest of {work.seconds.shape[-1]} runs in turns on one "
+        f"{jax.default_backend().upper()}; bars reach to the upper quartile. The paper finds CF4 "
+        "the best, and CF3 and RKMK3 roughly the same. Here, at the smallest step and for equal "
+        f"error, CF4 takes {flops:.2f} times the flops and {seconds:.2f} times the time of RKMK4, "
+        f"and CF3 {flops_3:.2f} times the flops and {seconds_3:.2f} times the time of RKMK3. RKMK4 "
         "saves a flow with two commutators, and in so(3) a commutator is only a cross product.",
     )
-    left, right = figure.subplots(1, 2, sharey=True)
-    for name, cost in work.items():
-        left.loglog(cost.flops, cost.error, label=name, markersize=4, **STYLES[name])
-        low, median, high = 1e3 * np.percentile(cost.seconds, (25, 50, 75), axis=-1)
-        spread = (median - low, high - median)
-        right.errorbar(median, cost.error, xerr=spread, capsize=3, markersize=4, **STYLES[name])
-    right.set_xscale("log")
-    right.xaxis.set_major_formatter("{x:g}")
-    left.set_ylabel("global error at t = 100 (2-norm)")
-    left.set_xlabel("flops")
-    right.set_xlabel("time (ms)")
-    figure.align_xlabels()
-    finish(figure, len(METHODS))
-    return figure
+    return work.plot(figure)
 
 
-def _cost_at_equal_error(a: Efficiency, b: Efficiency, *, order: int) -> tuple[float, float]:
+def _cost_at_equal_error(work: WorkPrecision, a: str, b: str, *, order: int) -> tuple[float, float]:
     """Flops and time of method `a` over those of `b` for the same error at the last step size.
 
     An error C h^p takes work proportional to C^(1/p). The ratio of times is the median of those
     measured one after the other, which disturbances of the machine change least.
     """
-    steps = (a.error[-1] / b.error[-1]) ** (1 / order)
-    flops = a.flops[-1] / b.flops[-1]
-    seconds = np.median(a.seconds / b.seconds)
+    one, other = work.select(a), work.select(b)
+    steps = (one.error[-1] / other.error[-1]) ** (1 / order)
+    flops = one.flops[-1] / other.flops[-1]
+    seconds = np.median(one.seconds[-1] / other.seconds[-1])
     return float(flops * steps), float(seconds * steps)

@@ -10,12 +10,17 @@ Section 3.1.
 
 from typing import Any
 
+import diffrax
 import jax.numpy as jnp
 import numpy as np
 from jax import lax
 from jaxtyping import Array, Float
 
 from .._fields.rotation import Rotation
+from .._solvers.commutator_free import CF3, CF4
+from .._solvers.munthe_kaas import RKMK3, RKMK4
+from .._term import LieTerm
+from .._work_precision import WorkPrecision, work_precision
 
 t0, t1 = 0.0, 100.0
 y0 = np.array([8 / 9, 4 / 9, 1 / 9])
@@ -67,3 +72,26 @@ def reference(
     # SciPy's own dn is wrong by 3e-14.
     dn = np.sqrt(1 - m * sn**2)
     return np.stack([y1_max * dn, -y2_max * sn, y3_max * cn], axis=-1)
+
+
+def chart(**options: Any) -> WorkPrecision:
+    """The free rigid body, 500 to 32 000 equal steps to t = 100; Tsit5 and Dopri5 in space."""
+    space = diffrax.ODETerm(lambda t, y, args: jnp.cross(y, y / args))
+    return work_precision(
+        LieTerm(field),
+        t0,
+        t1,
+        y0,
+        inertia,
+        methods={
+            "CF3": CF3(),
+            "RKMK3": RKMK3(),
+            "CF4": CF4(),
+            "RKMK4": RKMK4(),
+            "Dopri5": (space, diffrax.Dopri5()),
+            "Tsit5": (space, diffrax.Tsit5()),
+        },
+        reference=reference(t1),
+        num_steps=[500 * 2**k for k in range(7)],
+        **options,
+    )

@@ -1,0 +1,122 @@
+"""The command `cfjax chart`. The command `cfjax paper` is tested with the paper."""
+
+import csv
+import os
+import subprocess
+import sys
+
+import pytest
+from rich.progress import Progress
+
+from cfjax import __main__, _report, scenes
+from cfjax.__main__ import main
+
+
+@pytest.fixture
+def short(monkeypatch):
+    """The same command with fewer programs."""
+
+    def work_precision(*args, **options):
+        methods = dict(list(options.pop("methods").items())[-2:])
+        return original(*args, methods=methods, **(options | dict(num_steps=[500, 1000])))
+
+    original = scenes.rigid_body.work_precision
+    monkeypatch.setattr(scenes.rigid_body, "work_precision", work_precision)
+
+
+def test_files_and_table(short, tmp_path, capsys):
+    output = tmp_path / "new" / "folder"
+    command = ["chart", "rigid_body", "--output", str(output), "--budget", "0.1"]
+    assert main(command) == 0
+    out, error = capsys.readouterr()
+    files = ["rigid_body.csv", "rigid_body.pdf", "rigid_body.png"]
+    assert sorted(os.listdir(output)) == files
+    assert error == ""
+    for name in files:
+        assert f"Wrote {output / name}" in out
+    assert (output / "rigid_body.png").read_bytes().startswith(b"\x89PNG")
+    assert (output / "rigid_body.pdf").read_bytes().startswith(b"%PDF")
+    with open(output / "rigid_body.csv", newline="") as file:
+        rows = list(csv.DictReader(file))
+    assert [(row["method"], row["num_steps"]) for row in rows] == [
+        (name, n) for name in ("Dopri5", "Tsit5") for n in ("500", "1000")
+    ]
+    for row in rows:
+        assert row["method"] in out
+        assert 0 < float(row["error"]) < 1e-3
+        assert float(row["seconds_min"]) <= float(row["seconds_median"])
+    # A second run replaces the files.
+    (output / "rigid_body.csv").write_text("old")
+    assert main(command) == 0
+    assert sorted(os.listdir(output)) == files
+    assert (output / "rigid_body.csv").read_text() != "old"
+
+
+def test_every_chart_says_what_it_shows():
+    assert "rigid_body" in __main__._SCENES
+    for name, chart in __main__._SCENES.items():
+        assert chart.__doc__ and len(chart.__doc__.splitlines()[0]) > 10, name
+
+
+def test_the_caption_says_what_is_not_known(short):
+    with Progress(disable=True) as progress:
+        report = _report.chart("rigid_body", scenes.rigid_body.chart, 0.1, progress)
+    (caption,) = (text.get_text() for text in report.figures["rigid_body"].texts)
+    caption = caption.replace("\n", " ")
+    assert "rigid body" in caption
+    assert "not known for Dopri5, Tsit5" in caption
+
+
+def test_a_missing_extra():
+    code = """
+import sys
+sys.modules["rich"] = None
+from cfjax.__main__ import main
+main(["chart", "rigid_body"])
+"""
+    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True)
+    assert done.returncode == 2
+    assert done.stderr == "cfjax chart: error: rich is missing: pip install cfjax[paper]\n"
+
+
+@pytest.mark.parametrize(
+    "arguments, message",
+    [
+        ([], "SCENE"),
+        (["chess"], "invalid choice: 'chess' (choose from"),
+        (["rigid_body", "extra"], "extra"),
+        (["rigid_body", "--budget"], "--budget"),
+        (["rigid_body", "--budget", "soon"], "positive number of seconds, got 'soon'"),
+        (["rigid_body", "--budget", "0"], "positive number of seconds, got '0'"),
+        (["rigid_body", "--budget=-1"], "positive number of seconds, got '-1'"),
+        (["rigid_body", "--budget", "nan"], "positive number of seconds, got 'nan'"),
+        (["rigid_body", "--output"], "--output"),
+    ],
+)
+def test_bad_arguments(arguments, message, capsys):
+    check_one_line_error(["chart", *arguments], message, capsys)
+
+
+def test_output_that_is_a_file(tmp_path, capsys):
+    path = tmp_path / "file"
+    path.write_text("mine")
+    check_one_line_error(["chart", "rigid_body", "--output", str(path)], str(path), capsys)
+    assert path.read_text() == "mine"
+
+
+def check_one_line_error(arguments, message, capsys):
+    with pytest.raises(SystemExit) as exit_:
+        main(arguments)
+    out, error = capsys.readouterr()
+    assert exit_.value.code == 2
+    assert out == ""
+    assert error.startswith("cfjax") and error.count("\n") == 1
+    assert message in error
+
+
+def test_help(capsys):
+    with pytest.raises(SystemExit) as exit_:
+        main(["chart", "--help"])
+    assert exit_.value.code == 0
+    out = capsys.readouterr().out
+    assert "rigid_body" in out and "--budget" in out and "--output" in out
