@@ -1,3 +1,4 @@
 """Problems with known answers, one to a module."""
 
+from . import heat as heat
 from . import rigid_body as rigid_body
