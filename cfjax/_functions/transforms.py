@@ -2,6 +2,7 @@
 
 import abc
 from collections.abc import Callable
+from math import sqrt
 
 import equinox as eqx
 import jax.numpy as jnp
@@ -130,7 +131,7 @@ def _cosine_scale(n: int) -> Float[np.ndarray, " n"]:
 def _sine(x: Float[Array, "n *k"]) -> Float[Array, "n *k"]:
     n = len(x)
     padded = jnp.concatenate([jnp.zeros_like(x[:1]), x])
-    return -np.sqrt(2 / (n + 1)) * jnp.fft.rfft(padded, 2 * (n + 1), axis=0).imag[1 : n + 1]
+    return -sqrt(2 / (n + 1)) * jnp.fft.rfft(padded, 2 * (n + 1), axis=0).imag[1 : n + 1]
 
 
 def _cosine(x: Float[Array, "n *k"]) -> Float[Array, "n *k"]:

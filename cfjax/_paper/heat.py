@@ -109,14 +109,16 @@ class Controller(diffrax.AbstractAdaptiveStepSizeController):
     def init(self, terms, t0, t1, y0, dt0, args, func, error_order):
         return t0 + dt0, ()
 
-    def adapt_step_size(self, t0, t1, y0, y1_candidate, args, y_error, error_order, state):
+    def adapt_step_size(
+        self, t0, t1, y0, y1_candidate, args, y_error, error_order, controller_state
+    ):
         error = self.norm(y_error)
         keep = error <= self.atol
         # Bounds for estimates of zero and infinity only.
         factor = jnp.clip(0.9 * (self.atol / error) ** (1 / error_order), 1e-3, 1e3)
         start = jnp.where(keep, t1, t0)
         end = start + (t1 - t0) * factor
-        return keep, start, end, False, state, diffrax.RESULTS.successful
+        return keep, start, end, False, controller_state, diffrax.RESULTS.successful
 
 
 def report(
@@ -177,10 +179,11 @@ def _solve(method: Method, tolerance: Array, y0: Array, args: heat.Diffusivity):
             )
         ),
         stepsize_controller=Controller(
-            tolerance, norm=lambda error: jnp.max(jnp.abs(method.to_grid(error)))
+            atol=tolerance, norm=lambda error: jnp.max(jnp.abs(method.to_grid(error)))
         ),
         max_steps=2**18,
     )
+    assert solution.ys is not None
     t, y = solution.ys
     return t, method.to_grid(y[-1]), solution.stats
 

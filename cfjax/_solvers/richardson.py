@@ -70,7 +70,9 @@ class Richardson(diffrax.AbstractAdaptiveSolver, diffrax.AbstractWrappedSolver):
         return self.solver.term_compatible_contr_kwargs
 
     @property
-    def interpolation_cls(self) -> Callable[..., diffrax.AbstractLocalInterpolation]:
+    def interpolation_cls(  # pyright: ignore[reportIncompatibleMethodOverride]
+        self,
+    ) -> Callable[..., diffrax.AbstractLocalInterpolation]:
         inner = self.solver.interpolation_cls
         return _HalvesFactory(inner) if self.advance_by_halves else inner
 

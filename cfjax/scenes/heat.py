@@ -25,14 +25,14 @@ t0, t1 = 0.0, 0.5
 class Diffusivity(NamedTuple):
     """What the fields take as `args`."""
 
-    mu: Float[Array | np.ndarray, " N"]  # At the midpoints of the intervals.
-    constant: Float[Array | np.ndarray | np.generic, ""]  # The part that the flows solve exactly.
+    mu: Float[Array | np.ndarray, " N"]  # at the midpoints of the intervals
+    constant: Float[Array | np.ndarray, ""]  # the part that the flows solve exactly
 
 
 def diffusivity(num_intervals: int = 100) -> Diffusivity:
     """The paper's `mu(x) = 1 - x^2`, and its mean."""
     mu = 1 - _midpoints(num_intervals) ** 2
-    return Diffusivity(mu, np.mean(mu))
+    return Diffusivity(mu, np.asarray(np.mean(mu)))
 
 
 def y0(num_intervals: int = 100) -> Float[np.ndarray, " N-1"]:
@@ -40,7 +40,7 @@ def y0(num_intervals: int = 100) -> Float[np.ndarray, " N-1"]:
     # Not at import: few who import the package need it.
     from scipy.fft import dst
 
-    return dst(1 - np.abs(_points(num_intervals)), type=1, norm="ortho")
+    return np.asarray(dst(1 - np.abs(_points(num_intervals)), type=1, norm="ortho"))
 
 
 def field(t: Any, y: Float[Array, " N-1"], args: Diffusivity) -> Affine:
@@ -48,8 +48,9 @@ def field(t: Any, y: Float[Array, " N-1"], args: Diffusivity) -> Affine:
     n = len(y)
     k = np.arange(1, n + 1)
     second_difference = -(((n + 1) * np.sin(k * np.pi / (2 * (n + 1)))) ** 2)
-    b = _operator(args.mu - args.constant, to_grid(y))
-    return Affine(1.0, from_grid(b), args.constant * jnp.asarray(second_difference, y.dtype))
+    mu, constant = jnp.asarray(args.mu), jnp.asarray(args.constant)
+    b = _operator(mu - constant, to_grid(y))
+    return Affine(1.0, from_grid(b), constant * jnp.asarray(second_difference, y.dtype))
 
 
 def grid_field(t: Any, u: Float[Array, " N-1"], args: Diffusivity) -> Float[Array, " N-1"]:
@@ -57,7 +58,7 @@ def grid_field(t: Any, u: Float[Array, " N-1"], args: Diffusivity) -> Float[Arra
 
     As a translation: with it CF4 is the classical Runge-Kutta method.
     """
-    return _operator(args.mu, u)
+    return _operator(jnp.asarray(args.mu), u)
 
 
 def to_grid(y: Float[Array, " N-1"]) -> Float[Array, " N-1"]:
