@@ -1,7 +1,7 @@
 """An error estimate for any solver, by step doubling."""
 
 from collections.abc import Callable
-from typing import Any, NamedTuple
+from typing import Any, NamedTuple, cast
 
 import diffrax
 import equinox as eqx
@@ -70,6 +70,11 @@ class Richardson(diffrax.AbstractAdaptiveSolver, diffrax.AbstractWrappedSolver):
         return self.solver.term_compatible_contr_kwargs
 
     @property
+    def root_finder(self) -> Any:
+        """That of an implicit solver: diffrax gives it the controller's tolerances."""
+        return cast(diffrax.AbstractImplicitSolver, self.solver).root_finder
+
+    @property
     def interpolation_cls(  # pyright: ignore[reportIncompatibleMethodOverride]
         self,
     ) -> Callable[..., diffrax.AbstractLocalInterpolation]:
@@ -102,6 +107,10 @@ class Richardson(diffrax.AbstractAdaptiveSolver, diffrax.AbstractWrappedSolver):
         factor = 1 / (2 ** self.order(terms) - 1)
         error = jtu.tree_map(lambda a, b: (a - b) * factor, y1, y2)
         result = _first_failure(result, result_1, result_2)
+        if result is not diffrax.RESULTS.successful:
+            # What a failed step returns may look like a small error. As in diffrax, it is rejected.
+            okay = diffrax.is_okay(result)
+            error = jtu.tree_map(lambda e: jnp.where(okay, e, jnp.inf), error)
         if self.advance_by_halves:
             halves = dict(first=first, second=second)
             return y2, error, halves, state_2, result
