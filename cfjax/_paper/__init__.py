@@ -9,6 +9,10 @@ from collections.abc import Callable, Sequence
 from rich.progress import Progress
 
 from .._report import Report
-from . import complexity, rigid_body
+from . import complexity, heat, rigid_body
 
-EXPERIMENTS: Sequence[Callable[[Progress], Report]] = (complexity.report, rigid_body.report)
+EXPERIMENTS: Sequence[Callable[[Progress], Report]] = (
+    complexity.report,
+    rigid_body.report,
+    heat.report,
+)
