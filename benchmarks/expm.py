@@ -1,9 +1,13 @@
-"""`expm` against `jax.scipy.linalg.expm`: time in a loop, forward and gradient, and compile time.
+"""Exponentials against `jax.scipy.linalg.expm`: time in a loop, with gradients, and compile time.
+
+The dense `expm` for several sizes, and the closed form for rotations of space against the dense
+exponential of the 3 x 3 matrix.
 
 Run `python benchmarks/expm.py`. Both are timed in turns in one process, so the ratios carry over to
 other machines and the times do not.
 """
 
+import itertools
 import statistics
 import time
 from collections.abc import Callable
@@ -16,6 +20,7 @@ from rich.console import Console
 from rich.table import Table
 
 from cfjax._functions.expm import expm
+from cfjax._functions.rotate import rotate
 
 SIZES = (3, 8, 32)
 BATCHES = (1, 100, 1000)
@@ -34,12 +39,24 @@ def matrices(n: int, batch: int, norm: float) -> tuple[Array, Array]:
     return jnp.asarray(a), jnp.asarray(rng.normal(size=(batch, n)))
 
 
-def loop(exponential: Callable[[Array], Array], steps: int, gradient: bool) -> jax.stages.Wrapped:
+def apply_ours(a: Array, v: Array) -> Array:
+    return expm(a) @ v
+
+
+def apply_theirs(a: Array, v: Array) -> Array:
+    return jax.scipy.linalg.expm(a) @ v
+
+
+def rotate_ours(a: Array, v: Array) -> Array:
+    return rotate(jnp.array([a[2, 1], a[0, 2], a[1, 0]]), v)
+
+
+def loop(action: Callable[[Array, Array], Array], steps: int, gradient: bool) -> jax.stages.Wrapped:
     """A batch of loops that multiply a vector with an exponential which changes every step."""
 
     def step(carry: tuple[Array, Array], _: None) -> tuple[tuple[Array, Array], None]:
         a, v = carry
-        return (a * (1 - 1e-9), exponential(a) @ v), None
+        return (a * (1 - 1e-9), action(a, v)), None
 
     def run(a: Array, v: Array) -> Array:
         body = jax.checkpoint(step) if gradient else step
@@ -48,12 +65,15 @@ def loop(exponential: Callable[[Array], Array], steps: int, gradient: bool) -> j
     return jax.jit(jax.vmap(jax.grad(run) if gradient else run))
 
 
-def compare(n: int, batch: int, norm: float, gradient: bool) -> list[str]:
+def compare(
+    ours: Callable[[Array, Array], Array], n: int, batch: int, norm: float, gradient: bool
+) -> list[str]:
+    """One row of the table for the exponential `ours`."""
     a, v = matrices(n, batch, norm)
     steps = max(3, min(1000, int(FLOPS / (n**3 * batch) / (10 if gradient else 3))))
     programs, compiling, times = [], [], ([], [])
-    for exponential in (expm, jax.scipy.linalg.expm):
-        lowered = loop(exponential, steps, gradient).lower(a, v)
+    for action in (ours, apply_theirs):
+        lowered = loop(action, steps, gradient).lower(a, v)
         start = time.perf_counter()
         programs.append(lowered.compile())
         compiling.append(time.perf_counter() - start)
@@ -63,12 +83,12 @@ def compare(n: int, batch: int, norm: float, gradient: bool) -> list[str]:
             jax.block_until_ready(program(a, v))
             if repeat > 0:  # The first call warms up.
                 taken.append(time.perf_counter() - start)
-    ours, theirs = times
-    ratios = [t / o for o, t in zip(ours, theirs, strict=True)]
+    ratios = [t / o for o, t in zip(*times, strict=True)]
     return [
         "gradient" if gradient else "forward",
+        "rotate" if ours is rotate_ours else "expm",
         *(str(x) for x in (n, batch, norm)),
-        f"{statistics.median(ours) / steps / batch * 1e6:.2f}",
+        f"{statistics.median(times[0]) / steps / batch * 1e6:.2f}",
         f"{statistics.median(ratios):.1f}",
         f"{min(ratios):.1f} to {max(ratios):.1f}",
         f"{compiling[0]:.2f} / {compiling[1]:.2f}",
@@ -77,15 +97,14 @@ def compare(n: int, batch: int, norm: float, gradient: bool) -> list[str]:
 
 def main() -> None:
     jax.config.update("jax_enable_x64", True)
-    table = Table(title="expm against jax.scipy.linalg.expm, float64")
-    columns = ("", "n", "batch", "norm", "µs each", "times faster", "spread", "compile, s")
+    table = Table(title="Exponentials against jax.scipy.linalg.expm, float64")
+    columns = ("", "ours", "n", "batch", "norm", "µs each", "times faster", "spread", "compile, s")
     for column in columns:
         table.add_column(column, justify="right")
     for gradient in (False, True):
-        for n in SIZES:
-            for batch in BATCHES:
-                for norm in NORMS:
-                    table.add_row(*compare(n, batch, norm, gradient))
+        for ours, sizes in ((rotate_ours, (3,)), (apply_ours, SIZES)):
+            for n, batch, norm in itertools.product(sizes, BATCHES, NORMS):
+                table.add_row(*compare(ours, n, batch, norm, gradient))
         table.add_section()
     Console(width=100).print(table)
 

@@ -1,6 +1,11 @@
 """Commutator-free Lie group integrators for JAX."""
 
 from . import scenes as scenes
+from ._batch import BatchResult as BatchResult
+from ._batch import map_batch as map_batch
+from ._fields.affine import Affine as Affine
+from ._fields.low_rank import BorderedSkew as BorderedSkew
+from ._fields.low_rank import LowRankSkew as LowRankSkew
 from ._fields.matrix import LeftMatrix as LeftMatrix
 from ._fields.matrix import RightMatrix as RightMatrix
 from ._fields.rotation import Rotation as Rotation
@@ -10,6 +15,11 @@ from ._frozen_field import bracket as bracket
 from ._frozen_field import combine as combine
 from ._frozen_field import flow as flow
 from ._frozen_field import tangent as tangent
+from ._functions.transforms import AbstractTransform as AbstractTransform
+from ._functions.transforms import CosineTransform as CosineTransform
+from ._functions.transforms import FourierTransform as FourierTransform
+from ._functions.transforms import RealFourierTransform as RealFourierTransform
+from ._functions.transforms import SineTransform as SineTransform
 from ._integrate import integrate as integrate
 from ._order_conditions import error_constant as error_constant
 from ._order_conditions import order as order
@@ -24,6 +34,7 @@ from ._solvers.commutator_free import LieEuler as LieEuler
 from ._solvers.munthe_kaas import RKMK as RKMK
 from ._solvers.munthe_kaas import RKMK3 as RKMK3
 from ._solvers.munthe_kaas import RKMK4 as RKMK4
+from ._solvers.richardson import Richardson as Richardson
 from ._stability import stability_function as stability_function
 from ._tableau import Tableau as Tableau
 from ._tableau import third_order_a as third_order_a

@@ -25,6 +25,9 @@ class AbstractFrozenField(eqx.Module):
       an array is structure (a spectrum, a factor) instead of a coordinate.
 
     `flow` and `tangent` must accept the zero field.
+
+    A class may also work in coordinates of its own within a step, where that is what makes it
+    cheap. Then it overrides `enter` and `leave` too.
     """
 
     # Whether the point that the field acts on is a pytree instead of one array.
@@ -38,10 +41,33 @@ class AbstractFrozenField(eqx.Module):
     def tangent(self, point: Any) -> Any:
         """The ambient velocity at `point`, the derivative of the flow at time zero."""
 
+    def displacement(self, point: Any) -> Any:
+        """`flow(point) - point`, with a rounding as small as the displacement; None if not offered.
+
+        A class that offers it gets compensated summation over the steps where it acts on matrices
+        (`_solvers/base.py`). Not for a field whose flow keeps signs or relative accuracy: the sum
+        of point and displacement keeps absolute accuracy only.
+        """
+        return None
+
     @classmethod
     def combine(cls, weights: Sequence[Weight], fields: Sequence[Any]) -> Any:
         """The field `sum_i weights[i] * fields[i]`. Weights are real scalars."""
         return jtu.tree_map(lambda *leaves: _linear_combination(weights, leaves), *fields)
+
+    def enter(self, point: Any, earlier: Sequence[Any]) -> tuple["AbstractFrozenField", Any]:
+        """This field and the point where it is frozen, in the coordinates of the step.
+
+        A solver calls it after every evaluation. `earlier` holds the fields that have entered in
+        this step; where there is none, `point` is the state itself. All flows of the step start
+        from the point returned then, so drift can be corrected there. By default nothing changes.
+        """
+        del earlier
+        return self, point
+
+    def leave(self, point: Any) -> Any:
+        """The state at a point of a step, for a field that has entered. By default the point."""
+        return point
 
 
 class AbstractAlgebraElement(AbstractFrozenField):
@@ -68,9 +94,36 @@ def flow(field: PyTree, point: PyTree) -> PyTree:
     field, whose flow is a translation; an `AbstractFrozenField` acts on the part of `point` that
     stands in its place.
     """
-    return jtu.tree_map(
-        lambda f, p: f.flow(p) if is_field(f) else p + f, field, point, is_leaf=is_field
-    )
+
+    def flow_leaf(f, p):
+        if isinstance(p, Displaced) and is_field(f):
+            moved = f.displacement(p.value)
+            if moved is not None:
+                return Displaced(p.start, p.displacement + moved)
+        p = value(p)
+        return f.flow(p) if is_field(f) else p + f
+
+    return jtu.tree_map(flow_leaf, field, point, is_leaf=is_field)
+
+
+class Displaced(eqx.Module):
+    """A point as a start and the displacement from it, whose rounding is as small as it is."""
+
+    start: Inexact[Array, "..."]
+    displacement: Inexact[Array, "..."]
+
+    @property
+    def value(self) -> Inexact[Array, "..."]:
+        return self.start + self.displacement
+
+
+def is_displaced(x: Any) -> bool:
+    return isinstance(x, Displaced)
+
+
+def value(point: PyTree) -> PyTree:
+    """The point with every `Displaced` in it summed up."""
+    return jtu.tree_map(lambda p: p.value if is_displaced(p) else p, point, is_leaf=is_displaced)
 
 
 def tangent(field: PyTree, point: PyTree) -> PyTree:
@@ -109,6 +162,25 @@ def bracket(a: PyTree, b: PyTree) -> PyTree:
         return jnp.zeros_like(x)
 
     return jtu.tree_map(bracket_leaf, a, b, is_leaf=is_field)
+
+
+def enter(field: PyTree, point: PyTree, earlier: Sequence[PyTree]) -> tuple[PyTree, PyTree]:
+    """`field` and the point where it is frozen, in the coordinates of a step, part by part."""
+    parts, treedef = jtu.tree_flatten(field, is_leaf=is_field)
+    columns = [treedef.flatten_up_to(tree) for tree in (point, *earlier)]
+    entered = [
+        f.enter(p, before) if is_field(f) else (f, p)
+        for f, p, *before in zip(parts, *columns, strict=True)
+    ]
+    fields, points = zip(*entered, strict=True)
+    return treedef.unflatten(fields), treedef.unflatten(points)
+
+
+def leave(field: PyTree, point: PyTree) -> PyTree:
+    """The state at a point of a step, for a field that has entered."""
+    return jtu.tree_map(
+        lambda f, p: f.leave(p) if is_field(f) else p, field, point, is_leaf=is_field
+    )
 
 
 def without_bracket(field: AbstractFrozenField) -> str:

@@ -25,6 +25,7 @@ STYLES: dict[str, dict[str, Any]] = {
     "RKMK3": dict(color="#CC79A7", linestyle=":", marker="v", linewidth=1.9),
     "CF4": dict(color="#0072B2", linestyle="-", marker="o"),
     "RKMK4": dict(color="#D55E00", linestyle="--", marker="s"),
+    "RK4": dict(color="#000000", linestyle="-.", marker="D"),
 }
 # For all other methods, in turn.
 _OTHER_STYLES = [

@@ -4,6 +4,7 @@ from typing import ClassVar
 
 import jax
 import jax.numpy as jnp
+import mpmath
 import numpy as np
 import pytest
 import scipy.linalg
@@ -215,3 +216,27 @@ def test_a_class_of_the_user_under_every_solver_kind():
         ys = jax.tree.map(lambda y: y[-1], end.ys)
         np.testing.assert_allclose(ys["Q"], e[:3, :3], rtol=0, atol=100 * EPS)
         np.testing.assert_allclose(ys["x"], e[:3, :3] @ V + e[:3, 3], rtol=0, atol=400 * EPS)
+
+
+SPIN = np.array([[0.0, -0.3, 0.2], [0.3, 0.0, -0.7], [-0.2, 0.7, 0.0]])
+
+
+@pytest.mark.parametrize(
+    "make",
+    [
+        lambda a: cfjax.Rotation(jnp.array([a[2, 1], a[0, 2], a[1, 0]])),
+        cfjax.LeftMatrix,
+        cfjax.RightMatrix,
+    ],
+)
+@pytest.mark.parametrize("size", [1e-7, 1.0, 30.0])
+def test_displacement_has_the_rounding_of_the_displacement(make, size):
+    a = size * SPIN
+    moved = make(jnp.asarray(a)).displacement(jnp.eye(3))
+    with mpmath.workdps(40):
+        exact = np.array((mpmath.expm(mpmath.matrix(a)) - mpmath.eye(3)).tolist(), float)
+    # Eight units times the largest entry; an angle beyond one multiplies its own rounding.
+    atol = 8 * np.finfo(float).eps * np.abs(exact).max() * max(1, size)
+    np.testing.assert_allclose(moved, exact, rtol=0, atol=atol)
+    flow = cfjax.flow(make(jnp.asarray(a)), jnp.eye(3))
+    np.testing.assert_allclose(flow, exact + np.eye(3), rtol=0, atol=max(atol, 1e-15))

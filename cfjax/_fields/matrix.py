@@ -37,6 +37,10 @@ class LeftMatrix(AbstractAlgebraElement):
         weight, rest = expm_parts(self.a)
         return weight.astype(point.dtype) * point + _product(rest, point)
 
+    def displacement(self, point: Inexact[Array, "n *k"]) -> Inexact[Array, "n *k"]:
+        weight, rest = expm_parts(self.a)
+        return (weight - 1).astype(point.dtype) * point + _product(rest, point)
+
     def tangent(self, point: Inexact[Array, "n *k"]) -> Inexact[Array, "n *k"]:
         n = len(self.a)
         if point.ndim not in (1, 2) or point.shape[0] != n:
@@ -65,6 +69,10 @@ class RightMatrix(AbstractAlgebraElement):
     def flow(self, point: Inexact[Array, "*k n"]) -> Inexact[Array, "*k n"]:
         weight, rest = expm_parts(self.a)
         return weight.astype(point.dtype) * point + _product(point, rest)
+
+    def displacement(self, point: Inexact[Array, "*k n"]) -> Inexact[Array, "*k n"]:
+        weight, rest = expm_parts(self.a)
+        return (weight - 1).astype(point.dtype) * point + _product(point, rest)
 
     def tangent(self, point: Inexact[Array, "*k n"]) -> Inexact[Array, "*k n"]:
         n = len(self.a)

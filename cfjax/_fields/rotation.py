@@ -7,7 +7,7 @@ import jax.numpy as jnp
 from jaxtyping import Array, Float
 
 from .._frozen_field import AbstractAlgebraElement
-from .._functions.rotate import cross, rotate
+from .._functions.rotate import cross, displacement, rotate
 
 
 class Rotation(AbstractAlgebraElement):
@@ -35,6 +35,10 @@ class Rotation(AbstractAlgebraElement):
     def flow(self, point: Float[Array, "3 *k"]) -> Float[Array, "3 *k"]:
         _check_point(point)
         return rotate(self.omega, point)
+
+    def displacement(self, point: Float[Array, "3 *k"]) -> Float[Array, "3 *k"]:
+        _check_point(point)
+        return displacement(self.omega, point)
 
     def tangent(self, point: Float[Array, "3 *k"]) -> Float[Array, "3 *k"]:
         _check_point(point)

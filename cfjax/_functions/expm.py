@@ -115,19 +115,19 @@ def _scaling(scheme: _Scheme, a2: Array) -> tuple[Array, Array]:
 # A condition that vmap batches becomes a select, which runs both branches. The maximum over the
 # batch is not batched, so a condition on it stays a real branch.
 @custom_vmap
-def _max_over_batch(s: Array) -> Array:
+def max_over_batch(s: Array) -> Array:
     return s
 
 
-@_max_over_batch.def_vmap
+@max_over_batch.def_vmap
 def _(axis_size: int, in_batched: list[bool], s: Array) -> tuple[Array, bool]:
     del axis_size, in_batched
-    return _max_over_batch(jnp.max(s)), False
+    return max_over_batch(jnp.max(s)), False
 
 
 def _square(x: Array, s: Array) -> Array:
     """x squared s times. A loop of branches, since a loop of unknown length has no reverse mode."""
-    most = _max_over_batch(s)
+    most = max_over_batch(s)
 
     # Without checkpoints the branch not taken must still hand out room for what the other saves.
     @jax.checkpoint

@@ -20,13 +20,19 @@ def rotate(a: Float[Array, "3"], x: Float[Array, "3 *k"]) -> Float[Array, "3 *k"
     Rodrigues' formula `x + c_1 a*x + c_2 a*(a*x)` with cross products and Stumpff functions
     of `|a|^2`.
     """
+    return x + displacement(a, x)
+
+
+@jax.jit
+def displacement(a: Float[Array, "3"], x: Float[Array, "3 *k"]) -> Float[Array, "3 *k"]:
+    """`rotate(a, x) - x`, with a rounding as small as it is."""
     a0, a1, a2 = a[0], a[1], a[2]
     s = a0 * a0 + a1 * a1 + a2 * a2
     c1, c2 = stumpff_1_2(s)
     once = _cross((a0, a1, a2), (x[0], x[1], x[2]))
     twice = _cross((a0, a1, a2), once)
     return _vector(
-        tuple(x[i] + (c1 * once[i] + c2 * twice[i]) for i in range(3)),
+        tuple(c1 * once[i] + c2 * twice[i] for i in range(3)),
     )
 
 

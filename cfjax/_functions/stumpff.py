@@ -10,6 +10,8 @@ import jax.numpy as jnp
 from jax import lax
 from jaxtyping import Array, Float
 
+from .polynomial import polynomial
+
 
 @functools.partial(jax.custom_jvp, nondiff_argnums=(0,))
 def stumpff(n: int, s: Float[Array, "*batch"]) -> Float[Array, "*batch"]:
@@ -31,7 +33,7 @@ def stumpff(n: int, s: Float[Array, "*batch"]) -> Float[Array, "*batch"]:
     # The recursion loses digits to cancellation for small s, the series for large s.
     small = s < 16
     coefficients = [(-1) ** j / factorial(n + 2 * j) for j in range(18)]
-    series = _polynomial(coefficients, jnp.where(small, s, 0))
+    series = polynomial(coefficients, jnp.where(small, s, 0))
     recursion = (1 / factorial(n - 2) - stumpff(n - 2, s)) / jnp.where(small, 1, s)
     return jnp.where(small, series, recursion)
 
@@ -49,7 +51,7 @@ def stumpff_1_2(s: Float[Array, "*batch"]) -> tuple[Float[Array, "*batch"], Floa
     scale = _reduction(s, constants)
     square = scale * scale
     z = s * square
-    return scale * _polynomial(constants.sin, z), square * _polynomial(constants.versin, z)
+    return scale * polynomial(constants.sin, z), square * polynomial(constants.versin, z)
 
 
 @stumpff_1_2.defjvp
@@ -79,20 +81,10 @@ def _reduction(s: Float[Array, "*batch"], constants: _Constants) -> Float[Array,
     """
     bits = lax.bitcast_convert_type(s, constants.bits)
     guess = lax.bitcast_convert_type(constants.seed - (bits >> 1), s.dtype)
-    correction = _polynomial(constants.rsqrt, 1 - (s * guess) * guess)
+    correction = polynomial(constants.rsqrt, 1 - (s * guess) * guess)
     # What does not need the correction is grouped so that it does not wait for it.
     turns = jnp.round(((s * (0.5 / pi)) * guess) * correction)
     return 1 - turns * (((2 * pi) * guess) * correction)
-
-
-def _polynomial(coefficients: Sequence[float], x: Float[Array, "*batch"]) -> Float[Array, "*batch"]:
-    """Estrin's scheme: shorter chains of dependent operations than Horner's."""
-    terms: list = [jnp.asarray(a, x.dtype) for a in coefficients]
-    while len(terms) > 1:
-        pairs = [terms[i] + terms[i + 1] * x for i in range(0, len(terms) - 1, 2)]
-        terms = pairs + terms[len(pairs) * 2 :]
-        x = x * x
-    return terms[0]
 
 
 _DOUBLE = _Constants(

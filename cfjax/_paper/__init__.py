@@ -1,7 +1,7 @@
 """The experiments of the paper: its tables and figures, each beside the printed numbers.
 
 Source: Celledoni, Marthinsen & Owren, Commutator-free Lie group methods, FGCS 19 (2003),
-Section 3.
+Sections 1 and 3.
 """
 
 from collections.abc import Callable, Sequence
@@ -9,6 +9,10 @@ from collections.abc import Callable, Sequence
 from rich.progress import Progress
 
 from .._report import Report
-from . import rigid_body
+from . import complexity, heat, rigid_body
 
-EXPERIMENTS: Sequence[Callable[[Progress], Report]] = (rigid_body.report,)
+EXPERIMENTS: Sequence[Callable[[Progress], Report]] = (
+    complexity.report,
+    rigid_body.report,
+    heat.report,
+)

@@ -6,7 +6,7 @@ import equinox as eqx
 from jaxtyping import PyTree
 
 from .. import _tableau
-from .._frozen_field import combine, flow
+from .._frozen_field import combine, enter, flow, leave
 from .._order_conditions import order
 from .._tableau import Product, Tableau
 from .base import AbstractLieSolver
@@ -32,8 +32,11 @@ class AbstractCommutatorFree(AbstractLieSolver):
             return points[rows]
 
         for c, rows in zip(self.tableau.c, self.tableau.alpha, strict=True):
-            fields.append(field(float(c), point(rows)))
-        return point(self.tableau.beta)
+            here = point(rows)
+            value = field(float(c), leave(fields[0], here) if fields else here)
+            value, points[rows] = enter(value, here, fields)
+            fields.append(value)
+        return leave(fields[0], point(self.tableau.beta))
 
 
 class CommutatorFree(AbstractCommutatorFree):

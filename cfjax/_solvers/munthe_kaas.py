@@ -16,8 +16,10 @@ from .._frozen_field import (
     AbstractAlgebraElement,
     bracket,
     combine,
+    enter,
     flow,
     is_field,
+    leave,
     without_bracket,
 )
 from .._order_conditions import runge_kutta_order
@@ -32,14 +34,24 @@ class AbstractMuntheKaas(AbstractLieSolver):
         """The element v; `field(c, u)` is `h f(t + c h, exp(u) y0)`, and `u = None` means zero."""
 
     def end_point(self, field, y0):
+        fields: list[PyTree] = []
+        start = y0
+
         def field_at(c: float, u: PyTree) -> PyTree:
-            value = field(c, y0 if u is None else flow(u, y0))
+            nonlocal start
+            here = start if u is None else flow(u, start)
+            value = field(c, leave(fields[0], here) if fields else here)
+            value, here = enter(value, here, fields)
             for part in jtu.tree_leaves(value, is_leaf=is_field):
                 if is_field(part) and not isinstance(part, AbstractAlgebraElement):
                     raise TypeError(without_bracket(part))
+            if not fields:
+                start = here
+            fields.append(value)
             return value
 
-        return flow(self.increment(field_at), y0)
+        end = flow(self.increment(field_at), start)
+        return leave(fields[0], end)
 
 
 class RKMK3(AbstractMuntheKaas):

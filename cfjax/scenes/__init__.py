@@ -1,3 +1,5 @@
 """Problems with known answers, one to a module."""
 
+from . import heat as heat
 from . import rigid_body as rigid_body
+from . import stiefel as stiefel

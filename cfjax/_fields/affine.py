@@ -1,0 +1,133 @@
+"""Affine fields with a linear part that a fast transform makes diagonal."""
+
+from collections.abc import Sequence
+from typing import Any
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Inexact
+
+from .._frozen_field import AbstractAlgebraElement, Weight, combine
+from .._functions.phi import phi_1
+from .._functions.transforms import AbstractTransform
+
+_DTYPES = ("float32", "float64", "complex64", "complex128")
+
+
+class Affine(AbstractAlgebraElement):
+    """The field `x' = alpha M x + b` with a fixed operator M, for stiff semilinear problems.
+
+    M is diagonal in the coefficients of a transform, with the eigenvalues `spectrum`. Its flow is
+    `exp(alpha M) x + phi_1(alpha M) b` with `phi_1(z) = (exp(z) - 1) / z`, exact however stiff M
+    is. So to solve `u' = M u + g(u)` return `Affine(1.0, g(u), spectrum, transform)`.
+
+    Without a transform the state, and `b`, are the coefficients themselves, and a flow costs an
+    exponential, a division and a polynomial for each eigenvalue. With one they are points, and a
+    flow costs three transforms more. So a state of coefficients is cheaper: only g transforms.
+
+    The coordinates are `(alpha, b)`. **The spectrum is not one**: a linear combination has the
+    spectrum of its first field, so it must not depend on time or state. It may depend on `args`,
+    and has a derivative. The bracket is `[(a, b), (a', b')] = (0, M (a b' - a' b))`: a method that
+    needs it multiplies by M, which makes it stiff.
+
+    **Arguments:**
+
+    - `alpha`: a real scalar.
+    - `b`: shaped like the state, `(n,)` or `(n, k)` or any other shape. float32, float64,
+      complex64 or complex128.
+    - `spectrum`: the eigenvalues, shaped like the coefficients of `b` or, if these have more axes,
+      like the first of them: with shape `(m,)` every column has the same. Real, or complex where
+      the coefficients are.
+    - `transform`: a `cfjax.AbstractTransform`, for example `cfjax.SineTransform()`, or None.
+
+    **Raises** `ValueError` for shapes that do not fit, `TypeError` for dtypes that do not, or
+    another kind of transform.
+
+    Source: Celledoni, Marthinsen & Owren, Commutator-free Lie group methods, FGCS 19 (2003),
+    Section 3.3; Munthe-Kaas, High order Runge-Kutta methods on manifolds, Appl. Numer. Math. 29
+    (1999).
+    """
+
+    alpha: Inexact[Array, ""]
+    b: Inexact[Array, "*point"]
+    spectrum: Inexact[Array, "*coefficients"]
+    transform: AbstractTransform | None
+
+    def __init__(
+        self,
+        alpha: Any,
+        b: Inexact[Array | np.ndarray, "*point"],
+        spectrum: Inexact[Array | np.ndarray, "*coefficients"],
+        transform: AbstractTransform | None = None,
+    ):
+        self.b, self.spectrum, self.transform = jnp.asarray(b), jnp.asarray(spectrum), transform
+        if self.b.dtype.name not in _DTYPES:
+            raise TypeError(f"b must be one of {', '.join(_DTYPES)}, got {self.b.dtype}.")
+        if transform is not None and not isinstance(transform, AbstractTransform):
+            raise TypeError(f"transform must be a cfjax.AbstractTransform, got {transform!r}.")
+        # A Python number takes the precision of the field.
+        precision = jnp.finfo(self.b.dtype).dtype
+        is_number = isinstance(alpha, int | float)
+        self.alpha = jnp.asarray(alpha, precision) if is_number else jnp.asarray(alpha)
+        if self.alpha.shape != () or self.alpha.dtype != precision:
+            raise ValueError(
+                f"alpha must be a real scalar of the precision of b, {precision}, got "
+                f"{self.alpha.dtype} of shape {self.alpha.shape}."
+            )
+        c = jax.eval_shape(self._coefficients, self.b)
+        if (
+            not 1 <= self.spectrum.ndim <= c.ndim
+            or self.spectrum.shape != c.shape[: self.spectrum.ndim]
+        ):
+            raise ValueError(
+                f"spectrum must have the shape {c.shape} of the coefficients of b, or of their "
+                f"first axes, got {self.spectrum.shape}."
+            )
+        if self.spectrum.dtype not in (c.dtype, precision):
+            raise TypeError(
+                f"spectrum must be {precision} or have the dtype of the coefficients of b, "
+                f"{c.dtype}, got {self.spectrum.dtype}."
+            )
+
+    def flow(self, point: Inexact[Array, "*point"]) -> Inexact[Array, "*point"]:
+        z = self._exponent()
+        x, b = self._coefficients(point), self._coefficients(self.b)
+        return self._point(_times(jnp.exp(z), x) + _times(phi_1(z), b))
+
+    def tangent(self, point: Inexact[Array, "*point"]) -> Inexact[Array, "*point"]:
+        if point.shape != self.b.shape or point.dtype != self.b.dtype:
+            raise ValueError(
+                f"Affine acts on points like its b, {self.b.dtype} of shape {self.b.shape}, got "
+                f"{point.dtype} of shape {point.shape}."
+            )
+        return self._point(_times(self._exponent(), self._coefficients(point))) + self.b
+
+    def bracket(self, other: Any) -> "Affine":
+        # The commutator of the matrices [[alpha M, b], [0, 0]].
+        b = combine((self.alpha, -other.alpha), (other.b, self.b))
+        c = self._point(_times(self.spectrum, self._coefficients(b)))
+        return self._with(jnp.zeros_like(self.alpha), c)
+
+    @classmethod
+    def combine(cls, weights: Sequence[Weight], fields: Sequence[Any]) -> "Affine":
+        alpha = combine(weights, [field.alpha for field in fields])
+        return fields[0]._with(alpha, combine(weights, [field.b for field in fields]))
+
+    def _with(self, alpha: Array, b: Array) -> "Affine":
+        return eqx.tree_at(lambda field: (field.alpha, field.b), self, (alpha, b))
+
+    def _exponent(self) -> Array:
+        return self.alpha.astype(self.spectrum.dtype) * self.spectrum
+
+    def _coefficients(self, point: Array) -> Array:
+        return point if self.transform is None else self.transform.forward(point)
+
+    def _point(self, coefficients: Array) -> Array:
+        return coefficients if self.transform is None else self.transform.inverse(coefficients)
+
+
+def _times(diagonal: Array, coefficients: Array) -> Array:
+    columns = (1,) * (coefficients.ndim - diagonal.ndim)
+    return diagonal.reshape(*diagonal.shape, *columns).astype(coefficients.dtype) * coefficients

@@ -1,0 +1,73 @@
+"""Two problems on the Stiefel manifold: n x p matrices with orthonormal columns.
+
+`first` is `Y' = (g Y^T - Y g^T) Y` with `g = D Y C`. `second` is `Y' = S(Y) Y` with the skew matrix
+`S = [[A, -B^T], [B, 0]]`. All quantities are dimensionless, and t runs from 0 to 1. Any n >= p;
+the paper has p = 4 and n = 100 and 1000.
+
+Source: Celledoni, Marthinsen & Owren, Commutator-free Lie group methods, FGCS 19 (2003),
+Section 3.2.
+"""
+
+from typing import Any
+
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Float
+
+from .._fields.low_rank import BorderedSkew, LowRankSkew
+
+t0, t1 = 0.0, 1.0
+
+# The first two rows of Y(1) and the sum of its entries for n = 100, p = 4, from an independent
+# program, rounded to 13 decimals.
+tabulated = {
+    "first": (
+        np.array(
+            [
+                [0.1641570774157, -0.1539080809612, -0.3672064275045, -0.2622972415577],
+                [-0.1380751208096, -0.2246971448282, 0.3229395241233, -0.0523774997053],
+            ]
+        ),
+        -0.8017493611088,
+    ),
+    "second": (
+        np.array(
+            [
+                [0.4778990111738, -0.058155756172, 0.3581387591196, -0.101179885336],
+                [-0.170258166442, 0.0774084024799, -0.1118791496841, 0.3080389149506],
+            ]
+        ),
+        0.8944825715559,
+    ),
+}
+
+
+def y0(n: int, p: int = 4) -> Float[np.ndarray, "n p"]:
+    """The initial value: Q of the matrix `cos(i j)`, i = 1..n, j = 1..p, with diag(R) > 0."""
+    q, r = np.linalg.qr(np.cos(np.outer(np.arange(1, n + 1), np.arange(1, p + 1))))
+    return q * np.sign(np.diag(r))
+
+
+def diagonals(n: int, p: int = 4) -> tuple[Float[np.ndarray, " n"], Float[np.ndarray, " p"]]:
+    """The diagonals of D (1 up to 2 - 1/n) and C (-3 down to -4 + 1/p) of the first problem."""
+    return 1 + np.arange(n) / n, -3 - np.arange(p) / p
+
+
+def first(
+    t: Any,
+    y: Float[Array, "n p"],
+    args: tuple[Float[Array | np.ndarray, " n"], Float[Array | np.ndarray, " p"]],
+) -> LowRankSkew:
+    """The frozen field of the first problem at `y`, with `args = (D, C)` as diagonals."""
+    d, c = args
+    return LowRankSkew(d[:, None] * y * c[None, :])
+
+
+def second(t: Any, y: Float[Array, "n p"], args: Any = None) -> BorderedSkew:
+    """The frozen field of the second problem at `y`; needs n > p."""
+    n, p = y.shape
+    # G is skew and tridiagonal with G[i, i + 1] = (1 + sum_j Y[j, j]) i, counting from 1.
+    rate = (1 + jnp.trace(y[:p])) * np.arange(1, p + 1).astype(y.dtype)
+    above = rate[:, None] * y[1 : p + 1]
+    below = jnp.pad(rate[: p - 1, None] * y[: p - 1], ((1, 0), (0, 0)))
+    return BorderedSkew(jnp.concatenate([jnp.tril(above - below, -1), y[: n - p]]))
