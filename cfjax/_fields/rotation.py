@@ -17,7 +17,8 @@ class Rotation(AbstractAlgebraElement):
     k = 3 on attitude matrices in SO(3), with `omega` in the fixed frame.
 
     The flow is Rodrigues' formula, about 100 flops, exact to rounding for every angle, and so are
-    its derivatives of every order, also at `omega = 0`.
+    its derivatives of every order, also at `omega = 0`. An angle beyond 2^45 (2^16 in float32),
+    where rounding leaves no two digits of the direction, gives NaN.
 
     **Arguments:** `omega`, shape `(3,)`, float32 or float64, in radians per unit of time.
 

@@ -21,8 +21,9 @@ def stumpff(n: int, s: Float[Array, "*batch"]) -> Float[Array, "*batch"]:
     `s c_{n+2} = 1/n! - c_n`. They are entire functions of s, with the derivatives
     `c_n' = (n c_{n+2} - c_{n+1}) / 2`. So every derivative is exact, at zero too.
 
-    The error is a few units of rounding of x, for every x: absolute in `x c_1` and `x^2 c_2`,
-    relative for small x. A value that is not finite gives NaN. Works in float32 and float64.
+    The error is a few units of rounding of x: absolute in `x c_1` and `x^2 c_2`, relative for
+    small x. So an x beyond 2^45 (2^16 in float32), which rounding leaves uncertain by a hundredth,
+    gives NaN, and so does one that is not finite. Works in float32 and float64.
 
     Source: Stiefel & Scheifele, Linear and Regular Celestial Mechanics (1971), Section 11.
     """
@@ -84,6 +85,9 @@ def _reduction(s: Float[Array, "*batch"], constants: _Constants) -> Float[Array,
     correction = polynomial(constants.rsqrt, 1 - (s * guess) * guess)
     # What does not need the correction is grouped so that it does not wait for it.
     turns = jnp.round(((s * (0.5 / pi)) * guess) * correction)
+    # Beyond, an angle is known to a hundredth of a radian at best, and further on to no digit.
+    limit = 2.0 ** (2 * (jnp.finfo(s.dtype).nmant - 7))
+    guess = jnp.where(s <= limit, guess, jnp.nan)
     return 1 - turns * (((2 * pi) * guess) * correction)
 
 
