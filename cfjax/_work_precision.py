@@ -133,8 +133,8 @@ class WorkPrecision(NamedTuple):
             cells = [f"{self.error[i]:.1e}", f"{self.num_steps[i]:.0f}"]
             if is_adaptive:
                 cells = [f"{self.tolerance[i]:.0e}", *cells, f"{self.num_rejected[i]:.0f}"]
-            counts = (self.num_evaluations[i], self.num_flows[i], self.flops[i])
-            cells += [f"{count:.6g}" for count in counts]
+            cells += [f"{count:.6g}" for count in (self.num_evaluations[i], self.num_flows[i])]
+            cells.append(f"{self.flops[i]:.2e}")
             cells += [f"{self.compile_seconds[i]:.2f}", f"{1e3 * best[i]:.3g}"]
             if not self.note[i]:
                 cells[-1] += f" +{upper[i] / best[i] - 1:.0%}"
@@ -380,10 +380,20 @@ class _Cost(NamedTuple):
 
 
 def _cost(problem: _Problem, is_adaptive: bool) -> _Cost:
+    if _is_implicit(problem.solver):
+        # How often its steps repeat depends on a tolerance that the controller may give it.
+        unknown = np.full(3, np.nan)
+        return _Cost(unknown, unknown)
     evaluations, flows = _calls(problem)
     flops = _flops(problem, is_adaptive)
     first, later = zip(evaluations, flows, flops, strict=True)
     return _Cost(np.array(first, float), np.array(later, float))
+
+
+def _is_implicit(solver: diffrax.AbstractSolver) -> bool:
+    while isinstance(solver, diffrax.AbstractWrappedSolver):
+        solver = solver.solver
+    return isinstance(solver, diffrax.AbstractImplicitSolver)
 
 
 def _flops(problem: _Problem, is_adaptive: bool) -> tuple[float, float]:
@@ -444,8 +454,6 @@ def _counted_steps(
     first = tally.read()
     step(term, t1, t2, y, args, state)
     later = tally.read()
-    if isinstance(solver, diffrax.AbstractImplicitSolver):
-        return (np.nan, np.nan), (np.nan, np.nan)
     return (first[0], later[0]), (first[1], later[1])
 
 

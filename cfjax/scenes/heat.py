@@ -12,12 +12,18 @@ Section 3.3.
 
 from typing import Any, NamedTuple
 
+import diffrax
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
 from .._fields.affine import Affine
 from .._functions.transforms import SineTransform
+from .._solvers.commutator_free import CF4
+from .._solvers.munthe_kaas import RKMK4
+from .._solvers.richardson import Richardson
+from .._term import LieTerm
+from .._work_precision import WorkPrecision, work_precision
 
 t0, t1 = 0.0, 0.5
 
@@ -85,6 +91,33 @@ def reference(
     rates, vectors = eigh_tridiagonal(-scale * (mu[:-1] + mu[1:]), scale * mu[1:-1])
     modes = vectors.T @ (1 - np.abs(_points(len(mu))))
     return (np.exp(np.asarray(t, float)[..., None] * rates) * modes) @ vectors.T
+
+
+def chart(**options: Any) -> WorkPrecision:
+    """Heat conduction, N = 100, tolerances 1e-2 to 1e-7; Kvaerno5 is an implicit method."""
+    args = diffusivity()
+
+    def velocity(t, y, args):
+        return from_grid(grid_field(t, to_grid(y), args))
+
+    return work_precision(
+        LieTerm(field),
+        t0,
+        t1,
+        y0(),
+        args,
+        methods={
+            "CF4": Richardson(CF4()),
+            "RKMK4": Richardson(RKMK4()),
+            # On translations CF4 is the classical Runge-Kutta method.
+            "RK4": (LieTerm(velocity), Richardson(CF4())),
+            "Tsit5": (diffrax.ODETerm(velocity), diffrax.Tsit5()),
+            "Kvaerno5": (diffrax.ODETerm(velocity), diffrax.Kvaerno5()),
+        },
+        reference=np.asarray(from_grid(jnp.asarray(reference(t1, np.asarray(args.mu))))),
+        tolerances=[10.0**-k for k in range(2, 8)],
+        **options,
+    )
 
 
 def _points(num_intervals: int) -> Float[np.ndarray, " N-1"]:
