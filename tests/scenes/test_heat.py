@@ -213,8 +213,8 @@ def test_gradient_of_a_solution(solver):
 
 def test_second_derivative_of_a_solution():
     def value(constant):
-        args = arguments(6)._replace(constant=constant)
-        y0 = jnp.asarray(heat.y0(6))
+        args = arguments(9)._replace(constant=constant)
+        y0 = jnp.asarray(heat.y0(9))
         solution = cfjax.integrate(COEFFICIENTS, cfjax.CF2(), 0.0, 0.2, y0, args, num_steps=4)
         return jnp.sum(heat.to_grid(end(solution)) ** 2)
 
