@@ -10,7 +10,7 @@ import cfjax
 from cfjax._functions.transforms import _MAX_DENSE
 
 # The dense path, both sides of the switch, and a prime number of intervals, 251.
-SIZES = [1, 2, 8, 99, _MAX_DENSE, _MAX_DENSE + 1, 250, 1024]
+SIZES = [1, 2, 8, 99, _MAX_DENSE, _MAX_DENSE + 1, 250, 1023, 1024]
 
 
 def transform(kind, n):
