@@ -26,7 +26,7 @@ def _moment(m: int, z: Inexact[Array, "*batch"]) -> Inexact[Array, "*batch"]:
     """The integral of `s^m exp(s z)` over s from 0 to 1: the m-th derivative of phi_1."""
     # A large polynomial keeps XLA:CPU from using vector instructions, so there is none in the
     # value. The small one is for loops, which may lose the rule of the derivative below.
-    radius = float(max(2**-6, m))
+    radius = float(max(2**-10, m))
     small = jnp.abs(z) < radius
     inner, outer = jnp.where(small, z, 0), jnp.where(small, 1, z)
     series = polynomial([1 / (factorial(j) * (m + j + 1)) for j in range(_terms(radius))], inner)

@@ -131,17 +131,19 @@ def _cosine_scale(n: int) -> Float[np.ndarray, " n"]:
 
 def _sine(x: Float[Array, "n *k"]) -> Float[Array, "n *k"]:
     intervals = len(x) + 1
-    zero = jnp.zeros_like(x[:1])
+    # Not a concatenation: XLA would compute x inside it, one entry at a time.
+    padded = lax.dynamic_update_slice_in_dim(
+        jnp.zeros((intervals, *x.shape[1:]), x.dtype), x, 1, axis=0
+    )
     if intervals % 2:
-        padded = jnp.concatenate([zero, x])
         transformed = jnp.fft.rfft(padded, 2 * intervals, axis=0)[1:intervals]
         return -sqrt(2 / intervals) * transformed.imag
     # An FFT of half the length. Its imaginary parts are the coefficients of even number, its real
     # parts the differences of those of odd number (Press et al., Numerical Recipes, Section 12.3).
-    sines = np.sin(np.arange(1, intervals) * np.pi / intervals)
+    sines = np.sin(np.arange(intervals) * np.pi / intervals)
     sines = jnp.asarray(sines, x.dtype).reshape(-1, *(1,) * (x.ndim - 1))
-    mirrored = x[::-1]
-    folded = jnp.concatenate([zero, sines * (x + mirrored) + (x - mirrored) / 2])
+    mirrored = jnp.roll(padded[::-1], 1, axis=0)
+    folded = sines * (padded + mirrored) + (padded - mirrored) / 2
     transformed = jnp.fft.rfft(folded, axis=0)[:-1]
     steps = jnp.concatenate([transformed[:1].real / 2, transformed[1:].real])
     odd, even = jnp.cumsum(steps, axis=0), -jnp.roll(transformed.imag, -1, axis=0)
