@@ -85,6 +85,10 @@ def compiled(size: int, steps: int, *, coefficients: bool) -> Callable[[], np.nd
     return lambda: np.asarray(jax.block_until_ready(executable(y0, args)))
 
 
+def dst(y: np.ndarray) -> np.ndarray:
+    return np.asarray(scipy.fft.dst(y, type=1, norm="ortho"))
+
+
 def numpy_steps(size: int, steps: int) -> np.ndarray:
     mu, constant = heat.diffusivity(size)
     nu = (mu - constant) * (size / 2) ** 2
@@ -95,8 +99,8 @@ def numpy_steps(size: int, steps: int) -> np.ndarray:
     flux = np.zeros(size + 1)
 
     def f(y):
-        flux[1:-1] = scipy.fft.dst(y, type=1, norm="ortho")
-        return scipy.fft.dst(np.diff(nu * np.diff(flux)), type=1, norm="ortho", overwrite_x=True)
+        flux[1:-1] = dst(y)
+        return dst(np.diff(nu * np.diff(flux)))
 
     y = heat.y0(size)
     h = STEP
@@ -110,7 +114,7 @@ def numpy_steps(size: int, steps: int) -> np.ndarray:
         middle = (h / 6) * (f2 + f3)
         y = started + phi * ((h / 4) * f1 + middle - (h / 12) * f4)
         y = decay * y + phi * (middle - (h / 12) * f1 + (h / 4) * f4)
-    return scipy.fft.dst(y, type=1, norm="ortho")
+    return dst(y)
 
 
 def check(reference: np.ndarray, *others: np.ndarray) -> None:

@@ -12,7 +12,11 @@ from cfjax import _paper
 from cfjax.__main__ import main
 from cfjax._paper import rigid_body
 
-FILES = ["figure1.pdf", "figure1.png", "figure2.pdf", "figure2.png"]
+FILES = [
+    f"{name}.{kind}"
+    for name in ("figure1", "figure2", "figure4", "heat_stiffness")
+    for kind in ("pdf", "png")
+]
 
 
 @pytest.fixture(scope="module")

@@ -65,7 +65,7 @@ def test_value_and_three_derivatives(dtype):
         size = np.maximum(
             np.abs(wanted), np.abs(np.exp(z.astype(complex)) / np.maximum(np.abs(z), 1))
         )
-        limit = np.where(z.imag == 0, 4, 12) * eps * size
+        limit = np.where(np.imag(z) == 0, 4, 12) * eps * size
         # Below the smallest normal number XLA on a CPU gives zero.
         limit = limit + np.finfo(dtype).tiny
         worst = np.argmax(np.abs(found[order] - wanted) / limit)

@@ -32,6 +32,7 @@ def growth(tableau, z, w):
         return np.exp(total) * point + phi * b
 
     stages: list = []
+    point = np.ones_like(z)
     for rows in (*tableau.alpha, tableau.beta):
         point = np.ones_like(z)
         for row in rows:

@@ -293,7 +293,7 @@ def test_an_implicit_solver_takes_the_tolerances_of_the_controller():
 
 
 class NoOrder(diffrax.Euler):
-    def order(self, terms):
+    def order(self, terms):  # pyright: ignore[reportIncompatibleMethodOverride]
         return None
 
 
