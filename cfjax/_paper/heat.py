@@ -246,12 +246,11 @@ def figure_stiffness(runs: Mapping[tuple[str, int], Run]) -> Figure:
     last = {name: runs[name, sizes[-1]].num_steps for name in METHODS}
     figure = new_figure(
         (7.0, 4.8),
-        f"Heat conduction: steps attempted to t = 1/2 at tolerance {STIFFNESS_TOLERANCE:g} "
-        "against the number of intervals N. The step sizes of RK4 and RKMK4 are bounded by "
-        "stability, so the steps grow like N²: in RK4 through the whole operator, in RKMK4 through "
-        "the commutator, whose factor M no flow damps. "
-        f"At N = {sizes[-1]} CF4 attempts {last['CF4']} steps, RKMK4 {last['RKMK4']} and RK4 "
-        f"{last['RK4']}.",
+        f"Heat conduction: steps attempted to t = 1/2 at tolerance {STIFFNESS_TOLERANCE:g} against "
+        "the number of intervals N. Stability bounds the steps of RK4, through the whole operator, "
+        "and of RKMK4, through the commutator, whose factor M no flow damps. So their number grows "
+        f"like N². At N = {sizes[-1]} CF4 attempts {last['CF4']} steps, RKMK4 {last['RKMK4']} and "
+        f"RK4 {last['RK4']}.",
     )
     axes = figure.subplots()
     for name in METHODS:

@@ -41,7 +41,7 @@ def diffusivity(num_intervals: int = 100) -> Diffusivity:
     return Diffusivity(mu, np.asarray(np.mean(mu)))
 
 
-def y0(num_intervals: int = 100) -> Float[np.ndarray, " N-1"]:
+def y0(num_intervals: int = 100) -> Float[np.ndarray, " n"]:
     """The sine coefficients of the initial temperature `1 - |x|`."""
     # Not at import: few who import the package need it.
     from scipy.fft import dst
@@ -49,7 +49,7 @@ def y0(num_intervals: int = 100) -> Float[np.ndarray, " N-1"]:
     return np.asarray(dst(1 - np.abs(_points(num_intervals)), type=1, norm="ortho"))
 
 
-def field(t: Any, y: Float[Array, " N-1"], args: Diffusivity) -> Affine:
+def field(t: Any, y: Float[Array, " n"], args: Diffusivity) -> Affine:
     """The frozen field at sine coefficients `y`. Costs two sine transforms."""
     n = len(y)
     k = np.arange(1, n + 1)
@@ -59,7 +59,7 @@ def field(t: Any, y: Float[Array, " N-1"], args: Diffusivity) -> Affine:
     return Affine(1.0, from_grid(b), constant * jnp.asarray(second_difference, y.dtype))
 
 
-def grid_field(t: Any, u: Float[Array, " N-1"], args: Diffusivity) -> Float[Array, " N-1"]:
+def grid_field(t: Any, u: Float[Array, " n"], args: Diffusivity) -> Float[Array, " n"]:
     """The velocity of the grid values `u`, for methods of a linear space.
 
     As a translation: with it CF4 is the classical Runge-Kutta method.
@@ -67,19 +67,19 @@ def grid_field(t: Any, u: Float[Array, " N-1"], args: Diffusivity) -> Float[Arra
     return _operator(jnp.asarray(args.mu), u)
 
 
-def to_grid(y: Float[Array, " N-1"]) -> Float[Array, " N-1"]:
+def to_grid(y: Float[Array, " n"]) -> Float[Array, " n"]:
     """The grid values of sine coefficients."""
     return SineTransform().inverse(y)
 
 
-def from_grid(u: Float[Array, " N-1"]) -> Float[Array, " N-1"]:
+def from_grid(u: Float[Array, " n"]) -> Float[Array, " n"]:
     """The sine coefficients of grid values."""
     return SineTransform().forward(u)
 
 
 def reference(
     t: float | Float[Array | np.ndarray, "*times"], mu: Float[np.ndarray, " N"]
-) -> Float[np.ndarray, "*times N-1"]:
+) -> Float[np.ndarray, "*times n"]:
     """The exact grid values of the semidiscrete system at times `t`, in NumPy's float64.
 
     By the eigenvectors of its symmetric matrix. The error is that of the eigenvalues, a few units
@@ -120,7 +120,7 @@ def chart(**options: Any) -> WorkPrecision:
     )
 
 
-def _points(num_intervals: int) -> Float[np.ndarray, " N-1"]:
+def _points(num_intervals: int) -> Float[np.ndarray, " n"]:
     return 2 * np.arange(1, num_intervals) / num_intervals - 1
 
 
@@ -128,7 +128,7 @@ def _midpoints(num_intervals: int) -> Float[np.ndarray, " N"]:
     return (2 * np.arange(num_intervals) + 1) / num_intervals - 1
 
 
-def _operator(mu: Float[Array, " N"], u: Float[Array, " N-1"]) -> Float[Array, " N-1"]:
+def _operator(mu: Float[Array, " N"], u: Float[Array, " n"]) -> Float[Array, " n"]:
     """Central differences of the flux `mu u_x`."""
     flux = mu * jnp.diff(jnp.pad(u, 1))
     return (len(mu) / 2) ** 2 * jnp.diff(flux)

@@ -9,8 +9,8 @@ import pytest
 from cfjax._functions.phi import phi_1
 
 ORDERS = 3
-# On both sides of every switch between the formulas, which are at 1, 2 and 3.
-SWITCHES = [k * d for k in (1, 2, 3) for d in (1 - 1e-9, 1, 1 + 1e-9)]
+# On both sides of every switch between the formulas, which are at 1/1024, 1, 2 and 3.
+SWITCHES = [k * d for k in (2**-10, 1, 2, 3) for d in (1 - 1e-9, 1, 1 + 1e-9)]
 MAGNITUDES = np.array([1e-300, 1e-20, 1e-9, 1e-3, 0.3, 0.999, *SWITCHES, 1.5, 2.5, 5, 20, 80])
 LARGE = np.array([-1e4, -1e8, -1e30])
 DIRECTIONS = {
@@ -65,7 +65,7 @@ def test_value_and_three_derivatives(dtype):
         size = np.maximum(
             np.abs(wanted), np.abs(np.exp(z.astype(complex)) / np.maximum(np.abs(z), 1))
         )
-        limit = np.where(z.imag == 0, 4, 12) * eps * size
+        limit = np.where(np.imag(z) == 0, 4, 12) * eps * size
         # Below the smallest normal number XLA on a CPU gives zero.
         limit = limit + np.finfo(dtype).tiny
         worst = np.argmax(np.abs(found[order] - wanted) / limit)

@@ -10,9 +10,13 @@ from rich.progress import Progress
 
 from cfjax import _report
 from cfjax.__main__ import main
-from cfjax._paper import rigid_body
+from cfjax._paper import heat, rigid_body
 
-FILES = ["figure1.pdf", "figure1.png", "figure2.pdf", "figure2.png"]
+FILES = [
+    f"{name}.{kind}"
+    for name in ("figure1", "figure2", "figure4", "heat_stiffness")
+    for kind in ("pdf", "png")
+]
 
 
 @pytest.fixture(scope="module")
@@ -130,7 +134,8 @@ def test_command_as_a_user_runs_it_and_a_second_run(tmp_path, capsys):
     for name in FILES:
         (output / name).write_bytes(b"old")
     short = functools.partial(rigid_body.report, step_counts=(500, 1000), repeats=2)
-    _report.run(output, [short])
+    short_heat = functools.partial(heat.report, tolerances=(1e-3, 1e-6), sizes=(30,))
+    _report.run(output, [short, short_heat])
     check_files(output)
     for printed in (done.stdout, capsys.readouterr().out):
         for text in ("RKMK3", "RKMK4", "5.1e-04", "0.970252535114", "The paper finds"):

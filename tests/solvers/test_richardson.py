@@ -105,7 +105,7 @@ def test_the_estimate_is_the_error_of_the_two_halves(name, body_problem):
 
 
 @halves
-@pytest.mark.parametrize("name", ["CF3", "CF4"])
+@pytest.mark.parametrize("name", ["CF4"])
 def test_order(name, by_halves, body_problem):
     solver, order, _ = CASES[name]
     field, y0, args, answer = body_problem
@@ -142,9 +142,10 @@ def test_pytree_of_manifolds(flight_problem):
 # Memory: solvers whose last stage is the first of the next step.
 
 
-@halves
-@pytest.mark.parametrize("name", ["CF4", "Euler", "Tsit5"])
-@pytest.mark.parametrize("direction", [1, -1])
+@pytest.mark.parametrize(
+    "name, by_halves, direction",
+    [("CF4", False, 1), ("CF4", True, -1), ("Tsit5", True, 1), ("Tsit5", False, -1)],
+)
 def test_fixed_steps_are_those_of_the_solver(name, by_halves, direction):
     solver, _, problem = CASES[name]
     found = solve(Richardson(solver, by_halves), problem, 2.0 * direction, 0.1 * direction)
@@ -292,7 +293,7 @@ def test_an_implicit_solver_takes_the_tolerances_of_the_controller():
 
 
 class NoOrder(diffrax.Euler):
-    def order(self, terms):
+    def order(self, terms):  # pyright: ignore[reportIncompatibleMethodOverride]
         return None
 
 

@@ -1,0 +1,138 @@
+"""Time of one CF4 step of the heat problem against NumPy and SciPy.
+
+Run as `python benchmarks/heat.py`. The other program makes the same steps on sine coefficients with
+`scipy.fft`, and computes the exponentials of a step of fixed size once, before the loop. All
+programs take turns in one run, so that the ratios mean something on a busy machine.
+"""
+
+import argparse
+import statistics
+import time
+from collections.abc import Callable
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import scipy.fft
+from rich.console import Console
+from rich.table import Table
+
+import cfjax
+from cfjax.scenes import heat
+
+SIZES = (100, 1000, 10_000)
+TARGETS = {100: 0.5, 1000: 0.5, 10_000: 1.1}
+STEP = 1e-3
+INTERVALS_PER_TURN = 2_000_000  # steps times intervals: some tenths of a second
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(description=__doc__)
+    parser.add_argument("--rounds", type=int, default=15, help="turns of every program")
+    rounds = parser.parse_args().rounds
+    jax.config.update("jax_enable_x64", True)
+    table = Table(title="One CF4 step of the heat problem", title_justify="left")
+    for heading in ("N", "program", "µs a step", "over NumPy", "middle half", "target"):
+        table.add_column(heading, justify="left" if heading == "program" else "right")
+    for size in SIZES:
+        steps = max(20, min(2000, INTERVALS_PER_TURN // size))
+        programs = {
+            "NumPy and SciPy": lambda size=size, steps=steps: numpy_steps(size, steps),
+            "cfjax.integrate, CF4": compiled(size, steps, coefficients=True),
+            "the same with grid values as the state": compiled(size, steps, coefficients=False),
+        }
+        check(*(program() for program in programs.values()))
+        times = take_turns(programs, rounds)
+        base = times["NumPy and SciPy"]
+        for name, values in times.items():
+            low, middle, high = statistics.quantiles(
+                [a / b for a, b in zip(values, base, strict=True)], n=4
+            )
+            table.add_row(
+                str(size),
+                name,
+                f"{1e6 * statistics.median(values) / steps:.1f}",
+                f"{middle:.2f}",
+                f"{low:.2f} to {high:.2f}",
+                f"{TARGETS[size]}" if name == "cfjax.integrate, CF4" else "",
+                end_section=name == list(times)[-1],
+            )
+    console = Console(width=110)
+    console.print(f"{jax.devices()[0].device_kind}, jax {jax.__version__}, {rounds} rounds")
+    console.print(table)
+
+
+def grid_field(t, u, args: heat.Diffusivity) -> cfjax.Affine:
+    spectrum = heat.field(t, u, args).spectrum
+    b = heat.grid_field(t, u, args._replace(mu=args.mu - args.constant))
+    return cfjax.Affine(1.0, b, spectrum, cfjax.SineTransform())
+
+
+def compiled(size: int, steps: int, *, coefficients: bool) -> Callable[[], np.ndarray]:
+    """The grid values after so many steps."""
+    args = jax.tree.map(jnp.asarray, heat.diffusivity(size))
+    term = cfjax.LieTerm(heat.field if coefficients else grid_field)
+
+    def run(y0, args):
+        y0 = y0 if coefficients else heat.to_grid(y0)
+        end = steps * STEP
+        solution = cfjax.integrate(term, cfjax.CF4(), 0.0, end, y0, args, num_steps=steps)
+        y = jax.tree.map(lambda ys: ys[-1], solution.ys)
+        return heat.to_grid(y) if coefficients else y
+
+    y0 = jnp.asarray(heat.y0(size))
+    executable = jax.jit(run).lower(y0, args).compile()
+    return lambda: np.asarray(jax.block_until_ready(executable(y0, args)))
+
+
+def dst(y: np.ndarray) -> np.ndarray:
+    return np.asarray(scipy.fft.dst(y, type=1, norm="ortho"))
+
+
+def numpy_steps(size: int, steps: int) -> np.ndarray:
+    mu, constant = heat.diffusivity(size)
+    nu = (mu - constant) * (size / 2) ** 2
+    rates = -constant * (size * np.sin(np.arange(1, size) * np.pi / (2 * size))) ** 2
+    z = STEP / 2 * rates
+    # Every flow of a CF4 step goes over half of it.
+    decay, phi = np.exp(z), np.expm1(z) / z
+    flux = np.zeros(size + 1)
+
+    def f(y):
+        flux[1:-1] = dst(y)
+        return dst(np.diff(nu * np.diff(flux)))
+
+    y = heat.y0(size)
+    h = STEP
+    for _ in range(steps):
+        started = decay * y
+        f1 = f(y)
+        y2 = started + phi * ((h / 2) * f1)
+        f2 = f(y2)
+        f3 = f(started + phi * ((h / 2) * f2))
+        f4 = f(decay * y2 + phi * (h * f3 - (h / 2) * f1))
+        middle = (h / 6) * (f2 + f3)
+        y = started + phi * ((h / 4) * f1 + middle - (h / 12) * f4)
+        y = decay * y + phi * (middle - (h / 12) * f1 + (h / 4) * f4)
+    return dst(y)
+
+
+def check(reference: np.ndarray, *others: np.ndarray) -> None:
+    # The same steps; what differs is rounding, which the heat equation damps.
+    for other in others:
+        if not np.allclose(other, reference, atol=1e-10, rtol=0):
+            raise RuntimeError(f"Programs disagree by {np.abs(other - reference).max()}.")
+
+
+def take_turns(programs: dict[str, Callable[[], object]], rounds: int) -> dict[str, list[float]]:
+    times: dict[str, list[float]] = {name: [] for name in programs}
+    for _ in range(rounds):
+        for name, program in programs.items():
+            start = time.perf_counter()
+            program()
+            times[name].append(time.perf_counter() - start)
+    return times
+
+
+if __name__ == "__main__":
+    main()

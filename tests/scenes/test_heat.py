@@ -1,0 +1,272 @@
+"""The heat scene: its equations, its reference, orders, derivatives, and what a step costs."""
+
+import diffrax
+import jax
+import jax.numpy as jnp
+import mpmath
+import numpy as np
+import problems
+import pytest
+
+import cfjax
+from cfjax.scenes import heat
+
+COEFFICIENTS = cfjax.LieTerm(heat.field)
+GRID = cfjax.LieTerm(heat.grid_field)
+
+
+def arguments(num_intervals) -> heat.Diffusivity:
+    return problems.arrays(heat.diffusivity(num_intervals))
+
+
+def matrix(mu):
+    """The semidiscrete operator, written down from the paper's formula."""
+    n = len(mu)
+    below = np.diag(mu[1:-1], -1)
+    return (below + below.T - np.diag(mu[:-1] + mu[1:])) * (n / 2) ** 2
+
+
+def end(solution) -> jax.Array:
+    return solution.ys[-1]
+
+
+# The problem
+
+
+def test_constants_are_numpy_arrays():
+    # A JAX array made at import would be in float32 if x64 comes on later.
+    for constant in (heat.y0(), *heat.diffusivity()):
+        assert type(constant) is np.ndarray
+        assert constant.dtype == np.float64
+
+
+def test_diffusivity():
+    mu, constant = heat.diffusivity()
+    x = -1 + 0.02 * np.arange(101)
+    np.testing.assert_allclose(mu, 1 - ((x[1:] + x[:-1]) / 2) ** 2, rtol=1e-13)
+    # By hand: the mean of 1 - x^2 over N midpoints is 2/3 + 1/(3 N^2).
+    np.testing.assert_allclose(constant, 2 / 3 + 1 / 30000, rtol=1e-14)
+
+
+@pytest.mark.parametrize("n", [10, 99, 100, 400])
+def test_initial_value(n):
+    x = np.linspace(-1, 1, n + 1)[1:-1]
+    found = heat.to_grid(jnp.asarray(heat.y0(n)))
+    np.testing.assert_allclose(found, 1 - np.abs(x), rtol=0, atol=1e-13)
+    np.testing.assert_allclose(heat.from_grid(found), heat.y0(n), rtol=0, atol=1e-13)
+
+
+@pytest.mark.parametrize("n", [10, 99, 400])
+def test_fields_are_the_equation(n):
+    mu, constant = heat.diffusivity(n)
+    a, m = matrix(np.asarray(mu)), matrix(np.full(n, constant))
+    u = np.random.default_rng(0).standard_normal(n - 1)
+    # The operator has norm n^2, points have norm sqrt(n), and a transform and its inverse add
+    # rounding of 4 sqrt(n) units of the largest entry each, as its own tests bound it.
+    atol = 2.0**-52 * n**2 * 8 * np.sqrt(n)
+    np.testing.assert_allclose(
+        heat.grid_field(0.0, jnp.asarray(u), arguments(n)), a @ u, rtol=0, atol=atol
+    )
+    y = heat.from_grid(jnp.asarray(u))
+    field = heat.field(0.0, y, arguments(n))
+    np.testing.assert_allclose(heat.to_grid(field.b), (a - m) @ u, rtol=0, atol=atol)
+    np.testing.assert_allclose(heat.to_grid(field.tangent(y)), a @ u, rtol=0, atol=2 * atol)
+    linear = heat.to_grid(field.spectrum * y)
+    np.testing.assert_allclose(linear, m @ u, rtol=0, atol=2 * atol)
+
+
+def test_eigenvalues():
+    """For mu = 1 - x^2 the fast ones are -k (k + 1), as in Legendre's equation."""
+    a = jax.jacfwd(lambda u: heat.grid_field(0.0, u, arguments(100)))(jnp.zeros(99))
+    k = np.arange(99, 59, -1)
+    np.testing.assert_allclose(np.linalg.eigvalsh(a)[:40], -k * (k + 1.0), rtol=0, atol=1e-10)
+
+
+def test_reference():
+    mu = np.asarray(heat.diffusivity(8).mu)
+    with mpmath.workdps(30):
+        u0 = mpmath.matrix((1 - np.abs(np.linspace(-1, 1, 9)[1:-1])).tolist())
+        for t in (0.0, 0.1, 0.5):
+            exact = mpmath.expm(mpmath.matrix(matrix(mu).tolist()) * t) * u0
+            exact = np.array(exact.tolist(), float)[:, 0]
+            np.testing.assert_allclose(heat.reference(t, mu), exact, rtol=0, atol=1e-14)
+    times = np.array([[0.0, 0.1, 0.5]])
+    assert heat.reference(times, mu).shape == (1, 3, 7)
+    one = heat.reference(0.1, mu)
+    np.testing.assert_allclose(heat.reference(times, mu)[0, 1], one, rtol=0, atol=1e-15)
+
+
+def test_reference_solves_the_large_system():
+    # Of order 4 in time with steps of 1e-3 at t = 0.3, where rates up to 20 are left.
+    mu = np.asarray(heat.diffusivity(100).mu)
+    u = heat.reference(0.3 + 1e-3 * np.arange(-2, 3), mu)
+    slope = (u[0] - u[4] - 8 * (u[1] - u[3])) / 0.012
+    np.testing.assert_allclose(slope, matrix(mu) @ u[2], rtol=0, atol=1e-8)
+
+
+# Methods
+
+
+@pytest.mark.parametrize(
+    "solver, term, order",
+    [
+        (cfjax.CF3(), COEFFICIENTS, 3),
+        (cfjax.CF4(), COEFFICIENTS, 4),
+        (cfjax.RKMK4(), COEFFICIENTS, 4),
+        (cfjax.CF4(), GRID, 4),
+    ],
+    ids=["CF3", "CF4", "RKMK4", "RK4"],
+)
+def test_order_where_the_system_is_not_stiff(solver, term, order):
+    """With N = 6 the eigenvalues are up to 30, and steps of 1/100 resolve them all."""
+    y0 = heat.to_grid(jnp.asarray(heat.y0(6))) if term is GRID else heat.y0(6)
+    exact = heat.reference(0.5, np.asarray(heat.diffusivity(6).mu))
+    answer = exact if term is GRID else np.asarray(heat.from_grid(jnp.asarray(exact)))
+    steps = [64, 128, 256]
+    errors = problems.errors(term.field, solver, 0.5, y0, arguments(6), answer, steps)
+    assert errors.min() > 1e-13
+    assert abs(problems.slope(steps, errors) - order) < 0.15
+
+
+def test_translations_make_the_classical_runge_kutta_method():
+    a, h = matrix(np.asarray(heat.diffusivity(20).mu)), 5e-3
+    u = wanted = 1 - np.abs(np.linspace(-1, 1, 21)[1:-1])
+    for _ in range(20):
+        k1 = a @ wanted
+        k2 = a @ (wanted + h / 2 * k1)
+        k3 = a @ (wanted + h / 2 * k2)
+        k4 = a @ (wanted + h * k3)
+        wanted = wanted + h / 6 * (k1 + 2 * k2 + 2 * k3 + k4)
+    found = cfjax.integrate(GRID, cfjax.CF4(), 0.0, 20 * h, u, arguments(20), num_steps=20)
+    np.testing.assert_allclose(end(found), wanted, rtol=0, atol=1e-14)
+
+
+@pytest.mark.parametrize("solver", [cfjax.CF4(), cfjax.RKMK4()], ids=["CF4", "RKMK4"])
+def test_grid_values_with_a_transform_give_the_same_steps(solver):
+    def field(t, u, args):
+        spectrum = heat.field(t, u, args).spectrum
+        b = heat.grid_field(t, u, args._replace(mu=args.mu - args.constant))
+        return cfjax.Affine(1.0, b, spectrum, cfjax.SineTransform())
+
+    y0, args = jnp.asarray(heat.y0(20)), arguments(20)
+    kwargs = dict(num_steps=20)
+    found = cfjax.integrate(
+        cfjax.LieTerm(field), solver, 0.0, 0.1, heat.to_grid(y0), args, **kwargs
+    )
+    wanted = cfjax.integrate(COEFFICIENTS, solver, 0.0, 0.1, y0, args, **kwargs)
+    np.testing.assert_allclose(end(found), heat.to_grid(end(wanted)), rtol=0, atol=1e-13)
+
+
+def test_a_step_costs_eight_transforms():
+    y0, args = jnp.asarray(heat.y0(300)), arguments(300)
+
+    def step(y):
+        return cfjax.CF4().step(COEFFICIENTS, 0.0, 0.01, y, args, None, made_jump=False)[0]
+
+    text = jax.jit(step).lower(y0).compile().as_text()
+    assert text is not None and text.count(" fft(") == 8
+
+
+def test_float32():
+    y0, args = jnp.asarray(heat.y0(100), jnp.float32), arguments(100)
+    args = jax.tree.map(lambda x: x.astype(jnp.float32), args)
+    found = cfjax.integrate(COEFFICIENTS, cfjax.CF4(), 0.0, 0.5, y0, args, num_steps=50)
+    assert end(found).dtype == jnp.float32
+    double = cfjax.integrate(
+        COEFFICIENTS, cfjax.CF4(), 0.0, 0.5, heat.y0(100), arguments(100), num_steps=50
+    )
+    # Each step rounds the balance of M y and b, which are a hundred times the state, and the
+    # flow divides by M again: some ten units of rounding a step, of a state of norm 6.
+    atol = 50 * 10 * 2.0**-24 * 6
+    np.testing.assert_allclose(end(found), end(double), rtol=0, atol=atol)
+
+
+# Derivatives of whole solutions
+
+
+def check_gradient(value, x, atol):
+    """Against central differences, and forward against reverse, in two directions."""
+    found = jax.jit(jax.grad(value))(x)
+    for seed in (1, 2):
+        direction = problems.random_like(x, seed)
+        wanted = problems.central_difference(jax.jit(value), x, direction, 1e-3)
+        assert float(problems.inner(found, direction)) == pytest.approx(float(wanted), abs=atol)
+    return found, direction
+
+
+WEIGHTS = np.cos(np.arange(11.0))
+
+
+@pytest.mark.parametrize("solver", [cfjax.CF4(), cfjax.RKMK4()], ids=["CF4", "RKMK4"])
+def test_gradient_of_a_solution(solver):
+    """With respect to the initial value and all of the diffusivity, through the spectrum too."""
+
+    def value(x):
+        solution = cfjax.integrate(COEFFICIENTS, solver, 0.0, 0.2, *x, num_steps=20)
+        return jnp.sum(WEIGHTS * heat.to_grid(end(solution)))
+
+    # Differences with steps of 1e-3: 1e-12 times fifth derivatives, and 1e-15 / 1e-3 of rounding.
+    x = (jnp.asarray(heat.y0(12)), arguments(12))
+    found, direction = check_gradient(value, x, 1e-9)
+    forward = jax.jvp(value, (x,), (direction,))[1]
+    assert float(problems.inner(found, direction)) == pytest.approx(float(forward), rel=1e-11)
+
+
+def test_second_derivative_of_a_solution():
+    def value(constant):
+        args = arguments(9)._replace(constant=constant)
+        y0 = jnp.asarray(heat.y0(9))
+        solution = cfjax.integrate(COEFFICIENTS, cfjax.CF2(), 0.0, 0.2, y0, args, num_steps=4)
+        return jnp.sum(heat.to_grid(end(solution)) ** 2)
+
+    # Without the splitting the solution would not depend on it: what is seen is the error of four
+    # long steps. The difference leaves 1e-12 times the fifth derivative of the first.
+    constant = jnp.asarray(0.7)
+    wanted = problems.central_difference(jax.jit(jax.grad(value)), constant, 1.0, 1e-3)
+    assert float(jax.grad(jax.grad(value))(constant)) == pytest.approx(float(wanted), abs=1e-8)
+    assert float(jax.jacfwd(jax.grad(value))(constant)) == pytest.approx(float(wanted), abs=1e-8)
+
+
+def test_gradient_with_adaptive_steps():
+    """diffrax holds the step sizes fixed in a derivative, so the differences must do so too."""
+    solver = cfjax.Richardson(cfjax.CF4())
+
+    def value(x, controller, dt0):
+        solution = diffrax.diffeqsolve(
+            COEFFICIENTS,
+            solver,
+            0.0,
+            0.2,
+            dt0,
+            *x,
+            saveat=diffrax.SaveAt(t1=True, steps=True),
+            stepsize_controller=controller,
+            max_steps=64,
+        )
+        assert solution.ys is not None
+        # The last step ends at t1, and is saved last in what is not infinite.
+        ends = jnp.where(jnp.isfinite(solution.ts), solution.ts, -1.0)
+        last = solution.ys[jnp.argmax(ends)]
+        return jnp.sum(WEIGHTS * heat.to_grid(last)), solution.ts
+
+    def controlled(x):
+        controller = diffrax.PIDController(rtol=0.0, atol=1e-4, norm=max_norm)
+        return value(x, controller, 5e-3)
+
+    x = (jnp.asarray(heat.y0(12)), arguments(12))
+    found, ts = jax.jit(jax.grad(controlled, has_aux=True))(x)
+    times = np.unique(np.concatenate([[0.0], np.asarray(ts)[np.isfinite(ts)]]))
+    assert len(times) > 5
+
+    @jax.jit
+    def fixed(x):
+        return value(x, diffrax.StepTo(times), None)[0]
+
+    for seed in (1, 2):
+        direction = problems.random_like(x, seed)
+        wanted = problems.central_difference(fixed, x, direction, 1e-3)
+        assert float(problems.inner(found, direction)) == pytest.approx(float(wanted), abs=1e-9)
+
+
+def max_norm(error):
+    return jnp.max(jnp.abs(heat.to_grid(error)))
