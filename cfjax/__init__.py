@@ -26,6 +26,7 @@ from ._solvers.commutator_free import LieEuler as LieEuler
 from ._solvers.munthe_kaas import RKMK as RKMK
 from ._solvers.munthe_kaas import RKMK3 as RKMK3
 from ._solvers.munthe_kaas import RKMK4 as RKMK4
+from ._solvers.retraction import CayleyRK4 as CayleyRK4
 from ._tableau import Tableau as Tableau
 from ._tableau import third_order_a as third_order_a
 from ._tableau import third_order_b as third_order_b
