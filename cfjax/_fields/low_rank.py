@@ -1,5 +1,6 @@
 """Skew fields of low rank, for points with orthonormal columns: the Stiefel manifold."""
 
+import math
 from collections.abc import Sequence
 from typing import Any
 
@@ -56,7 +57,7 @@ class LowRankSkew(AbstractFrozenField):
             span, frozen_at = earlier[-1].span, point.z
         else:
             _check_point(self, self.g, point)
-            span = _Span((point,), _product(point.T, point))
+            span = _Span((point,), _square(point))
             frozen_at = jnp.eye(point.shape[1], dtype=point.dtype)
             point = SpanPoint(frozen_at + _correction(span.gram), span.blocks)
         return SpanSkew.of(self.g, frozen_at, span), point
@@ -135,7 +136,7 @@ class BorderedSkew(AbstractAlgebraElement):
     def enter(self, point: Any, earlier: Sequence[Any]) -> tuple["BorderedSkew", Any]:
         if not earlier:
             _check_point(self, self.gamma, point)
-            point = point + _product(point, _correction(_product(point.T, point)))
+            point = point + _product(point, _correction(_square(point)))
         return self, point
 
     def on_span(self) -> "SpanSkew":
@@ -300,6 +301,15 @@ def _correction(square: Float[Array, "p p"]) -> Float[Array, "p p"]:
     # Far from the manifold there is no nearest point that the caller can have meant.
     near = jnp.max(jnp.abs(lax.stop_gradient(defect))) < 0.1
     return jnp.where(near, defect / 2, jnp.nan)
+
+
+def _square(y: Float[Array, "n p"]) -> Float[Array, "p p"]:
+    """`y^T y`, in blocks of rows: the rounding of long sums is what would limit orthonormality."""
+    n, p = y.shape
+    count = math.isqrt(n)
+    rows = -(-n // count)
+    blocks = jnp.pad(y, ((0, rows * count - n), (0, 0))).reshape(count, rows, p)
+    return jnp.sum(_product(jnp.swapaxes(blocks, 1, 2), blocks), axis=0)
 
 
 def _product(a: Array, b: Array) -> Array:
