@@ -12,10 +12,10 @@ from pathlib import Path
 from rich.console import Console
 from rich.progress import Progress
 
-from . import rigid_body
+from . import rigid_body, stiefel
 from .figures import Report
 
-EXPERIMENTS: Sequence[Callable[[Progress], Report]] = (rigid_body.report,)
+EXPERIMENTS: Sequence[Callable[[Progress], Report]] = (rigid_body.report, stiefel.report)
 
 
 def run(output: Path, experiments: Sequence[Callable[[Progress], Report]] = EXPERIMENTS) -> None:

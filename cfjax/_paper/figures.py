@@ -14,6 +14,8 @@ STYLES: dict[str, dict[str, Any]] = {
     "RKMK3": dict(color="#CC79A7", linestyle=":", marker="v", linewidth=1.9),
     "CF4": dict(color="#0072B2", linestyle="-", marker="o"),
     "RKMK4": dict(color="#D55E00", linestyle="--", marker="s"),
+    "RKMK4, full series": dict(color="#E69F00", linestyle=":", marker="D", linewidth=1.9),
+    "RKR-C4": dict(color="#56B4E9", linestyle="-.", marker="v"),
 }
 
 
