@@ -101,8 +101,9 @@ class BorderedSkew(AbstractAlgebraElement):
         def product(x: Array) -> Array:
             return jnp.concatenate([_product(row, x), x[:p]])
 
-        rows = lax.stop_gradient((jnp.sum(jnp.abs(corner), axis=1), jnp.sum(jnp.abs(square), axis=1)))
-        half, size = jnp.max(rows[0]) / 2, jnp.max(rows[1])
+        # Norms that are no less than the 2-norm. A skew matrix has its singular values in pairs.
+        half = jnp.sqrt(lax.stop_gradient(jnp.sum(corner * corner)) / 2) / 2
+        size = jnp.max(jnp.sum(jnp.abs(lax.stop_gradient(square)), axis=1))
 
         def dense() -> tuple[Array, Array]:
             a = jnp.concatenate([row, jnp.eye(p, 2 * p, dtype=row.dtype)])
@@ -259,7 +260,9 @@ class SpanSkew(AbstractAlgebraElement):
         if places == list(range(len(places))):
             k = jnp.pad(self.k, (0, rest))
             new = _product(self.k, span.gram[: m - rest, m - rest :])
-            return SpanSkew(k, jnp.pad(jnp.concatenate([self.a, new], 1), ((0, rest), (0, 0))), span)
+            return SpanSkew(
+                k, jnp.pad(jnp.concatenate([self.a, new], 1), ((0, rest), (0, 0))), span
+            )
         index = np.concatenate([np.arange(p) + p * place for place in places])
         k = jnp.zeros((m, m), self.k.dtype).at[np.ix_(index, index)].set(self.k)
         return SpanSkew(k, _product(k, span.gram), span)

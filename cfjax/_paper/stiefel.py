@@ -59,8 +59,7 @@ def report(
 ) -> Report:
     """Tables 2 and 3, and Figure 3. `step_counts` and `repeats` are the figure's."""
     tables = [
-        flops_table(problem)
-        for problem in progress.track(PROBLEMS, description="Stiefel manifold")
+        flops_table(problem) for problem in progress.track(PROBLEMS, description="Stiefel manifold")
     ]
     work = {problem: efficiencies(problem, step_counts, repeats, progress) for problem in PROBLEMS}
     return Report(printed=[*tables, FINDINGS], figures={"figure3": figure_3(work)})

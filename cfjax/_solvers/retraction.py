@@ -78,7 +78,9 @@ class _Cayley:
         self.right = jnp.concatenate([q, g], axis=1)
         small = jnp.eye(2 * p, dtype=q.dtype) - _product(self.right.T, self.left) / 2
         # Halfway between Q and Y: (I - a / 2)^-1 Q, by the Sherman-Morrison-Woodbury formula.
-        self.middle = q + _product(self.left, jnp.linalg.solve(small, _product(self.right.T, q))) / 2
+        self.middle = (
+            q + _product(self.left, jnp.linalg.solve(small, _product(self.right.T, q))) / 2
+        )
 
     def end(self) -> Float[Array, "n p"]:
         return 2 * self.middle - self.q
