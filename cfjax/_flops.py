@@ -110,7 +110,7 @@ def _flatten(
         if not isinstance(v, Literal):
             return names[v]
         literal = ("literal", str(v.aval), repr(v.val))
-        program.values[literal] = jnp.asarray(v.val, v.aval.dtype)
+        program.values[literal] = jnp.asarray(v.val, _dtype(v))
         return literal
 
     for eqn in inner.eqns:
@@ -122,7 +122,8 @@ def _flatten(
                 results = [object() for _ in eqn.outvars]
                 program.operations[key] = _Operation(_cost(eqn), operands, results)
                 if program.has_branches and all(x in program.values for x in operands):
-                    program.values.update(zip(results, _evaluate(eqn, operands, program)))
+                    values = _evaluate(eqn, operands, program)
+                    program.values.update(zip(results, values, strict=True))
             results = program.operations[key].results
         names.update(zip(eqn.outvars, results, strict=True))
     return [name(v) for v in inner.outvars]
@@ -197,7 +198,7 @@ def _parameters(eqn: JaxprEqn) -> Hashable:
 
 def _cost(eqn: JaxprEqn) -> int:
     name = eqn.primitive.name
-    dtypes = [getattr(v.aval, "dtype", None) for v in (*eqn.invars, *eqn.outvars)]
+    dtypes = [_dtype(v) for v in (*eqn.invars, *eqn.outvars)]
     if name not in _CONTROL and not any(d is not None and _is_inexact(d) for d in dtypes):
         return 0
     if name not in _COSTS:
@@ -218,6 +219,10 @@ def _is_inexact(dtype: Any) -> bool:
 
 def _is_complex(dtype: Any) -> bool:
     return dtype is not None and jnp.issubdtype(dtype, jnp.complexfloating)
+
+
+def _dtype(v: Any) -> Any:
+    return getattr(v.aval, "dtype", None)
 
 
 def _shape(v: Any) -> tuple[int, ...]:
@@ -263,7 +268,7 @@ def _product(eqn: JaxprEqn) -> int:
 
 
 def _modulus(eqn: JaxprEqn) -> int:
-    return _size(eqn.outvars[0]) if _is_complex(eqn.invars[0].aval.dtype) else 0
+    return _size(eqn.outvars[0]) if _is_complex(_dtype(eqn.invars[0])) else 0
 
 
 def _triangular_solve(eqn: JaxprEqn) -> int:
@@ -301,7 +306,7 @@ def _eigh(eqn: JaxprEqn) -> int:
 
 def _fft(eqn: JaxprEqn) -> int:
     n = prod(eqn.params["fft_lengths"])
-    real = not all(map(_is_complex, (eqn.invars[0].aval.dtype, eqn.outvars[0].aval.dtype)))
+    real = not all(_is_complex(_dtype(v)) for v in (eqn.invars[0], eqn.outvars[0]))
     # The real side is the larger one.
     transforms = max(_size(eqn.invars[0]), _size(eqn.outvars[0])) // max(n, 1)
     return round(transforms * 5 * n * log2(max(n, 1)) / (2 if real else 1))
@@ -354,8 +359,9 @@ _ARITHMETIC = (
 _FREE = (
     "argmax argmin bitcast_convert_type broadcast_in_dim ceil clamp complex concatenate conj "
     "convert_element_type copy copy_p dynamic_slice dynamic_update_slice eq expand_dims floor "
-    "gather ge gt imag is_finite le lt max min ne neg optimization_barrier pad reduce_max reduce_min "
-    "real reshape rev round scatter select_n sign slice split squeeze stack stop_gradient transpose"
+    "gather ge gt imag is_finite le lt max min ne neg optimization_barrier pad real reduce_max "
+    "reduce_min reshape rev round scatter select_n sign slice split squeeze stack stop_gradient "
+    "transpose"
 )
 _COSTS: dict[str, Callable[[JaxprEqn], int]] = {
     **dict.fromkeys(_ARITHMETIC.split(), _each_entry),

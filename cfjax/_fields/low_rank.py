@@ -168,12 +168,12 @@ class _Span(eqx.Module):
         top = jnp.concatenate([self.gram, new[:-p]], axis=1)
         return _Span(blocks, jnp.concatenate([top, new.T]))
 
-    def position(self, block: Any) -> int | None:
-        """Which block is the same array, by identity: equal ones would only cost more."""
+    def position(self, block: Any) -> int:
+        """Which block is the same array, or -1. By identity: equal ones would only cost more."""
         for i, own in enumerate(self.blocks):
             if own is block or (isinstance(own, _Corner) and isinstance(block, _Corner)):
                 return i
-        return None
+        return -1
 
 
 class SpanPoint(eqx.Module):
@@ -247,7 +247,7 @@ class SpanSkew(AbstractAlgebraElement):
     def leave(self, point: Any) -> Any:
         if isinstance(point, SpanPoint):
             p = point.z.shape[1]
-            return _product(jnp.concatenate(point.blocks[: len(point.z) // p], axis=1), point.z)
+            return _product(_columns(point.blocks[: len(point.z) // p]), point.z)
         return point
 
     def on(self, span: _Span) -> "SpanSkew":
@@ -270,32 +270,37 @@ class SpanSkew(AbstractAlgebraElement):
 
 def _on_one_span(fields: Sequence[Any]) -> list[SpanSkew]:
     spanned = [f.on_span() if isinstance(f, BorderedSkew) else f for f in fields]
-    span = max((f.span for f in spanned), key=lambda span: len(span.blocks))
+    # With the corner in front, if there is one, and then the fewest new products.
+    spans = [f.span for f in spanned]
+    span = max(spans, key=lambda s: (isinstance(s.blocks[0], _Corner), len(s.blocks)))
     for field in spanned:
         for block in field.span.blocks:
-            if span.position(block) is None:
+            if span.position(block) < 0 and not isinstance(block, _Corner):
                 span = span.extended(block)
     return [f.on(span) for f in spanned]
 
 
+def _columns(blocks: _Blocks) -> Float[Array, "n m"]:
+    return jnp.concatenate([x for x in blocks if not isinstance(x, _Corner)], axis=1)
+
+
 def _inner(blocks: _Blocks, x: Float[Array, "n p"]) -> Float[Array, "m p"]:
-    """`W^T x`."""
-    corner = [x[: block.p] for block in blocks if isinstance(block, _Corner)]
-    columns = [block for block in blocks if not isinstance(block, _Corner)]
-    if columns:
-        corner.append(_product(jnp.concatenate(columns, axis=1).T, x))
-    return jnp.concatenate(corner)
+    """`W^T x`. A corner can only be the first block."""
+    if not isinstance(blocks[0], _Corner):
+        return _product(_columns(blocks).T, x)
+    top = x[: blocks[0].p]
+    return jnp.concatenate([top, _product(_columns(blocks[1:]).T, x)])
 
 
 def _plus_product(
     x: Float[Array, "n p"], blocks: _Blocks, z: Float[Array, "m p"]
 ) -> Float[Array, "n p"]:
-    """`x + W z`, with a corner in front if there is one."""
+    """`x + W z`."""
     if isinstance(blocks[0], _Corner):
         p = blocks[0].p
         x = jnp.concatenate([x[:p] + z[:p], x[p:]])
         blocks, z = blocks[1:], z[p:]
-    return x + _product(jnp.concatenate(blocks, axis=1), z) if blocks else x
+    return x + _product(_columns(blocks), z)
 
 
 def _correction(square: Float[Array, "p p"]) -> Float[Array, "p p"]:

@@ -54,9 +54,7 @@ def phi_1_action(
     coefficients = jnp.asarray(table, b.dtype)[choice]
 
     # In a loop: every product written out would be compiled by itself.
-    def step(
-        carry: tuple[Array, Array], coefficient: Array
-    ) -> tuple[tuple[Array, Array], None]:
+    def step(carry: tuple[Array, Array], coefficient: Array) -> tuple[tuple[Array, Array], None]:
 
         def add(carry: tuple[Array, Array]) -> tuple[Array, Array]:
             term = product(carry[0])

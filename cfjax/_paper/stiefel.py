@@ -15,6 +15,7 @@ import jax.numpy as jnp
 import numpy as np
 from jax import lax
 from matplotlib.figure import Figure
+from matplotlib.ticker import LogLocator, NullLocator
 from rich.progress import Progress
 from rich.table import Table
 
@@ -197,15 +198,18 @@ def figure_3(work: Mapping[str, Mapping[str, Efficiency]]) -> Figure:
     for (left, right), label, costs in zip(panels, "ab", work.values(), strict=True):
         for name, cost in costs.items():
             style = STYLES[name] | dict(markersize=4)
-            left.loglog(cost.flops, cost.error, label=name if label == "a" else None, **style)
+            left.loglog(cost.flops / 1e6, cost.error, label=name if label == "a" else None, **style)
             low, median, high = 1e3 * np.percentile(cost.seconds, (25, 50, 75), axis=-1)
             right.errorbar(
                 median, cost.error, xerr=(median - low, high - median), capsize=3, **style
             )
         right.set_xscale("log")
-        right.xaxis.set_major_formatter("{x:g}")
+        for axes in (left, right):
+            axes.xaxis.set_major_locator(LogLocator(subs=(1, 2, 5)))
+            axes.xaxis.set_major_formatter("{x:g}")
+            axes.xaxis.set_minor_locator(NullLocator())
         left.set_ylabel(f"({label}) global error at t = 1")
-    panels[1, 0].set_xlabel("flops")
+    panels[1, 0].set_xlabel("flops (millions)")
     panels[1, 1].set_xlabel("time (ms)")
     finish(figure, len(METHODS))
     return figure
