@@ -297,7 +297,7 @@ def _qr(eqn: JaxprEqn) -> int:
     m, n = _shape(eqn.invars[0])[-2:]
     k = min(m, n)
     columns = m if eqn.params["full_matrices"] else k
-    return _batch(eqn.invars[0]) * (_reflections(m, n, k) // 2 + _reflections(m, columns, k))
+    return _batch(eqn.invars[0]) * (_reflections(m, n, k) + _reflections(m, columns, k))
 
 
 def _eigh(eqn: JaxprEqn) -> int:

@@ -14,8 +14,10 @@ from jaxtyping import Array, Float
 
 from .expm import max_over_batch
 
-# Beyond this norm the powers cancel and the rounding shows.
-_LARGEST_NORM = 2.5
+# On shorter intervals the error of the second derivative at zero, `eps / length^2`, would show.
+_SHORTEST = 0.1
+# On longer ones the powers cancel and the rounding shows.
+_LONGEST = 2.5
 
 
 def phi_1_action(
@@ -36,8 +38,8 @@ def phi_1_action(
     - `dense`: gives A itself, shape `(m, m)`, and scales, shape `(m,)`, in which it is nearly
       skew: `A[i, j] scale[j] / scale[i]`. Used if the bound is above 2.
 
-    **Cost:** one product less than the degree of a polynomial, which grows with the bound: 6
-    products at 0.1, 11 at 0.5, 14 at 1 in double precision. Under `jax.vmap` the largest bound
+    **Cost:** one product less than the degree of a polynomial, which grows with the bound: 7
+    products up to 0.1, 11 at 0.5, 13 at 1 in double precision. Under `jax.vmap` the largest bound
     decides.
 
     **Accuracy:** the polynomial differs from exp by less than half a unit of rounding on the
@@ -79,14 +81,13 @@ def _polynomials(eps: float) -> tuple[np.ndarray, np.ndarray]:
     imaginary z in the interval. All are positive, with zeros behind.
     """
     intervals, rows = [], []
-    for degree in range(5, 30):
+    for degree in range(4, 30):
         # The first term left out is below z^2 2 (x / 2)^(degree - 1) / (degree + 1)!.
         power = degree + 1
         length = Fraction(floor(2000 * (eps / 16 * factorial(power)) ** (1 / power)), 1000)
-        if length > _LARGEST_NORM:
-            break
-        intervals.append(float(length))
-        rows.append(_chebyshev(degree - 2, length))
+        if _SHORTEST < length < _LONGEST:
+            intervals.append(float(length))
+            rows.append(_chebyshev(degree - 2, length))
     table = np.zeros((len(rows), len(rows[-1])))
     for i, row in enumerate(rows):
         table[i, : len(row)] = [float(a) for a in row]
