@@ -32,8 +32,8 @@ class LowRankSkew(AbstractFrozenField):
     **Raises** `ValueError` for another shape, `TypeError` for another dtype. A point that is far
     from orthonormal (by 0.1 in an entry of `y^T y`) gives NaN.
 
-    Source: the step in coordinates is that of Celledoni & Owren, On the implementation of Lie
-    group methods on the Stiefel manifold, Numer. Algorithms 32 (2003), carried to all stages.
+    Source: Celledoni & Owren, On the implementation of Lie group methods on the Stiefel manifold,
+    Numer. Algorithms 32 (2003), for exponentials of low rank.
     """
 
     g: Float[Array, "n p"] = eqx.field(converter=jnp.asarray)
@@ -132,18 +132,13 @@ class BorderedSkew(AbstractAlgebraElement):
         return SpanSkew.combine(weights, fields)
 
     def bracket(self, other: Any) -> "SpanSkew":
-        return self.on_span().bracket(other)
+        return _spanned(self).bracket(other)
 
     def enter(self, point: Any, earlier: Sequence[Any]) -> tuple["BorderedSkew", Any]:
         if not earlier:
             _check_point(self, self.gamma, point)
             point = point + _product(point, _correction(_square(point)))
         return self, point
-
-    def on_span(self) -> "SpanSkew":
-        p = self.gamma.shape[1]
-        one = jnp.eye(p, dtype=self.gamma.dtype)
-        return SpanSkew.of(self.gamma, one, _Span((_Corner(p),), one))
 
 
 class _Corner(eqx.Module):
@@ -268,8 +263,17 @@ class SpanSkew(AbstractAlgebraElement):
         return SpanSkew(k, _product(k, span.gram), span)
 
 
+def _spanned(field: Any) -> SpanSkew:
+    if not isinstance(field, BorderedSkew):
+        return field
+    # gamma E^T - E gamma^T, where E is the corner.
+    p = field.gamma.shape[1]
+    one = jnp.eye(p, dtype=field.gamma.dtype)
+    return SpanSkew.of(field.gamma, one, _Span((_Corner(p),), one))
+
+
 def _on_one_span(fields: Sequence[Any]) -> list[SpanSkew]:
-    spanned = [f.on_span() if isinstance(f, BorderedSkew) else f for f in fields]
+    spanned = [_spanned(f) for f in fields]
     # With the corner in front, if there is one, and then the fewest new products.
     spans = [f.span for f in spanned]
     span = max(spans, key=lambda s: (isinstance(s.blocks[0], _Corner), len(s.blocks)))
