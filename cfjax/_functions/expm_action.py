@@ -39,12 +39,12 @@ def phi_1_action(
       skew: `A[i, j] scale[j] / scale[i]`. Used if the bound is above 2.
 
     **Cost:** one product less than the degree of a polynomial, which grows with the bound: 7
-    products up to 0.1, 11 at 0.5, 13 at 1 in double precision. Under `jax.vmap` the largest bound
+    products up to 0.1, 11 at 0.5, 14 at 1 in double precision. Under `jax.vmap` the largest bound
     decides.
 
     **Accuracy:** the polynomial differs from exp by less than half a unit of rounding on the
     imaginary interval that holds the eigenvalues, and less near zero, as it begins `1 + z`. A
-    truncated Chebyshev series needs three products less than Taylor's. The choice depends on A's
+    truncated Chebyshev series needs two or three products less than Taylor's. The choice depends on A's
     norm alone and not on `b`, so the derivatives are nearly as accurate.
 
     Source: Tal-Ezer & Kosloff, J. Chem. Phys. 81 (1984), for Chebyshev series of skew operators.
