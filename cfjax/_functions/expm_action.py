@@ -44,8 +44,8 @@ def phi_1_action(
 
     **Accuracy:** the polynomial differs from exp by less than half a unit of rounding on the
     imaginary interval that holds the eigenvalues, and less near zero, as it begins `1 + z`. A
-    truncated Chebyshev series needs two or three products less than Taylor's. The choice depends on A's
-    norm alone and not on `b`, so the derivatives are nearly as accurate.
+    truncated Chebyshev series needs two or three products less than Taylor's. The choice depends
+    on A's norm alone and not on `b`, so the derivatives are nearly as accurate.
 
     Source: Tal-Ezer & Kosloff, J. Chem. Phys. 81 (1984), for Chebyshev series of skew operators.
     """
