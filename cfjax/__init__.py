@@ -34,6 +34,7 @@ from ._solvers.commutator_free import LieEuler as LieEuler
 from ._solvers.munthe_kaas import RKMK as RKMK
 from ._solvers.munthe_kaas import RKMK3 as RKMK3
 from ._solvers.munthe_kaas import RKMK4 as RKMK4
+from ._solvers.retraction import CayleyRK4 as CayleyRK4
 from ._solvers.richardson import Richardson as Richardson
 from ._stability import stability_function as stability_function
 from ._tableau import Tableau as Tableau

@@ -3,13 +3,21 @@
 import argparse
 import math
 import sys
+import types
 from collections.abc import Sequence
 from pathlib import Path
 from typing import NoReturn
 
 from . import scenes
 
-_SCENES = {name: scene.chart for name, scene in vars(scenes).items() if hasattr(scene, "chart")}
+# A scene may have several charts: `scenes.stiefel.chart_first` is that of stiefel_first.
+_SCENES = {
+    scene + name.removeprefix("chart"): function
+    for scene, module in vars(scenes).items()
+    if isinstance(module, types.ModuleType)
+    for name, function in vars(module).items()
+    if name == "chart" or name.startswith("chart_")
+}
 
 
 class _Parser(argparse.ArgumentParser):
@@ -24,11 +32,11 @@ def main(argv: Sequence[str] | None = None) -> int:
     commands = parser.add_subparsers(dest="command", metavar="COMMAND", title="commands")
     paper = commands.add_parser(
         "paper",
-        help="repeat the paper's rigid body experiment",
+        help="repeat the paper's experiments",
         description=(
-            "Repeats the rigid body experiment of Celledoni, Marthinsen & Owren (2003), Section "
-            "3.1: prints the errors of CF3, CF4, RKMK3 and RKMK4 and draws Figures 1 and 2 as PNG "
-            "and PDF. Takes about half a minute in float64."
+            "Repeats the experiments of Celledoni, Marthinsen & Owren (2003): prints Tables 1 to 4 "
+            "beside the printed numbers and draws Figures 1 to 4 as PNG and PDF. In float64; takes "
+            "one to two minutes."
         ),
     )
     chart = commands.add_parser(

@@ -201,4 +201,7 @@ def _linear_combination(
 
 
 def _scale(weight: Weight, array: Inexact[Array | np.ndarray, "..."]) -> Inexact[Array, "..."]:
+    # Most tableaus have weights of one.
+    if isinstance(weight, float) and weight == 1:
+        return jnp.asarray(array)
     return jnp.asarray(weight, array.dtype) * array

@@ -26,6 +26,8 @@ STYLES: dict[str, dict[str, Any]] = {
     "CF4": dict(color="#0072B2", linestyle="-", marker="o"),
     "RKMK4": dict(color="#D55E00", linestyle="--", marker="s"),
     "RK4": dict(color="#000000", linestyle="-.", marker="D"),
+    "RKMK4, full series": dict(color="#E69F00", linestyle=":", marker="D", linewidth=1.9),
+    "RKR-C4": dict(color="#56B4E9", linestyle="-.", marker="v"),
 }
 # For all other methods, in turn.
 _OTHER_STYLES = [

@@ -423,7 +423,7 @@ def _flops(problem: _Problem, is_adaptive: bool) -> tuple[float, float]:
         return y, y_error if is_adaptive else None, eqx.filter(state, eqx.is_array)
 
     try:
-        later = float(count_flops(step, arrays, problem.t1, state))
+        later = float(count_flops(step, arrays, problem.t0 + problem.dt0, state))
         return count_flops(start, arrays) + later, later
     except NotImplementedError:
         return np.nan, np.nan

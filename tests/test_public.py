@@ -15,6 +15,8 @@ PROMISED = [
     "Rotation",
     "LeftMatrix",
     "RightMatrix",
+    "LowRankSkew",
+    "BorderedSkew",
     "Tableau",
     "CommutatorFree",
     "LieEuler",
@@ -27,9 +29,10 @@ PROMISED = [
     "RKMK3",
     "RKMK4",
     "RKMK",
+    "CayleyRK4",
     "integrate",
 ]
-SOLVERS = ["LieEuler", "CF2", "CF3", "CF4", "CG3", "CG4", "CG5", "RKMK3", "RKMK4"]
+SOLVERS = ["LieEuler", "CF2", "CF3", "CF4", "CG3", "CG4", "CG5", "RKMK3", "RKMK4", "CayleyRK4"]
 PUBLIC = [
     name
     for name, value in vars(cfjax).items()

@@ -1,5 +1,6 @@
 """Skew fields of low rank, for points with orthonormal columns: the Stiefel manifold."""
 
+import math
 from collections.abc import Sequence
 from typing import Any
 
@@ -31,8 +32,8 @@ class LowRankSkew(AbstractFrozenField):
     **Raises** `ValueError` for another shape, `TypeError` for another dtype. A point that is far
     from orthonormal (by 0.1 in an entry of `y^T y`) gives NaN.
 
-    Source: the step in coordinates is that of Celledoni & Owren, On the implementation of Lie
-    group methods on the Stiefel manifold, Numer. Algorithms 32 (2003), carried to all stages.
+    Source: Celledoni & Owren, On the implementation of Lie group methods on the Stiefel manifold,
+    Numer. Algorithms 32 (2003), for exponentials of low rank.
     """
 
     g: Float[Array, "n p"] = eqx.field(converter=jnp.asarray)
@@ -56,7 +57,7 @@ class LowRankSkew(AbstractFrozenField):
             span, frozen_at = earlier[-1].span, point.z
         else:
             _check_point(self, self.g, point)
-            span = _Span((point,), _product(point.T, point))
+            span = _Span((point,), _square(point))
             frozen_at = jnp.eye(point.shape[1], dtype=point.dtype)
             point = SpanPoint(frozen_at + _correction(span.gram), span.blocks)
         return SpanSkew.of(self.g, frozen_at, span), point
@@ -100,10 +101,9 @@ class BorderedSkew(AbstractAlgebraElement):
         def product(x: Array) -> Array:
             return jnp.concatenate([_product(row, x), x[:p]])
 
-        rows = lax.stop_gradient(
-            (jnp.sum(jnp.abs(corner), axis=1), jnp.sum(jnp.abs(square), axis=1))
-        )
-        half, size = jnp.max(rows[0]) / 2, jnp.max(rows[1])
+        # Norms that are no less than the 2-norm. A skew matrix has its singular values in pairs.
+        half = jnp.sqrt(lax.stop_gradient(jnp.sum(corner * corner)) / 2) / 2
+        size = jnp.max(jnp.sum(jnp.abs(lax.stop_gradient(square)), axis=1))
 
         def dense() -> tuple[Array, Array]:
             a = jnp.concatenate([row, jnp.eye(p, 2 * p, dtype=row.dtype)])
@@ -132,18 +132,13 @@ class BorderedSkew(AbstractAlgebraElement):
         return SpanSkew.combine(weights, fields)
 
     def bracket(self, other: Any) -> "SpanSkew":
-        return self.on_span().bracket(other)
+        return _spanned(self).bracket(other)
 
     def enter(self, point: Any, earlier: Sequence[Any]) -> tuple["BorderedSkew", Any]:
         if not earlier:
             _check_point(self, self.gamma, point)
-            point = point + _product(point, _correction(_product(point.T, point)))
+            point = point + _product(point, _correction(_square(point)))
         return self, point
-
-    def on_span(self) -> "SpanSkew":
-        p = self.gamma.shape[1]
-        one = jnp.eye(p, dtype=self.gamma.dtype)
-        return SpanSkew.of(self.gamma, one, _Span((_Corner(p),), one))
 
 
 class _Corner(eqx.Module):
@@ -168,12 +163,12 @@ class _Span(eqx.Module):
         top = jnp.concatenate([self.gram, new[:-p]], axis=1)
         return _Span(blocks, jnp.concatenate([top, new.T]))
 
-    def position(self, block: Any) -> int | None:
-        """Which block is the same array, by identity: equal ones would only cost more."""
+    def position(self, block: Any) -> int:
+        """Which block is the same array, or -1. By identity: equal ones would only cost more."""
         for i, own in enumerate(self.blocks):
             if own is block or (isinstance(own, _Corner) and isinstance(block, _Corner)):
                 return i
-        return None
+        return -1
 
 
 class SpanPoint(eqx.Module):
@@ -247,7 +242,7 @@ class SpanSkew(AbstractAlgebraElement):
     def leave(self, point: Any) -> Any:
         if isinstance(point, SpanPoint):
             p = point.z.shape[1]
-            return _product(jnp.concatenate(point.blocks[: len(point.z) // p], axis=1), point.z)
+            return _product(_columns(point.blocks[: len(point.z) // p]), point.z)
         return point
 
     def on(self, span: _Span) -> "SpanSkew":
@@ -268,34 +263,48 @@ class SpanSkew(AbstractAlgebraElement):
         return SpanSkew(k, _product(k, span.gram), span)
 
 
+def _spanned(field: Any) -> SpanSkew:
+    if not isinstance(field, BorderedSkew):
+        return field
+    # gamma E^T - E gamma^T, where E is the corner.
+    p = field.gamma.shape[1]
+    one = jnp.eye(p, dtype=field.gamma.dtype)
+    return SpanSkew.of(field.gamma, one, _Span((_Corner(p),), one))
+
+
 def _on_one_span(fields: Sequence[Any]) -> list[SpanSkew]:
-    spanned = [f.on_span() if isinstance(f, BorderedSkew) else f for f in fields]
-    span = max((f.span for f in spanned), key=lambda span: len(span.blocks))
+    spanned = [_spanned(f) for f in fields]
+    # With the corner in front, if there is one, and then the fewest new products.
+    spans = [f.span for f in spanned]
+    span = max(spans, key=lambda s: (isinstance(s.blocks[0], _Corner), len(s.blocks)))
     for field in spanned:
         for block in field.span.blocks:
-            if span.position(block) is None:
+            if span.position(block) < 0 and not isinstance(block, _Corner):
                 span = span.extended(block)
     return [f.on(span) for f in spanned]
 
 
+def _columns(blocks: _Blocks) -> Float[Array, "n m"]:
+    return jnp.concatenate([x for x in blocks if not isinstance(x, _Corner)], axis=1)
+
+
 def _inner(blocks: _Blocks, x: Float[Array, "n p"]) -> Float[Array, "m p"]:
-    """`W^T x`."""
-    corner = [x[: block.p] for block in blocks if isinstance(block, _Corner)]
-    columns = [block for block in blocks if not isinstance(block, _Corner)]
-    if columns:
-        corner.append(_product(jnp.concatenate(columns, axis=1).T, x))
-    return jnp.concatenate(corner)
+    """`W^T x`. A corner can only be the first block."""
+    if not isinstance(blocks[0], _Corner):
+        return _product(_columns(blocks).T, x)
+    top = x[: blocks[0].p]
+    return jnp.concatenate([top, _product(_columns(blocks[1:]).T, x)])
 
 
 def _plus_product(
     x: Float[Array, "n p"], blocks: _Blocks, z: Float[Array, "m p"]
 ) -> Float[Array, "n p"]:
-    """`x + W z`, with a corner in front if there is one."""
+    """`x + W z`."""
     if isinstance(blocks[0], _Corner):
         p = blocks[0].p
         x = jnp.concatenate([x[:p] + z[:p], x[p:]])
         blocks, z = blocks[1:], z[p:]
-    return x + _product(jnp.concatenate(blocks, axis=1), z) if blocks else x
+    return x + _product(_columns(blocks), z)
 
 
 def _correction(square: Float[Array, "p p"]) -> Float[Array, "p p"]:
@@ -304,6 +313,15 @@ def _correction(square: Float[Array, "p p"]) -> Float[Array, "p p"]:
     # Far from the manifold there is no nearest point that the caller can have meant.
     near = jnp.max(jnp.abs(lax.stop_gradient(defect))) < 0.1
     return jnp.where(near, defect / 2, jnp.nan)
+
+
+def _square(y: Float[Array, "n p"]) -> Float[Array, "p p"]:
+    """`y^T y`, in blocks of rows: the rounding of long sums is what would limit orthonormality."""
+    n, p = y.shape
+    count = math.isqrt(n)
+    rows = -(-n // count)
+    blocks = jnp.pad(y, ((0, rows * count - n), (0, 0))).reshape(count, rows, p)
+    return jnp.sum(_product(jnp.swapaxes(blocks, 1, 2), blocks), axis=0)
 
 
 def _product(a: Array, b: Array) -> Array:

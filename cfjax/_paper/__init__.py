@@ -9,10 +9,11 @@ from collections.abc import Callable, Sequence
 from rich.progress import Progress
 
 from .._report import Report
-from . import complexity, heat, rigid_body
+from . import complexity, heat, rigid_body, stiefel
 
 EXPERIMENTS: Sequence[Callable[[Progress], Report]] = (
     complexity.report,
     rigid_body.report,
+    stiefel.report,
     heat.report,
 )

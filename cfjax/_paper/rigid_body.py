@@ -196,8 +196,8 @@ def figure_1(trajectories: Mapping[str, Trajectory]) -> Figure:
 
 def figure_2(work: WorkPrecision) -> Figure:
     """Global error against flops and against time."""
-    flops, seconds = _cost_at_equal_error(work, "CF4", "RKMK4", order=4)
-    flops_3, seconds_3 = _cost_at_equal_error(work, "CF3", "RKMK3", order=3)
+    flops, seconds = cost_at_equal_error(work, "CF4", "RKMK4", order=4)
+    flops_3, seconds_3 = cost_at_equal_error(work, "CF3", "RKMK3", order=3)
     steps = (rigid_body.t1 - rigid_body.t0) / work.num_steps
     figure = new_figure(
         (7.0, 5.4),
@@ -214,7 +214,7 @@ def figure_2(work: WorkPrecision) -> Figure:
     return work.plot(figure)
 
 
-def _cost_at_equal_error(work: WorkPrecision, a: str, b: str, *, order: int) -> tuple[float, float]:
+def cost_at_equal_error(work: WorkPrecision, a: str, b: str, *, order: int) -> tuple[float, float]:
     """Flops and time of method `a` over those of `b` for the same error at the last step size.
 
     An error C h^p takes work proportional to C^(1/p). The ratio of times is the median of those

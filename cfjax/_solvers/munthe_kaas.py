@@ -34,6 +34,11 @@ class AbstractMuntheKaas(AbstractLieSolver):
         """The element v; `field(c, u)` is `h f(t + c h, exp(u) y0)`, and `u = None` means zero."""
 
     def end_point(self, field, y0):
+        v, start = self.logarithm(field, y0)
+        return leave(v, flow(v, start))
+
+    def logarithm(self, field: Callable[[float, PyTree], PyTree], y0: PyTree) -> Any:
+        """The element v with the end of the step `exp(v) y0`, and y0, in the step's coordinates."""
         fields: list[PyTree] = []
         start = y0
 
@@ -50,8 +55,7 @@ class AbstractMuntheKaas(AbstractLieSolver):
             fields.append(value)
             return value
 
-        end = flow(self.increment(field_at), start)
-        return leave(fields[0], end)
+        return self.increment(field_at), start
 
 
 class RKMK3(AbstractMuntheKaas):

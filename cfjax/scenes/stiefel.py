@@ -8,13 +8,21 @@ Source: Celledoni, Marthinsen & Owren, Commutator-free Lie group methods, FGCS 1
 Section 3.2.
 """
 
+from collections.abc import Callable
 from typing import Any
 
+import diffrax
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
 from .._fields.low_rank import BorderedSkew, LowRankSkew
+from .._frozen_field import tangent
+from .._solvers.commutator_free import CF3, CF4
+from .._solvers.munthe_kaas import RKMK4
+from .._solvers.retraction import CayleyRK4
+from .._term import LieTerm
+from .._work_precision import WorkPrecision, work_precision
 
 t0, t1 = 0.0, 1.0
 
@@ -71,3 +79,72 @@ def second(t: Any, y: Float[Array, "n p"], args: Any = None) -> BorderedSkew:
     above = rate[:, None] * y[1 : p + 1]
     below = jnp.pad(rate[: p - 1, None] * y[: p - 1], ((1, 0), (0, 0)))
     return BorderedSkew(jnp.concatenate([jnp.tril(above - below, -1), y[: n - p]]))
+
+
+def reference(problem: str, n: int, p: int = 4) -> Float[np.ndarray, "n p"]:
+    """`Y(1)` of the problem, "first" or "second", in NumPy's float64.
+
+    DOP853 on the equation in the space of all matrices, at the tightest tolerance SciPy takes. The
+    error is about 1e-13. Takes some tenths of a second for n = 1000.
+    """
+    # Not at import: few who import the package need it.
+    from scipy.integrate import solve_ivp
+
+    d, c = diagonals(n, p)
+    rate = np.arange(1, p + 1)[:, None]
+
+    def first(y):
+        g = d[:, None] * y * c
+        return g @ (y.T @ y) - y @ (g.T @ y)
+
+    def second(y):
+        above = (1 + np.trace(y[:p])) * rate * y[1 : p + 1]
+        below = (1 + np.trace(y[:p])) * (rate - 1) * np.concatenate([y[:1], y[: p - 1]])
+        lower = np.tril(above - below, -1)
+        border = y[: n - p]
+        top = (lower - lower.T) @ y[:p] - border.T @ y[p:]
+        return np.concatenate([top, border @ y[:p]])
+
+    slope = {"first": first, "second": second}[problem]
+    answer = solve_ivp(
+        lambda t, y: slope(y.reshape(n, p)).ravel(),
+        (t0, t1),
+        y0(n, p).ravel(),
+        method="DOP853",
+        rtol=2.3e-14,
+        atol=1e-16,
+    )
+    return answer.y[:, -1].reshape(n, p)
+
+
+def chart_first(**options: Any) -> WorkPrecision:
+    """Stiefel manifold, first experiment, n = 1000, p = 4, 4 to 256 equal steps to t = 1."""
+    return _chart(first, "first", diagonals(1000), options)
+
+
+def chart_second(**options: Any) -> WorkPrecision:
+    """Stiefel manifold, second experiment, n = 1000, p = 4, 4 to 256 equal steps to t = 1."""
+    return _chart(second, "second", None, options)
+
+
+def _chart(
+    field: Callable[..., Any], problem: str, args: Any, options: dict[str, Any]
+) -> WorkPrecision:
+    space = diffrax.ODETerm(lambda t, y, args: tangent(field(t, y, args), y))
+    return work_precision(
+        LieTerm(field),
+        t0,
+        t1,
+        y0(1000),
+        args,
+        methods={
+            "CF3": CF3(),
+            "CF4": CF4(),
+            "RKMK4": RKMK4(),
+            "RKR-C4": CayleyRK4(),
+            "Tsit5": (space, diffrax.Tsit5()),
+        },
+        reference=reference(problem, 1000),
+        num_steps=[4 * 2**k for k in range(7)],
+        **options,
+    )

@@ -1,0 +1,139 @@
+"""The Stiefel scenes: the numbers of an independent program, orders, flops and gradients."""
+
+import functools
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import problems
+import pytest
+
+import cfjax
+from cfjax._paper.stiefel import METHODS as PAPER
+from cfjax.scenes import stiefel
+
+FIELDS = {"first": stiefel.first, "second": stiefel.second}
+both = pytest.mark.parametrize("problem", FIELDS)
+METHODS: dict[str, tuple[Any, int]] = {
+    "CF3": (cfjax.CF3(), 3),
+    "CF4": (cfjax.CF4(), 4),
+    "CG3": (cfjax.CG3(), 3),
+    "RKMK3": (cfjax.RKMK3(), 3),
+    "RKMK4": (cfjax.RKMK4(), 4),
+    "RKMK4, full series": (PAPER["RKMK4, full series"], 4),
+    "RKR-C4": (cfjax.CayleyRK4(), 4),
+}
+
+
+def arguments(problem, n, p=4):
+    return stiefel.diagonals(n, p) if problem == "first" else None
+
+
+@functools.cache
+def answer(problem, n, p):
+    return stiefel.reference(problem, n, p)
+
+
+def test_initial_value():
+    # The first row for n = 100 from the independent program, with 13 decimals.
+    row = (0.0766161898476, -0.0581921942222, -0.1406749262004, -0.0937863007163)
+    y = stiefel.y0(100)
+    np.testing.assert_allclose(y[0], row, rtol=0, atol=1e-13)
+    np.testing.assert_allclose(y.T @ y, np.eye(4), rtol=0, atol=1e-14)
+
+
+def test_constants_are_numpy_arrays():
+    # A JAX array made at import would be in float32 if x64 comes on later.
+    for rows, _ in stiefel.tabulated.values():
+        assert type(rows) is np.ndarray
+        assert rows.dtype == np.float64
+
+
+@pytest.mark.parametrize("n, p", [(5, 4), (9, 2), (7, 1)])
+def test_frozen_fields_are_the_equations(n, p):
+    """The matrices as the paper has them, entry by entry."""
+    y = np.linalg.qr(np.random.default_rng(0).standard_normal((n, p)))[0]
+    d, c = np.diag(1 + np.arange(n) / n), np.diag(-3 - np.arange(p) / p)
+    np.testing.assert_allclose(np.diag(d), stiefel.diagonals(n, p)[0])
+    np.testing.assert_allclose(np.diag(c), stiefel.diagonals(n, p)[1])
+    g = d @ y @ c
+    found = stiefel.first(0.0, jnp.asarray(y), stiefel.diagonals(n, p)).tangent(jnp.asarray(y))
+    np.testing.assert_allclose(found, (g @ y.T - y @ g.T) @ y, rtol=0, atol=1e-13)
+
+    big = np.zeros((n, n))
+    for i in range(n - 1):
+        big[i, i + 1] = (1 + sum(y[j, j] for j in range(p))) * (i + 1)
+        big[i + 1, i] = -big[i, i + 1]
+    lower = np.tril((big @ y)[:p], -1)
+    s = np.zeros((n, n))
+    s[:p, :p] = lower - lower.T
+    s[p:, :p] = y[: n - p]
+    s[:p, p:] = -y[: n - p].T
+    found = stiefel.second(0.0, jnp.asarray(y)).tangent(jnp.asarray(y))
+    np.testing.assert_allclose(found, s @ y, rtol=0, atol=1e-13)
+
+
+@both
+def test_reference_and_method_give_the_tabulated_numbers(problem):
+    rows, total = stiefel.tabulated[problem]
+    term, args = cfjax.LieTerm(FIELDS[problem]), arguments(problem, 100)
+    solved = cfjax.integrate(term, cfjax.CF4(), 0.0, 1.0, stiefel.y0(100), args, num_steps=1024)
+    # The table has 13 decimals. CF4's error is 3e-9 with 64 steps, of order 4: 4e-14 with 1024.
+    for y in (stiefel.reference(problem, 100), np.asarray(solved.ys[-1])):
+        np.testing.assert_allclose(y[:2], rows, rtol=0, atol=5e-13)
+        np.testing.assert_allclose(y.sum(), total, rtol=0, atol=2e-12)
+
+
+@both
+@pytest.mark.parametrize("name", METHODS)
+def test_order(problem, name):
+    """The slope over h = 1/16 to 1/128, with the smallest error far above the reference's."""
+    solver, order = METHODS[name]
+    n, p = 12, 3
+    steps = (16, 32, 64, 128)
+    found = problems.errors(
+        FIELDS[problem],
+        solver,
+        1.0,
+        stiefel.y0(n, p),
+        arguments(problem, n, p),
+        answer(problem, n, p).ravel(),
+        steps,
+    )
+    assert found.min() > 1e-12
+    assert abs(problems.slope(steps, found) - order) < 0.15
+    assert solver.order(None) == order
+
+
+@both
+def test_gradients_of_a_whole_solve(problem):
+    """In Y0, D and C, against finite differences of order 4."""
+    n, p = 6, 2
+    x = problems.arrays((stiefel.y0(n, p), arguments(problem, n, p)))
+    v = problems.random_like(x, 0)
+    weight = np.arange(12.0).reshape(n, p) / 4
+
+    def fun(x):
+        y0, args = x
+        term = cfjax.LieTerm(FIELDS[problem])
+        solution = cfjax.integrate(term, cfjax.CF4(), 0.0, 1.0, y0, args, num_steps=6)
+        return jnp.sum(jnp.sin(weight * solution.ys[-1]))
+
+    fun = jax.jit(fun)
+    gradient = jax.jit(jax.grad(fun))(x)
+    # Fifth derivatives up to 1e5 times 1e-12 / 30, and rounding of 1e-15 over 1e-3.
+    expected = problems.central_difference(fun, x, v, 1e-3)
+    np.testing.assert_allclose(problems.inner(gradient, v), expected, rtol=0, atol=1e-8)
+    if problem == "second":
+        forward = jax.jit(lambda x, v: jax.jvp(fun, (x,), (v,))[1])(x, v)
+        np.testing.assert_allclose(forward, problems.inner(gradient, v), rtol=1e-11)
+    assert all(np.abs(leaf).max() > 1e-3 for leaf in jax.tree.leaves(gradient))
+
+
+@pytest.mark.parametrize("dtype", [np.float32, np.float64])
+def test_precision_follows_the_state(dtype):
+    y = jnp.asarray(stiefel.y0(6, 2), dtype)
+    args = tuple(jnp.asarray(x, dtype) for x in stiefel.diagonals(6, 2))
+    assert stiefel.first(0.0, y, args).g.dtype == dtype
+    assert stiefel.second(0.0, y).gamma.dtype == dtype
