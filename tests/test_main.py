@@ -58,6 +58,24 @@ def test_every_chart_says_what_it_shows():
         assert chart.__doc__ and len(chart.__doc__.splitlines()[0]) > 10, name
 
 
+@pytest.mark.parametrize("name", ["heat", "stiefel_first", "stiefel_second"])
+def test_charts_of_the_other_scenes(name, monkeypatch):
+    module = getattr(scenes, name.partition("_")[0])
+    original = module.work_precision
+
+    def work_precision(*args, methods, num_steps=None, tolerances=None, **options):
+        some = {"CF4": methods["CF4"]}
+        num_steps, tolerances = num_steps and [8, 16], tolerances and [1e-4, 1e-6]
+        settings = dict(num_steps=num_steps, tolerances=tolerances)
+        return original(*args, methods=some, **(options | settings))
+
+    monkeypatch.setattr(module, "work_precision", work_precision)
+    work = __main__._SCENES[name](budget=0.1)
+    # One halving of the step at order 4; two powers of ten in tolerance, less the order reduction.
+    assert 8 < work.error[0] / work.error[1] < 100
+    assert work.error[1] < 1e-3
+
+
 def test_the_chart_says_what_is_not_known(short):
     with Progress(disable=True) as progress:
         report = _report.chart("rigid_body", scenes.rigid_body.chart, 0.1, progress)
