@@ -12,6 +12,8 @@ from typing import Any, TypeAlias
 Coefficient: TypeAlias = Fraction | float
 Row: TypeAlias = tuple[Coefficient, ...]
 Product: TypeAlias = tuple[Row, ...]
+# A product whose coefficients are polynomials without a constant term: by flow, power and stage.
+Extension: TypeAlias = tuple[Product, ...]
 
 
 def uncertainty(coefficient: Coefficient) -> Fraction:
@@ -46,16 +48,29 @@ class Tableau:
 
     A tableau is compared and hashed by value, so it can be static in a jitted function.
 
+    Two more products are optional. Both may use one more field, `F_s = h f(t + h, y_1)`, which
+    the next step starts with (first same as last).
+
+    - `companion[j][k]`: another end point, of an order lower by one, to estimate the error.
+    - `extension[j][i][k]`: the solution at `t + theta h` has for flow j and field F_k the
+      coefficient `sum_i extension[j][i][k] theta^(i+1)`, which is `beta`'s at theta = 1.
+
     **Raises:** `TypeError` where the nesting or a coefficient's type is wrong; `ValueError` where
-    a row is too long, the method is implicit, a coefficient is not finite, or the rows of `beta`
-    do not sum to 1.
+    a row is too long, the method is implicit, a coefficient is not finite, the rows of `beta` or
+    `companion` do not sum to 1, or the sums of the rows of `extension` are not those of `beta`.
     """
 
     alpha: tuple[Product, ...]
     beta: Product
+    companion: Product | None
+    extension: Extension | None
 
     def __init__(
-        self, alpha: Iterable[Iterable[Iterable[Any]]], beta: Iterable[Iterable[Any]]
+        self,
+        alpha: Iterable[Iterable[Iterable[Any]]],
+        beta: Iterable[Iterable[Any]],
+        companion: Iterable[Iterable[Any]] | None = None,
+        extension: Iterable[Iterable[Iterable[Any]]] | None = None,
     ) -> None:
         stages = _entries("alpha", alpha, "a sequence with one list of flows for each stage")
         if not stages:
@@ -66,16 +81,22 @@ class Tableau:
             self, "alpha", tuple(_product(f"alpha[{r}]", p, s, r) for r, p in enumerate(stages))
         )
         object.__setattr__(self, "beta", _product("beta", beta, s, s))
-        entries = [b for row in self.beta for b in row]
-        if abs(_sum(entries) - 1) > _sum(map(uncertainty, entries)):
-            raise ValueError(
-                "beta must sum to 1 over all its rows (consistency), got a sum of "
-                f"{_rounded_sum(entries)}."
-            )
+        _check_consistent("beta", self.beta)
+        if companion is not None:
+            companion = _product("companion", companion, s + 1, s + 1)
+            _check_consistent("companion", companion)
+        object.__setattr__(self, "companion", companion)
+        if extension is not None:
+            extension = _extension(extension, s + 1)
+            _check_end("extension", extension, self.beta)
+        object.__setattr__(self, "extension", extension)
 
     def __repr__(self) -> str:
         stages = ", ".join(map(_show_product, self.alpha))
-        return f"Tableau(alpha=[{stages}], beta={_show_product(self.beta)})"
+        more = "" if self.companion is None else f", companion={_show_product(self.companion)}"
+        if self.extension is not None:
+            more += f", extension=[{', '.join(map(_show_product, self.extension))}]"
+        return f"Tableau(alpha=[{stages}], beta={_show_product(self.beta)}{more})"
 
     def __hash__(self) -> int:
         return self._hash
@@ -91,8 +112,25 @@ class Tableau:
 
     @property
     def num_evaluations(self) -> int:
-        """Evaluations of the field in one step: one for each stage."""
+        """Evaluations of the field in one step: one for each stage.
+
+        Error control of a first-same-as-last method evaluates at the end of a step, and the next
+        step does not evaluate at its start: no more in the long run.
+        """
         return self.num_stages
+
+    @cached_property
+    def first_same_as_last(self) -> bool:
+        """Whether the companion or the extension uses the field at the end of the step."""
+        rows = [*(self.companion or ()), *(row for powers in self.extension or () for row in powers)]
+        return any(row[-1] != 0 for row in rows)
+
+    @cached_property
+    def companion_method(self) -> "Tableau | None":
+        """The companion as a method of its own, whose last stage is the end of the step."""
+        if self.companion is None:
+            return None
+        return Tableau((*self.alpha, self.beta), self.companion)
 
     @cached_property
     def c(self) -> Row:
@@ -114,6 +152,12 @@ class Tableau:
     def num_flows(self) -> int:
         """Flows (exponentials) in one step."""
         return len(self.prefixes)
+
+    @property
+    def num_companion_flows(self) -> int:
+        """Flows that the companion adds to a step."""
+        method = self.companion_method
+        return 0 if method is None else method.num_flows - self.num_flows
 
     @cached_property
     def is_exact(self) -> bool:
@@ -156,6 +200,39 @@ def _product(where: str, value: Any, num_stages: int, num_known: int) -> Product
     return tuple(rows)
 
 
+def _check_consistent(where: str, rows: Product) -> None:
+    entries = [b for row in rows for b in row]
+    if abs(_sum(entries) - 1) > _sum(map(uncertainty, entries)):
+        raise ValueError(
+            f"{where} must sum to 1 over all its rows (consistency), got a sum of "
+            f"{_rounded_sum(entries)}."
+        )
+
+
+def _extension(value: Any, num_stages: int) -> Extension:
+    flows = []
+    for j, powers in enumerate(_entries("extension", value, "a sequence with one entry a flow")):
+        place = f"extension[{j}]"
+        rows = []
+        for i, row in enumerate(_entries(place, powers, "a sequence of rows, one for each power")):
+            padded = _product(f"{place}[{i}]", [row], num_stages, num_stages)
+            # A row of zeros is left out of a product, but here its place says which power it is.
+            rows.append(padded[0] if padded else (Fraction(0),) * num_stages)
+        flows.append(tuple(rows))
+    return tuple(flows)
+
+
+def _check_end(where: str, extension: Extension, beta: Product) -> None:
+    for k in range(len(beta[0])):
+        entries = [row[k] for powers in extension for row in powers]
+        end = [row[k] for row in beta]
+        if abs(_sum(entries) - _sum(end)) > _sum(map(uncertainty, entries + end)):
+            raise ValueError(
+                f"{where} must lead to the end of the step: its coefficients of stage {k} sum to "
+                f"{_rounded_sum(entries)}, and those of beta to {_rounded_sum(end)}."
+            )
+
+
 def _coefficient(where: str, value: Any) -> Coefficient:
     if isinstance(value, Fraction):
         return value
@@ -189,7 +266,7 @@ def _rounded_sum(terms: list[Coefficient]) -> Coefficient:
 def _show_product(rows: Product) -> str:
     shown = []
     for row in rows:
-        last = max(k for k, a in enumerate(row) if a)
+        last = max((k for k, a in enumerate(row) if a), default=0)
         shown.append("(" + ", ".join(map(str, row[: last + 1])) + ")")
     return "[" + ", ".join(shown) + "]"
 
@@ -279,20 +356,40 @@ def _family(parameter: Any, alpha: list[Any], beta: list[Any]) -> Tableau:
 _half, _third, _sixth, _twelfth = (Fraction(1, n) for n in (2, 3, 6, 12))
 
 # Order 1: the exponential Euler step of every Lie group method.
-LIE_EULER = Tableau([[]], [[1]])
+LIE_EULER = Tableau([[]], [[1]], extension=[[[1]]])
 
-# Order 2: the classical midpoint rule.
-CF2 = Tableau([[], [[_half]]], [[0, 1]])
+# Order 2: the classical midpoint rule. Extension of order 2.
+CF2 = Tableau([[], [[_half]]], [[0, 1]], [[1]], [[[1], [-1, 1]]])
 
-# Order 3: Celledoni, Marthinsen & Owren, FGCS 19 (2003), the first family at 2/3.
-CF3 = third_order_a(Fraction(2, 3))
+# Order 3: Celledoni, Marthinsen & Owren, FGCS 19 (2003), the first family at 2/3. Companion and
+# extension of order 2.
+_cf3 = third_order_a(Fraction(2, 3))
+CF3 = Tableau(
+    _cf3.alpha,
+    _cf3.beta,
+    [[0, _half, _half]],
+    [[[_third]], [[2 * _third], [Fraction(-3, 4), 0, Fraction(3, 4)]]],
+)
 
-# Order 4: Celledoni, Marthinsen & Owren, FGCS 19 (2003), equation (7).
+# Order 4: Celledoni, Marthinsen & Owren, FGCS 19 (2003), equation (7). Companion, with the field
+# at the end of the step, and extension of order 3.
 CF4 = Tableau(
     [[], [[_half]], [[0, _half]], [[_half], [-_half, 0, 1]]],
     [
         [Fraction(1, 4), _sixth, _sixth, -_twelfth],
         [-_twelfth, _sixth, _sixth, Fraction(1, 4)],
+    ],
+    [
+        [Fraction(1, 4), _sixth, _sixth, -_twelfth],
+        [-_twelfth, _sixth, _sixth, 0, Fraction(1, 4)],
+    ],
+    [
+        [[_half], [Fraction(-1, 4), _sixth, _sixth, -_twelfth]],
+        [
+            [_half],
+            [Fraction(-5, 4), 5 * _sixth, 5 * _sixth, Fraction(-5, 12)],
+            [2 * _third, -2 * _third, -2 * _third, 2 * _third],
+        ],
     ],
 )
 

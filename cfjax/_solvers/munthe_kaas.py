@@ -23,7 +23,7 @@ from .._frozen_field import (
     without_bracket,
 )
 from .._order_conditions import runge_kutta_order
-from .base import AbstractLieSolver
+from .base import AbstractLieSolver, Move
 
 
 class AbstractMuntheKaas(AbstractLieSolver):
@@ -33,7 +33,7 @@ class AbstractMuntheKaas(AbstractLieSolver):
     def increment(self, field: Callable[[float, PyTree], PyTree]) -> PyTree:
         """The element v; `field(c, u)` is `h f(t + c h, exp(u) y0)`, and `u = None` means zero."""
 
-    def end_point(self, field, y0):
+    def move(self, field, y0):
         fields: list[PyTree] = []
         start = y0
 
@@ -51,7 +51,7 @@ class AbstractMuntheKaas(AbstractLieSolver):
             return value
 
         end = flow(self.increment(field_at), start)
-        return leave(fields[0], end)
+        return Move(leave(fields[0], end))
 
 
 class RKMK3(AbstractMuntheKaas):
