@@ -18,6 +18,8 @@ from ._order_conditions import order as order
 from ._solvers.commutator_free import CF2 as CF2
 from ._solvers.commutator_free import CF3 as CF3
 from ._solvers.commutator_free import CF4 as CF4
+from ._solvers.commutator_free import CF43 as CF43
+from ._solvers.commutator_free import CF54 as CF54
 from ._solvers.commutator_free import CG3 as CG3
 from ._solvers.commutator_free import CG4 as CG4
 from ._solvers.commutator_free import CG5 as CG5

@@ -11,6 +11,8 @@ import numpy as np
 from jax import lax
 from jaxtyping import Array, PyTree, Real
 
+from ._solvers.base import AbstractLieSolver
+
 
 def integrate(
     term: PyTree[diffrax.AbstractTerm],
@@ -45,6 +47,8 @@ def integrate(
     `y0` has an entry that is not finite, or if the solver reports a failure.
     """
     _check_types(term, solver, y0)
+    if isinstance(solver, AbstractLieSolver):
+        solver = solver.without_estimate()
     num_steps = _count("num_steps", num_steps)
     save_every = num_steps if save_every is None else _count("save_every", save_every)
     if num_steps % save_every:

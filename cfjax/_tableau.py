@@ -122,7 +122,10 @@ class Tableau:
     @cached_property
     def first_same_as_last(self) -> bool:
         """Whether the companion or the extension uses the field at the end of the step."""
-        rows = [*(self.companion or ()), *(row for powers in self.extension or () for row in powers)]
+        rows = [
+            *(self.companion or ()),
+            *(row for powers in self.extension or () for row in powers),
+        ]
         return any(row[-1] != 0 for row in rows)
 
     @cached_property
@@ -271,11 +274,17 @@ def _show_product(rows: Product) -> str:
     return "[" + ", ".join(shown) + "]"
 
 
-def crouch_grossman(a: Iterable[Iterable[Any]], b: Iterable[Any]) -> Tableau:
+def crouch_grossman(
+    a: Iterable[Iterable[Any]],
+    b: Iterable[Any],
+    companion: Iterable[Any] | None = None,
+    extension: Iterable[Iterable[Any]] | None = None,
+) -> Tableau:
     """The Crouch-Grossman method of a Runge-Kutta tableau: one flow for each coefficient.
 
     `a` holds the rows of the stages after the first, `a[i]` with the coefficients of stages
-    0..i; `b` holds one weight for each stage. Zero coefficients cost no flow. Its order is in
+    0..i; `b` holds one weight for each stage, and so does `companion`. `extension[k][i]` is the
+    coefficient of theta^(i+1) in the weight of stage k. Zero coefficients cost no flow. Its order is in
     general lower than that of the Runge-Kutta method.
 
     **Raises:** as `Tableau`, naming `alpha` for `a` and `beta` for `b`.
@@ -284,7 +293,14 @@ def crouch_grossman(a: Iterable[Iterable[Any]], b: Iterable[Any]) -> Tableau:
     def one_flow_each(row: Iterable[Any]) -> list[list[Any]]:
         return [[0] * k + [coefficient] for k, coefficient in enumerate(row)]
 
-    return Tableau([[], *map(one_flow_each, a)], one_flow_each(b))
+    return Tableau(
+        [[], *map(one_flow_each, a)],
+        one_flow_each(b),
+        None if companion is None else one_flow_each(companion),
+        None
+        if extension is None
+        else [[[0] * k + [power] for power in powers] for k, powers in enumerate(extension)],
+    )
 
 
 def third_order_a(alpha: int | Fraction | float) -> Tableau:
@@ -358,7 +374,7 @@ _half, _third, _sixth, _twelfth = (Fraction(1, n) for n in (2, 3, 6, 12))
 # Order 1: the exponential Euler step of every Lie group method.
 LIE_EULER = Tableau([[]], [[1]], extension=[[[1]]])
 
-# Order 2: the classical midpoint rule. Extension of order 2.
+# Order 2: the classical midpoint rule. Companion of order 1, extension of order 2.
 CF2 = Tableau([[], [[_half]]], [[0, 1]], [[1]], [[[1], [-1, 1]]])
 
 # Order 3: Celledoni, Marthinsen & Owren, FGCS 19 (2003), the first family at 2/3. Companion and
@@ -394,9 +410,12 @@ CF4 = Tableau(
 )
 
 # Order 3: Crouch & Grossman, J. Nonlinear Sci. 3 (1993); Owren & Marthinsen, BIT 39 (1999).
+# Companion, of the same sources, and extension of order 2.
 CG3 = crouch_grossman(
     [[Fraction(3, 4)], [Fraction(119, 216), Fraction(17, 108)]],
     [Fraction(13, 51), Fraction(-2, 3), Fraction(24, 17)],
+    [Fraction(17, 54), Fraction(19, 54), _third],
+    [[1, Fraction(-38, 51)], [0, Fraction(-2, 3)], [0, Fraction(24, 17)]],
 )
 
 # Order 4: Jackiewicz, Marthinsen & Owren, Adv. Comput. Math. 13 (2000).

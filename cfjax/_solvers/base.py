@@ -48,12 +48,9 @@ class AbstractLieSolver(diffrax.AbstractSolver):
         lost = self._no_loss(terms, t0, t1, y0, args)
         return (lost, terms.vf(t0, y0, args)) if self.first_same_as_last else lost
 
-    def forget(self, solver_state: PyTree) -> PyTree:
-        """A state without the field at `y0`: then every step evaluates it, and keeps nothing.
-
-        For steps of which none is rejected and no estimate is used, this is cheaper.
-        """
-        return (solver_state[0], None) if self.first_same_as_last else solver_state
+    def without_estimate(self) -> "AbstractLieSolver":
+        """The same method for steps that nobody controls: it keeps nothing for an estimate."""
+        return self
 
     def _no_loss(self, terms, t0, t1, y0, args) -> PyTree:
         """Zeros for the compensated parts of the state, and None for the others."""
