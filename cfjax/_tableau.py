@@ -122,11 +122,11 @@ class Tableau:
     @cached_property
     def first_same_as_last(self) -> bool:
         """Whether the companion or the extension uses the field at the end of the step."""
-        rows = [
-            *(self.companion or ()),
-            *(row for powers in self.extension or () for row in powers),
-        ]
-        return any(row[-1] != 0 for row in rows)
+        return any(map(self.uses_last, (self.companion or (), *(self.extension or ()))))
+
+    def uses_last(self, rows: Product) -> bool:
+        """Whether the rows have a coefficient for the field at the end of the step."""
+        return any(any(row[self.num_stages :]) for row in rows)
 
     @cached_property
     def companion_method(self) -> "Tableau | None":
@@ -182,25 +182,28 @@ def _product(where: str, value: Any, num_stages: int, num_known: int) -> Product
     """The rows of one point, of which only the first `num_known` stages may be used."""
     rows = []
     for j, row in enumerate(_entries(where, value, "a sequence of rows, one for each flow")):
-        place = f"{where}[{j}]"
-        entries = _entries(place, row, "a row with one coefficient for each stage")
-        if len(entries) > num_stages:
-            raise ValueError(
-                f"{place} must have at most {num_stages} entries, one for each stage of alpha, "
-                f"got {len(entries)}."
-            )
-        checked = [_coefficient(f"{place}[{k}]", entry) for k, entry in enumerate(entries)]
-        for k in range(num_known, len(checked)):
+        checked = _row(f"{where}[{j}]", row, num_stages)
+        for k in range(num_known, num_stages):
             if checked[k] != 0:
                 allowed = f"only stages before {num_known}" if num_known else "no stage"
                 raise ValueError(
-                    f"{place}[{k}] is {checked[k]}, but the method must be explicit: "
+                    f"{where}[{j}][{k}] is {checked[k]}, but the method must be explicit: "
                     f"{where} may use {allowed}, so this entry must be 0."
                 )
         if any(checked):
-            zeros = [Fraction(0)] * (num_stages - len(checked))
-            rows.append(tuple(checked + zeros))
+            rows.append(checked)
     return tuple(rows)
+
+
+def _row(where: str, value: Any, num_stages: int) -> Row:
+    entries = _entries(where, value, "a row with one coefficient for each stage")
+    if len(entries) > num_stages:
+        raise ValueError(
+            f"{where} must have at most {num_stages} entries, one for each stage of alpha, "
+            f"got {len(entries)}."
+        )
+    zeros = [Fraction(0)] * (num_stages - len(entries))
+    return (*(_coefficient(f"{where}[{k}]", entry) for k, entry in enumerate(entries)), *zeros)
 
 
 def _check_consistent(where: str, rows: Product) -> None:
@@ -213,16 +216,17 @@ def _check_consistent(where: str, rows: Product) -> None:
 
 
 def _extension(value: Any, num_stages: int) -> Extension:
-    flows = []
-    for j, powers in enumerate(_entries("extension", value, "a sequence with one entry a flow")):
-        place = f"extension[{j}]"
-        rows = []
-        for i, row in enumerate(_entries(place, powers, "a sequence of rows, one for each power")):
-            padded = _product(f"{place}[{i}]", [row], num_stages, num_stages)
-            # A row of zeros is left out of a product, but here its place says which power it is.
-            rows.append(padded[0] if padded else (Fraction(0),) * num_stages)
-        flows.append(tuple(rows))
-    return tuple(flows)
+    return tuple(
+        tuple(
+            _row(f"extension[{j}][{i}]", row, num_stages)
+            for i, row in enumerate(
+                _entries(f"extension[{j}]", powers, "a sequence of rows, one for each power")
+            )
+        )
+        for j, powers in enumerate(
+            _entries("extension", value, "a sequence with one entry for each flow")
+        )
+    )
 
 
 def _check_end(where: str, extension: Extension, beta: Product) -> None:

@@ -97,17 +97,18 @@ class AbstractCommutatorFree(AbstractLieSolver):
         end = leave(fields[0], point(stages[-1]))
         # All that follows is for error control and output within the step. It is dead code, left
         # out by the compiler, where nobody asks for them.
-        if tableau.first_same_as_last:
+        companion = None if self.estimate is None else tableau.companion
+        if any(map(tableau.uses_last, (companion or (), *(tableau.extension or ())))):
             evaluate(1.0, stages[-1])
         error, dense = None, {}
-        if tableau.companion is not None and self.estimate is not None:
+        if companion is not None:
             if self.estimate == "algebra":
-                difference = _combined(_difference(tableau.companion, tableau.beta), fields)
+                difference = _combined(_difference(companion, tableau.beta), fields)
                 error = tangent(difference, point(stages[-1]))
             else:
-                other = leave(fields[0], point(_trimmed(tableau.companion)))
+                other = leave(fields[0], point(_trimmed(companion)))
                 error = _minus(end, other)
-                if tableau.first_same_as_last:
+                if tableau.uses_last(companion):
                     last_stage = leave(fields[0], point(stages[-2]))
                     blind = _same(evaluated[-2], evaluated[-1], end)
                     error = jtu.tree_map(jnp.where, blind, _minus(end, last_stage), error)
