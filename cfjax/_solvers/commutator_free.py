@@ -51,9 +51,7 @@ class AbstractCommutatorFree(AbstractLieSolver):
 
     def __check_init__(self):
         if self.estimate not in ("group", "algebra", None):
-            raise ValueError(
-                f"estimate must be 'group', 'algebra' or None, got {self.estimate!r}."
-            )
+            raise ValueError(f"estimate must be 'group', 'algebra' or None, got {self.estimate!r}.")
 
     def without_estimate(self) -> "AbstractCommutatorFree":
         return dataclasses.replace(self, estimate=None)
