@@ -1,6 +1,8 @@
 """Commutator-free Lie group integrators for JAX."""
 
 from . import scenes as scenes
+from ._error_control import ErrorNorm as ErrorNorm
+from ._error_control import starting_step as starting_step
 from ._fields.low_rank import BorderedSkew as BorderedSkew
 from ._fields.low_rank import LowRankSkew as LowRankSkew
 from ._fields.matrix import LeftMatrix as LeftMatrix

@@ -50,63 +50,51 @@ def exact(word):
     return exact(word[:-1]) * exact(word[-1]) / size(word)
 
 
-def weight(word, rows, stages):
-    """Over all splits of the word's letters into one group for each flow."""
-    if not rows:
-        return Fraction(not word)
-    total = Fraction(0)
-    for i in range(len(word) + 1):
-        term = Fraction(1)
-        for m, tree in enumerate(word[i:], 1):
-            term *= sum(a * stages(k, tree) for k, a in enumerate(rows[-1]) if a) / Fraction(m)
-        if term:
-            total += term * weight(word[:i], rows[:-1], stages)
-    return total
-
-
 @methods
 def test_the_order_conditions_of_the_extension(solver, order):
     """Its weights must be `theta^n` times those of the exact solution, for words of order n."""
     tableau = solver.tableau
-    products = [[tuple(map(Fraction, r)) for r in p] for p in (*tableau.alpha, tableau.beta)]
+    # Exact where the tableau is; Fraction(2) / 3 and 2.0 / 3 are both right below.
+    number = Fraction if tableau.is_exact else float
+    products = [[list(map(number, r)) for r in p] for p in (*tableau.alpha, tableau.beta)]
 
     @lru_cache(None)
-    def stages(k, tree):
-        return weight(tree, products[k], stages)
+    def stage(k, tree):
+        return weigher(products[k])(tree, len(products[k]))
+
+    def weigher(rows):
+        @lru_cache(None)
+        def weight(word, j):
+            """Over all splits of the word's letters into one group for each of j flows."""
+            if not word or not j:
+                return number(not word)
+            total = number(0)
+            for i in range(len(word) + 1):
+                term = weight(word[:i], j - 1)
+                for m, tree in enumerate(word[i:], 1):
+                    term *= sum(a * stage(k, tree) for k, a in enumerate(rows[j - 1]) if a) / m
+                total += term
+            return total
+
+        return weight
 
     def defect(n, theta):
         rows = [
-            tuple(
-                sum(Fraction(a) * theta ** (i + 1) for i, a in enumerate(column))
+            [
+                sum(number(a) * theta ** (i + 1) for i, a in enumerate(column))
                 for column in zip(*powers, strict=True)
-            )
+            ]
             for powers in tableau.extension
         ]
-        return max(abs(weight(w, rows, stages) - theta**n * exact(w)) for w in words(n))
+        weight = weigher(rows)
+        return max(abs(weight(w, len(rows)) - theta**n * number(exact(w))) for w in words(n))
 
-    for theta in (Fraction(1, 7), Fraction(1, 2), Fraction(9, 10), Fraction(1)):
+    for theta in (number(1) / 7, number(1) / 2, number(1)):
         for n in range(1, order + 1):
-            # Coefficients of size 10 that are rounded, in products of up to four.
-            assert defect(n, theta) < (
-                1e-14 if "54" in type(solver).__name__ or not tableau.is_exact else 1e-300
-            )
+            # Coefficients up to 10 that are rounded, in products of up to four; or exact.
+            assert defect(n, theta) <= (0 if tableau.is_exact else 1e-14)
     # And no more than that.
-    assert defect(order + 1, Fraction(1, 2)) > 1e-5
-
-
-@pytest.fixture(scope="module")
-def body_solution():
-    """The driven body as a function of time."""
-    answer = solve_ivp(
-        lambda t, y: problems.driven_body_ode(t, y, problems.INERTIA),
-        (0, 1),
-        problems.MOMENTUM,
-        method="DOP853",
-        rtol=2.3e-14,
-        atol=1e-15,
-        dense_output=True,
-    )
-    return answer
+    assert defect(order + 1, number(1) / 2) > 1e-5
 
 
 def dense(solver, n, field, y0, args, t1=1.0, **kwargs):
@@ -158,8 +146,9 @@ def test_the_error_between_the_steps_falls_with_the_order_of_the_solution(solver
     assert abs(slope - (order + 1)) < 0.15
 
 
-@methods
-def test_random_times_are_on_the_manifold_and_nodes_are_the_steps(solver, order):
+@pytest.mark.parametrize("name", ["CF4", "CF54"])
+def test_random_times_are_on_the_manifold_and_nodes_are_the_steps(name):
+    solver, _ = EXTENDED[name]
     field, y0, args = BODY
     n = 8
     sol = dense(solver, n, field, y0, args)
@@ -196,8 +185,7 @@ def test_random_times_are_on_the_manifold_and_nodes_are_the_steps(solver, order)
     np.testing.assert_allclose(saved.ys, ys[np.argsort(times)], rtol=0, atol=1e-14)
 
 
-@pytest.mark.parametrize("name", ["CF3", "CF4", "CF43", "CF54"])
-@pytest.mark.parametrize("direction", [1, -1])
+@pytest.mark.parametrize("name, direction", [("CF3", 1), ("CF4", -1), ("CF54", 1)])
 def test_derivatives_in_time(name, direction):
     solver, order = EXTENDED[name]
     field, y0, args = BODY
@@ -286,7 +274,7 @@ def pendulum_ode(gravity):
     return ode
 
 
-@pytest.mark.parametrize("name", ["CF4", "CF43"])
+@pytest.mark.parametrize("name", ["CF4"])
 def test_a_pendulum_passes_a_plane_on_the_sphere_at_the_right_time(name):
     gravity = 2.0
     y0 = {"q": jnp.asarray([0.6, 0.0, -0.8]), "w": jnp.asarray([0.3, 1.0, 0.2])}
