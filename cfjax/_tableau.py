@@ -288,8 +288,8 @@ def crouch_grossman(
 
     `a` holds the rows of the stages after the first, `a[i]` with the coefficients of stages
     0..i; `b` holds one weight for each stage, and so does `companion`. `extension[k][i]` is the
-    coefficient of theta^(i+1) in the weight of stage k. Zero coefficients cost no flow. Its order is in
-    general lower than that of the Runge-Kutta method.
+    coefficient of theta^(i+1) in the weight of stage k. Zero coefficients cost no flow. Its order
+    is in general lower than that of the Runge-Kutta method.
 
     **Raises:** as `Tableau`, naming `alpha` for `a` and `beta` for `b`.
     """

@@ -30,9 +30,9 @@ class AbstractLieSolver(diffrax.AbstractSolver):
 
     term_structure: ClassVar = diffrax.AbstractTerm
 
-    @property
-    def interpolation_cls(self) -> Callable[..., diffrax.AbstractLocalInterpolation]:
-        return NodeInterpolation
+    interpolation_cls: ClassVar[Callable[..., diffrax.AbstractLocalInterpolation]] = (
+        NodeInterpolation
+    )
 
     @property
     def first_same_as_last(self) -> bool:
@@ -84,7 +84,8 @@ class AbstractLieSolver(diffrax.AbstractSolver):
             def field(c: float, y: PyTree) -> PyTree:
                 if values or first is None:
                     # The end of the step exactly, not up to rounding: the field may jump there.
-                    t = t1 if c == 1 else t0 + c * (t1 - t0)
+                    is_end = isinstance(c, float) and c == 1
+                    t = t1 if is_end else t0 + jnp.asarray(c, jnp.result_type(t0)) * (t1 - t0)
                     values.append(terms.vf(t, value(y), args))
                 else:
                     values.append(first)

@@ -13,7 +13,6 @@ from jaxtyping import PyTree
 from .. import _pairs, _tableau
 from .._dense import FlowInterpolation, NodeInterpolation, Path
 from .._frozen_field import (
-    Displaced,
     combine,
     enter,
     flow,
@@ -71,16 +70,23 @@ class AbstractCommutatorFree(AbstractLieSolver):
         companion = self.tableau.companion_method
         return None if companion is None else order(companion) + 1
 
+    def element(
+        self, rows: Product, fields: Sequence[PyTree], kept: dict[Product, PyTree]
+    ) -> PyTree:
+        """The field of the last of some rows; `kept` is for what is used again in the step."""
+        return _combined(rows[-1], fields)
+
     def move(self, field, y0):
         tableau = self.tableau
         fields: list[PyTree] = []
         evaluated: list[PyTree] = []
         # Rows that begin alike share their flows (the paper's "reusing flow calculations").
         points: dict[Product, PyTree] = {(): y0}
+        kept: dict[Product, PyTree] = {}
 
         def point(rows: Product) -> PyTree:
             if rows not in points:
-                points[rows] = flow(_combined(rows[-1], fields), point(rows[:-1]))
+                points[rows] = flow(self.element(rows, fields, kept), point(rows[:-1]))
             return points[rows]
 
         def evaluate(c: float, rows: Product) -> None:
@@ -127,11 +133,8 @@ def _trimmed(rows: Product) -> Product:
 
 def _difference(a: Product, b: Product) -> Row:
     """The sum of all rows of a less that of b, which may have fewer entries."""
-    total = [sum(column) for column in zip(*a, strict=True)]
-    for row in b:
-        for k, entry in enumerate(row):
-            total[k] -= entry
-    return tuple(total)
+    rest = [[-entry for entry in row] + [0] * (len(a[0]) - len(row)) for row in b]
+    return tuple(sum(column) for column in zip(*a, *rest, strict=True))
 
 
 def _minus(a: PyTree, b: PyTree) -> PyTree:
