@@ -27,6 +27,15 @@ from ._solvers.commutator_free import CG4 as CG4
 from ._solvers.commutator_free import CG5 as CG5
 from ._solvers.commutator_free import CommutatorFree as CommutatorFree
 from ._solvers.commutator_free import LieEuler as LieEuler
+from ._solvers.low_storage import BWRRK33 as BWRRK33
+from ._solvers.low_storage import BWRRK53 as BWRRK53
+from ._solvers.low_storage import CFEES25 as CFEES25
+from ._solvers.low_storage import CFEES27 as CFEES27
+from ._solvers.low_storage import CK34 as CK34
+from ._solvers.low_storage import CK54 as CK54
+from ._solvers.low_storage import Luscher3 as Luscher3
+from ._solvers.low_storage import Williamson3 as Williamson3
+from ._solvers.low_storage import YRK135 as YRK135
 from ._solvers.munthe_kaas import RKMK as RKMK
 from ._solvers.munthe_kaas import RKMK3 as RKMK3
 from ._solvers.munthe_kaas import RKMK4 as RKMK4

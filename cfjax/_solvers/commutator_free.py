@@ -95,7 +95,7 @@ class AbstractCommutatorFree(AbstractLieSolver):
             entered, points[rows] = enter(evaluated[-1], here, fields)
             fields.append(entered)
 
-        stages = [_trimmed(rows) for rows in (*tableau.alpha, tableau.beta)]
+        stages = [trimmed(rows) for rows in (*tableau.alpha, tableau.beta)]
         for c, rows in zip(tableau.c, stages[:-1], strict=True):
             evaluate(float(c), rows)
         end = leave(fields[0], point(stages[-1]))
@@ -110,7 +110,7 @@ class AbstractCommutatorFree(AbstractLieSolver):
                 difference = _combined(_difference(companion, tableau.beta), fields)
                 error = tangent(difference, point(stages[-1]))
             else:
-                other = leave(fields[0], point(_trimmed(companion)))
+                other = leave(fields[0], point(trimmed(companion)))
                 error = _minus(end, other)
                 if tableau.uses_last(companion):
                     last_stage = leave(fields[0], point(stages[-2]))
@@ -126,7 +126,7 @@ def _combined(row: Row, fields: Sequence[PyTree]) -> PyTree:
     return combine(*zip(*used, strict=True))
 
 
-def _trimmed(rows: Product) -> Product:
+def trimmed(rows: Product) -> Product:
     """The rows without zeros at their ends, so that equal flows have equal rows."""
     return tuple(row[: 1 + max(k for k, a in enumerate(row) if a != 0)] for row in rows)
 
