@@ -9,7 +9,7 @@ import equinox as eqx
 import jax.numpy as jnp
 import jax.tree_util as jtu
 from jax import lax
-from jaxtyping import Array, Inexact, PyTree
+from jaxtyping import Array, Inexact, PyTree, Real
 
 from .._components import by_components
 from .._dense import NodeInterpolation
@@ -40,7 +40,7 @@ class AbstractLieSolver(diffrax.AbstractSolver):
         return False
 
     @abc.abstractmethod
-    def move(self, field: Callable[[float, PyTree], PyTree], y0: PyTree) -> "Move":
+    def move(self, field: Callable[[Any, PyTree], PyTree], y0: PyTree) -> "Move":
         """A step from `y0`; `field(c, y)` is `h f(t + c h, y)`, a frozen field."""
 
     def init(self, terms, t0, t1, y0, args) -> PyTree:
@@ -81,11 +81,14 @@ class AbstractLieSolver(diffrax.AbstractSolver):
             control = terms.contr(t0, t1)
             values = []
 
-            def field(c: float, y: PyTree) -> PyTree:
+            def field(c: float | Real[Array, ""], y: PyTree) -> PyTree:
                 if values or first is None:
                     # The end of the step exactly, not up to rounding: the field may jump there.
-                    is_end = isinstance(c, float) and c == 1
-                    t = t1 if is_end else t0 + jnp.asarray(c, jnp.result_type(t0)) * (t1 - t0)
+                    if not isinstance(c, float):
+                        c = c.astype(jnp.result_type(t0))
+                        t = jnp.where(c == 1, t1, t0 + c * (t1 - t0))
+                    else:
+                        t = t1 if c == 1 else t0 + c * (t1 - t0)
                     values.append(terms.vf(t, value(y), args))
                 else:
                     values.append(first)

@@ -70,9 +70,7 @@ class AbstractCommutatorFree(AbstractLieSolver):
         companion = self.tableau.companion_method
         return None if companion is None else order(companion) + 1
 
-    def element(
-        self, rows: Product, fields: Sequence[PyTree], kept: dict[Product, PyTree]
-    ) -> PyTree:
+    def element(self, rows: Product, fields: Sequence[PyTree], kept: dict[int, PyTree]) -> PyTree:
         """The field of the last of some rows; `kept` is for what is used again in the step."""
         return _combined(rows[-1], fields)
 
@@ -82,7 +80,7 @@ class AbstractCommutatorFree(AbstractLieSolver):
         evaluated: list[PyTree] = []
         # Rows that begin alike share their flows (the paper's "reusing flow calculations").
         points: dict[Product, PyTree] = {(): y0}
-        kept: dict[Product, PyTree] = {}
+        kept: dict[int, PyTree] = {}
 
         def point(rows: Product) -> PyTree:
             if rows not in points:
@@ -111,11 +109,11 @@ class AbstractCommutatorFree(AbstractLieSolver):
                 error = tangent(difference, point(stages[-1]))
             else:
                 other = leave(fields[0], point(trimmed(companion)))
-                error = _minus(end, other)
+                error = minus(end, other)
                 if tableau.uses_last(companion):
                     last_stage = leave(fields[0], point(stages[-2]))
                     blind = _same(evaluated[-2], evaluated[-1], end)
-                    error = jtu.tree_map(jnp.where, blind, _minus(end, last_stage), error)
+                    error = jtu.tree_map(jnp.where, blind, minus(end, last_stage), error)
         if tableau.extension is not None:
             dense["path"] = Path.of(tableau.extension, value(points[()]), fields)
         return Move(end, error, dense)
@@ -137,7 +135,7 @@ def _difference(a: Product, b: Product) -> Row:
     return tuple(sum(column) for column in zip(*a, *rest, strict=True))
 
 
-def _minus(a: PyTree, b: PyTree) -> PyTree:
+def minus(a: PyTree, b: PyTree) -> PyTree:
     """The difference of two points of a step that may be displaced from the same start."""
     return jtu.tree_map(
         lambda p, q: p.displacement - q.displacement if is_displaced(p) else p - q,

@@ -9,12 +9,15 @@ import jax.tree_util as jtu
 from jax import lax
 
 from .._frozen_field import combine, enter, flow
+from .._frozen_field import value as value_of
 from .._tableau import Product, Row, Tableau
 from .base import Move
-from .commutator_free import AbstractCommutatorFree, trimmed
+from .commutator_free import AbstractCommutatorFree, minus, trimmed
 
-# Unrolled stages cost compile time quadratically.
+# Unrolled stages cost compile time quadratically. And XLA keeps the fields of several of them, to
+# add them up at once: as many as fit in a cache may be.
 _MAX_UNROLLED = 5
+_LARGE = 4096
 
 
 class AbstractLowStorage(AbstractCommutatorFree):
@@ -38,25 +41,31 @@ class AbstractLowStorage(AbstractCommutatorFree):
         return combine((float(self.b[i]),), (kept[i],))
 
     def move(self, field, y0):
-        if len(self.b) <= _MAX_UNROLLED:
+        companion = None if self.estimate is None else self.tableau.companion
+        penultimate = companion is not None and trimmed(companion) == trimmed(
+            self.tableau.beta[:-1]
+        )
+        other = companion is not None and not (penultimate and self.estimate == "group")
+        size = sum(jnp.size(leaf) for leaf in jtu.tree_leaves(value_of(y0)))
+        if other or (len(self.b) <= _MAX_UNROLLED and size <= _LARGE):
             return super().move(field, y0)
         value = field(0.0, y0)
         total, point = enter(value, y0, ())
         if jtu.tree_structure((total, point)) != jtu.tree_structure((value, y0)):
-            return super().move(lambda c, y: field(c, y) if c else value, y0)
+            return super().move(lambda c, y: value if y is y0 else field(c, y), y0)
 
         def stage(carry, coefficients):
             a, b, c = coefficients
-            total, point = carry
+            total, point, _ = carry
             total = combine((a, 1.0), (total, field(c, point)))
-            return (total, flow(combine((b,), (total,)), point)), None
+            return (total, flow(combine((b,), (total,)), point), point), None
 
-        point = flow(combine((float(self.b[0]),), (total,)), point)
-        columns = [
+        after = flow(combine((float(self.b[0]),), (total,)), point)
+        coefficients = tuple(
             jnp.asarray([float(x) for x in row[1:]]) for row in (self.a, self.b, self.tableau.c)
-        ]
-        (_, point), _ = lax.scan(stage, (total, point), tuple(columns))
-        return Move(point)
+        )
+        (_, end, before), _ = lax.scan(stage, (total, after, point), coefficients)
+        return Move(end, minus(end, before) if penultimate else None)
 
 
 def _tableau(a: Row, b: Row, companion: Callable[[Product], Any] | None = None) -> Tableau:
