@@ -33,9 +33,9 @@ from ._solvers.low_storage import CFEES25 as CFEES25
 from ._solvers.low_storage import CFEES27 as CFEES27
 from ._solvers.low_storage import CK34 as CK34
 from ._solvers.low_storage import CK54 as CK54
+from ._solvers.low_storage import YRK135 as YRK135
 from ._solvers.low_storage import Luscher3 as Luscher3
 from ._solvers.low_storage import Williamson3 as Williamson3
-from ._solvers.low_storage import YRK135 as YRK135
 from ._solvers.munthe_kaas import RKMK as RKMK
 from ._solvers.munthe_kaas import RKMK3 as RKMK3
 from ._solvers.munthe_kaas import RKMK4 as RKMK4

@@ -84,11 +84,11 @@ class AbstractLieSolver(diffrax.AbstractSolver):
             def field(c: float | Real[Array, ""], y: PyTree) -> PyTree:
                 if values or first is None:
                     # The end of the step exactly, not up to rounding: the field may jump there.
-                    if not isinstance(c, float):
-                        c = c.astype(jnp.result_type(t0))
-                        t = jnp.where(c == 1, t1, t0 + c * (t1 - t0))
-                    else:
+                    if isinstance(c, float):
                         t = t1 if c == 1 else t0 + c * (t1 - t0)
+                    else:
+                        c = jnp.asarray(c, jnp.result_type(t0))
+                        t = jnp.where(c == 1, t1, t0 + c * (t1 - t0))
                     values.append(terms.vf(t, value(y), args))
                 else:
                     values.append(first)

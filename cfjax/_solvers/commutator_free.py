@@ -5,7 +5,6 @@ from collections.abc import Sequence
 from typing import Any, ClassVar, Literal
 
 import equinox as eqx
-import jax
 import jax.numpy as jnp
 import jax.tree_util as jtu
 from jaxtyping import PyTree
@@ -56,7 +55,7 @@ class AbstractCommutatorFree(AbstractLieSolver):
         return dataclasses.replace(self, estimate=None)
 
     @property
-    def interpolation_cls(self) -> Any:
+    def interpolation_cls(self) -> Any:  # pyright: ignore[reportIncompatibleMethodOverride]
         return NodeInterpolation if self.tableau.extension is None else FlowInterpolation
 
     @property
