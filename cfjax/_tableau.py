@@ -12,6 +12,8 @@ from typing import Any, TypeAlias
 Coefficient: TypeAlias = Fraction | float
 Row: TypeAlias = tuple[Coefficient, ...]
 Product: TypeAlias = tuple[Row, ...]
+# A product whose coefficients are polynomials without a constant term: by flow, power and stage.
+Extension: TypeAlias = tuple[Product, ...]
 
 
 def uncertainty(coefficient: Coefficient) -> Fraction:
@@ -46,16 +48,29 @@ class Tableau:
 
     A tableau is compared and hashed by value, so it can be static in a jitted function.
 
+    Two more products are optional. Both may use one more field, `F_s = h f(t + h, y_1)`, which
+    the next step starts with (first same as last).
+
+    - `companion[j][k]`: another end point, of an order lower by one, to estimate the error.
+    - `extension[j][i][k]`: the solution at `t + theta h` has for flow j and field F_k the
+      coefficient `sum_i extension[j][i][k] theta^(i+1)`, which is `beta`'s at theta = 1.
+
     **Raises:** `TypeError` where the nesting or a coefficient's type is wrong; `ValueError` where
-    a row is too long, the method is implicit, a coefficient is not finite, or the rows of `beta`
-    do not sum to 1.
+    a row is too long, the method is implicit, a coefficient is not finite, the rows of `beta` or
+    `companion` do not sum to 1, or the sums of the rows of `extension` are not those of `beta`.
     """
 
     alpha: tuple[Product, ...]
     beta: Product
+    companion: Product | None
+    extension: Extension | None
 
     def __init__(
-        self, alpha: Iterable[Iterable[Iterable[Any]]], beta: Iterable[Iterable[Any]]
+        self,
+        alpha: Iterable[Iterable[Iterable[Any]]],
+        beta: Iterable[Iterable[Any]],
+        companion: Iterable[Iterable[Any]] | None = None,
+        extension: Iterable[Iterable[Iterable[Any]]] | None = None,
     ) -> None:
         stages = _entries("alpha", alpha, "a sequence with one list of flows for each stage")
         if not stages:
@@ -66,16 +81,22 @@ class Tableau:
             self, "alpha", tuple(_product(f"alpha[{r}]", p, s, r) for r, p in enumerate(stages))
         )
         object.__setattr__(self, "beta", _product("beta", beta, s, s))
-        entries = [b for row in self.beta for b in row]
-        if abs(_sum(entries) - 1) > _sum(map(uncertainty, entries)):
-            raise ValueError(
-                "beta must sum to 1 over all its rows (consistency), got a sum of "
-                f"{_rounded_sum(entries)}."
-            )
+        _check_consistent("beta", self.beta)
+        if companion is not None:
+            companion = _product("companion", companion, s + 1, s + 1)
+            _check_consistent("companion", companion)
+        object.__setattr__(self, "companion", companion)
+        if extension is not None:
+            extension = _extension(extension, s + 1)
+            _check_end("extension", extension, self.beta)
+        object.__setattr__(self, "extension", extension)
 
     def __repr__(self) -> str:
         stages = ", ".join(map(_show_product, self.alpha))
-        return f"Tableau(alpha=[{stages}], beta={_show_product(self.beta)})"
+        more = "" if self.companion is None else f", companion={_show_product(self.companion)}"
+        if self.extension is not None:
+            more += f", extension=[{', '.join(map(_show_product, self.extension))}]"
+        return f"Tableau(alpha=[{stages}], beta={_show_product(self.beta)}{more})"
 
     def __hash__(self) -> int:
         return self._hash
@@ -91,8 +112,28 @@ class Tableau:
 
     @property
     def num_evaluations(self) -> int:
-        """Evaluations of the field in one step: one for each stage."""
+        """Evaluations of the field in one step: one for each stage.
+
+        Error control of a first-same-as-last method evaluates at the end of a step, and the next
+        step does not evaluate at its start: no more in the long run.
+        """
         return self.num_stages
+
+    @cached_property
+    def first_same_as_last(self) -> bool:
+        """Whether the companion or the extension uses the field at the end of the step."""
+        return any(map(self.uses_last, (self.companion or (), *(self.extension or ()))))
+
+    def uses_last(self, rows: Product) -> bool:
+        """Whether the rows have a coefficient for the field at the end of the step."""
+        return any(any(row[self.num_stages :]) for row in rows)
+
+    @cached_property
+    def companion_method(self) -> "Tableau | None":
+        """The companion as a method of its own, whose last stage is the end of the step."""
+        if self.companion is None:
+            return None
+        return Tableau((*self.alpha, self.beta), self.companion)
 
     @cached_property
     def c(self) -> Row:
@@ -115,6 +156,12 @@ class Tableau:
         """Flows (exponentials) in one step."""
         return len(self.prefixes)
 
+    @property
+    def num_companion_flows(self) -> int:
+        """Flows that the companion adds to a step."""
+        method = self.companion_method
+        return 0 if method is None else method.num_flows - self.num_flows
+
     @cached_property
     def is_exact(self) -> bool:
         """Whether all coefficients are fractions."""
@@ -135,25 +182,62 @@ def _product(where: str, value: Any, num_stages: int, num_known: int) -> Product
     """The rows of one point, of which only the first `num_known` stages may be used."""
     rows = []
     for j, row in enumerate(_entries(where, value, "a sequence of rows, one for each flow")):
-        place = f"{where}[{j}]"
-        entries = _entries(place, row, "a row with one coefficient for each stage")
-        if len(entries) > num_stages:
-            raise ValueError(
-                f"{place} must have at most {num_stages} entries, one for each stage of alpha, "
-                f"got {len(entries)}."
-            )
-        checked = [_coefficient(f"{place}[{k}]", entry) for k, entry in enumerate(entries)]
-        for k in range(num_known, len(checked)):
+        checked = _row(f"{where}[{j}]", row, num_stages)
+        for k in range(num_known, num_stages):
             if checked[k] != 0:
                 allowed = f"only stages before {num_known}" if num_known else "no stage"
                 raise ValueError(
-                    f"{place}[{k}] is {checked[k]}, but the method must be explicit: "
+                    f"{where}[{j}][{k}] is {checked[k]}, but the method must be explicit: "
                     f"{where} may use {allowed}, so this entry must be 0."
                 )
         if any(checked):
-            zeros = [Fraction(0)] * (num_stages - len(checked))
-            rows.append(tuple(checked + zeros))
+            rows.append(checked)
     return tuple(rows)
+
+
+def _row(where: str, value: Any, num_stages: int) -> Row:
+    entries = _entries(where, value, "a row with one coefficient for each stage")
+    if len(entries) > num_stages:
+        raise ValueError(
+            f"{where} must have at most {num_stages} entries, one for each stage of alpha, "
+            f"got {len(entries)}."
+        )
+    zeros = [Fraction(0)] * (num_stages - len(entries))
+    return (*(_coefficient(f"{where}[{k}]", entry) for k, entry in enumerate(entries)), *zeros)
+
+
+def _check_consistent(where: str, rows: Product) -> None:
+    entries = [b for row in rows for b in row]
+    if abs(_sum(entries) - 1) > _sum(map(uncertainty, entries)):
+        raise ValueError(
+            f"{where} must sum to 1 over all its rows (consistency), got a sum of "
+            f"{_rounded_sum(entries)}."
+        )
+
+
+def _extension(value: Any, num_stages: int) -> Extension:
+    return tuple(
+        tuple(
+            _row(f"extension[{j}][{i}]", row, num_stages)
+            for i, row in enumerate(
+                _entries(f"extension[{j}]", powers, "a sequence of rows, one for each power")
+            )
+        )
+        for j, powers in enumerate(
+            _entries("extension", value, "a sequence with one entry for each flow")
+        )
+    )
+
+
+def _check_end(where: str, extension: Extension, beta: Product) -> None:
+    for k in range(len(beta[0])):
+        entries = [row[k] for powers in extension for row in powers]
+        end = [row[k] for row in beta]
+        if abs(_sum(entries) - _sum(end)) > _sum(map(uncertainty, entries + end)):
+            raise ValueError(
+                f"{where} must lead to the end of the step: its coefficients of stage {k} sum to "
+                f"{_rounded_sum(entries)}, and those of beta to {_rounded_sum(end)}."
+            )
 
 
 def _coefficient(where: str, value: Any) -> Coefficient:
@@ -189,17 +273,23 @@ def _rounded_sum(terms: list[Coefficient]) -> Coefficient:
 def _show_product(rows: Product) -> str:
     shown = []
     for row in rows:
-        last = max(k for k, a in enumerate(row) if a)
+        last = max((k for k, a in enumerate(row) if a), default=0)
         shown.append("(" + ", ".join(map(str, row[: last + 1])) + ")")
     return "[" + ", ".join(shown) + "]"
 
 
-def crouch_grossman(a: Iterable[Iterable[Any]], b: Iterable[Any]) -> Tableau:
+def crouch_grossman(
+    a: Iterable[Iterable[Any]],
+    b: Iterable[Any],
+    companion: Iterable[Any] | None = None,
+    extension: Iterable[Iterable[Any]] | None = None,
+) -> Tableau:
     """The Crouch-Grossman method of a Runge-Kutta tableau: one flow for each coefficient.
 
     `a` holds the rows of the stages after the first, `a[i]` with the coefficients of stages
-    0..i; `b` holds one weight for each stage. Zero coefficients cost no flow. Its order is in
-    general lower than that of the Runge-Kutta method.
+    0..i; `b` holds one weight for each stage, and so does `companion`. `extension[k][i]` is the
+    coefficient of theta^(i+1) in the weight of stage k. Zero coefficients cost no flow. Its order
+    is in general lower than that of the Runge-Kutta method.
 
     **Raises:** as `Tableau`, naming `alpha` for `a` and `beta` for `b`.
     """
@@ -207,7 +297,14 @@ def crouch_grossman(a: Iterable[Iterable[Any]], b: Iterable[Any]) -> Tableau:
     def one_flow_each(row: Iterable[Any]) -> list[list[Any]]:
         return [[0] * k + [coefficient] for k, coefficient in enumerate(row)]
 
-    return Tableau([[], *map(one_flow_each, a)], one_flow_each(b))
+    return Tableau(
+        [[], *map(one_flow_each, a)],
+        one_flow_each(b),
+        None if companion is None else one_flow_each(companion),
+        None
+        if extension is None
+        else [[[0] * k + [power] for power in powers] for k, powers in enumerate(extension)],
+    )
 
 
 def third_order_a(alpha: int | Fraction | float) -> Tableau:
@@ -279,27 +376,50 @@ def _family(parameter: Any, alpha: list[Any], beta: list[Any]) -> Tableau:
 _half, _third, _sixth, _twelfth = (Fraction(1, n) for n in (2, 3, 6, 12))
 
 # Order 1: the exponential Euler step of every Lie group method.
-LIE_EULER = Tableau([[]], [[1]])
+LIE_EULER = Tableau([[]], [[1]], extension=[[[1]]])
 
-# Order 2: the classical midpoint rule.
-CF2 = Tableau([[], [[_half]]], [[0, 1]])
+# Order 2: the classical midpoint rule. Companion of order 1, extension of order 2.
+CF2 = Tableau([[], [[_half]]], [[0, 1]], [[1]], [[[1], [-1, 1]]])
 
-# Order 3: Celledoni, Marthinsen & Owren, FGCS 19 (2003), the first family at 2/3.
-CF3 = third_order_a(Fraction(2, 3))
+# Order 3: Celledoni, Marthinsen & Owren, FGCS 19 (2003), the first family at 2/3. Companion and
+# extension of order 2.
+_cf3 = third_order_a(Fraction(2, 3))
+CF3 = Tableau(
+    _cf3.alpha,
+    _cf3.beta,
+    [[0, _half, _half]],
+    [[[_third]], [[2 * _third], [Fraction(-3, 4), 0, Fraction(3, 4)]]],
+)
 
-# Order 4: Celledoni, Marthinsen & Owren, FGCS 19 (2003), equation (7).
+# Order 4: Celledoni, Marthinsen & Owren, FGCS 19 (2003), equation (7). Companion, with the field
+# at the end of the step, and extension of order 3.
 CF4 = Tableau(
     [[], [[_half]], [[0, _half]], [[_half], [-_half, 0, 1]]],
     [
         [Fraction(1, 4), _sixth, _sixth, -_twelfth],
         [-_twelfth, _sixth, _sixth, Fraction(1, 4)],
     ],
+    [
+        [Fraction(1, 4), _sixth, _sixth, -_twelfth],
+        [-_twelfth, _sixth, _sixth, 0, Fraction(1, 4)],
+    ],
+    [
+        [[_half], [Fraction(-1, 4), _sixth, _sixth, -_twelfth]],
+        [
+            [_half],
+            [Fraction(-5, 4), 5 * _sixth, 5 * _sixth, Fraction(-5, 12)],
+            [2 * _third, -2 * _third, -2 * _third, 2 * _third],
+        ],
+    ],
 )
 
 # Order 3: Crouch & Grossman, J. Nonlinear Sci. 3 (1993); Owren & Marthinsen, BIT 39 (1999).
+# Companion, of the same sources, and extension of order 2.
 CG3 = crouch_grossman(
     [[Fraction(3, 4)], [Fraction(119, 216), Fraction(17, 108)]],
     [Fraction(13, 51), Fraction(-2, 3), Fraction(24, 17)],
+    [Fraction(17, 54), Fraction(19, 54), _third],
+    [[1, Fraction(-38, 51)], [0, Fraction(-2, 3)], [0, Fraction(24, 17)]],
 )
 
 # Order 4: Jackiewicz, Marthinsen & Owren, Adv. Comput. Math. 13 (2000).

@@ -16,10 +16,10 @@ import cfjax
 
 
 def interpolation(t0, t1, y0: Any = (1.0, 2.0), y1: Any = (3.0, 5.0), dtype=jnp.float64):
-    """That of CF4, made as diffrax makes it."""
+    """That of CG4, made as diffrax makes it."""
     y0, y1 = jnp.asarray(y0, dtype), jnp.asarray(y1, dtype)
     times = jnp.asarray(t0, dtype), jnp.asarray(t1, dtype)
-    made = cfjax.CF4().interpolation_cls(t0=times[0], t1=times[1], y0=y0, y1=y1)
+    made = cfjax.CG4().interpolation_cls(t0=times[0], t1=times[1], y0=y0, y1=y1)
     assert isinstance(made, diffrax.AbstractLocalInterpolation)
     return made
 
@@ -108,7 +108,7 @@ def test_single_precision():
 
 def test_a_pytree_in_a_batch():
     def evaluate(t):
-        made = cfjax.CF4().interpolation_cls(
+        made = cfjax.CG4().interpolation_cls(
             t0=jnp.asarray(0.0),
             t1=jnp.asarray(1.0),
             y0={"a": jnp.zeros(3), "b": (jnp.zeros((2, 2)),)},

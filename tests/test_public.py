@@ -23,16 +23,29 @@ PROMISED = [
     "CF2",
     "CF3",
     "CF4",
+    "CF43",
+    "CF54",
     "CG3",
     "CG4",
     "CG5",
+    "BWRRK33",
+    "BWRRK53",
+    "CFEES25",
+    "CFEES27",
+    "CK34",
+    "CK54",
+    "Luscher3",
+    "Williamson3",
+    "YRK135",
     "RKMK3",
     "RKMK4",
     "RKMK",
     "CayleyRK4",
     "integrate",
+    "ErrorNorm",
+    "starting_step",
 ]
-SOLVERS = ["LieEuler", "CF2", "CF3", "CF4", "CG3", "CG4", "CG5", "RKMK3", "RKMK4", "CayleyRK4"]
+SOLVERS = [*PROMISED[PROMISED.index("LieEuler") : PROMISED.index("RKMK")], "CayleyRK4"]
 PUBLIC = [
     name
     for name, value in vars(cfjax).items()

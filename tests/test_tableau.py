@@ -51,7 +51,7 @@ def test_every_kind_of_nested_sequence_gives_the_same_tableau():
 
 def test_rows_of_zeros_are_dropped_and_short_rows_padded():
     tableau = Tableau([[], [[0], [HALF], [0, 0]]], [[0, 0], [0, 1], []])
-    assert tableau == CF2
+    assert (tableau.alpha, tableau.beta) == (CF2.alpha, CF2.beta)
     assert all(len(row) == 2 for row in (*tableau.alpha[1], *tableau.beta))
 
 
@@ -70,7 +70,12 @@ def test_numpy_float32_is_converted_without_loss():
 
 @named
 def test_is_compared_and_hashed_by_value(tableau):
-    again = Tableau([list(map(list, rows)) for rows in tableau.alpha], tableau.beta)
+    again = Tableau(
+        [list(map(list, rows)) for rows in tableau.alpha],
+        tableau.beta,
+        tableau.companion,
+        tableau.extension,
+    )
     assert again is not tableau
     assert again == tableau
     assert hash(again) == hash(tableau)
@@ -88,13 +93,20 @@ def test_is_frozen():
 
 
 def test_replace_checks_again():
-    assert dataclasses.replace(CF2, beta=[[HALF, HALF]]).beta == ((HALF, HALF),)
+    tableau = Tableau(CF2.alpha, CF2.beta)
+    assert dataclasses.replace(tableau, beta=[[HALF, HALF]]).beta == ((HALF, HALF),)
     with pytest.raises(ValueError, match="beta must sum to 1"):
-        dataclasses.replace(CF2, beta=[[HALF]])
+        dataclasses.replace(tableau, beta=[[HALF]])
+    with pytest.raises(ValueError, match="extension must lead to the end"):
+        dataclasses.replace(CF2, beta=[[HALF, HALF]])
 
 
 def test_repr_is_short():
-    assert repr(CF3) == "Tableau(alpha=[[], [(1/3)], [(0, 2/3)]], beta=[(1/3), (-1/12, 0, 3/4)])"
+    family = third_order_a(Fraction(2, 3))
+    assert repr(family) == "Tableau(alpha=[[], [(1/3)], [(0, 2/3)]], beta=[(1/3), (-1/12, 0, 3/4)])"
+    assert repr(CF2) == (
+        "Tableau(alpha=[[], [(1/2)]], beta=[(0, 1)], companion=[(1)], extension=[[(1), (-1, 1)]])"
+    )
 
 
 # Derived facts
@@ -158,7 +170,49 @@ def test_crouch_grossman():
     assert tableau == Tableau([[], [[HALF]], [[0, HALF]]], [[0, 0, 1]])
     tableau = crouch_grossman([[1]], [HALF, HALF])
     assert tableau == Tableau([[], [[1]]], [[HALF], [0, HALF]])
-    assert crouch_grossman([], [1]) == LIE_EULER
+    assert crouch_grossman([], [1]) == Tableau([[]], [[1]])
+    tableau = crouch_grossman([[1]], [HALF, HALF], [1, 0], [[1, -HALF], [0, HALF]])
+    assert tableau.companion == ((1, 0, 0),)
+    assert tableau.extension == (((1, 0, 0), (-HALF, 0, 0)), ((0, 0, 0), (0, HALF, 0)))
+
+
+# Companion and extension
+
+
+@pytest.mark.parametrize(
+    "name, companion_flows, last", [("CF3", 1, False), ("CF4", 1, True), ("CG3", 3, False)]
+)
+def test_what_a_companion_costs(name, companion_flows, last):
+    tableau = NAMED[name]
+    assert tableau.num_companion_flows == companion_flows
+    assert tableau.first_same_as_last is last
+    assert tableau.companion_method.alpha[-1][0][: tableau.num_stages] == tableau.beta[0]
+
+
+def test_without_a_companion_there_is_no_method():
+    assert CG4.companion_method is None and CG4.num_companion_flows == 0
+    assert not CG4.first_same_as_last
+
+
+@pytest.mark.parametrize(
+    "more, message",
+    [
+        ({"companion": [[HALF]]}, r"companion must sum to 1 .* got a sum of 1/2"),
+        ({"companion": [[0, 0, 0, 1]]}, r"companion\[0\] must have at most 3 entries"),
+        ({"companion": [[float("nan"), 1]]}, r"companion\[0\]\[0\] must be finite"),
+        ({"extension": [[[1]]]}, r"extension must lead to the end.* stage 0 sum to 1, .* to 0"),
+        ({"extension": [[[0, 0, 0, 1]]]}, r"extension\[0\]\[0\] must have at most 3 entries"),
+    ],
+)
+def test_a_mistaken_companion_or_extension(more, message):
+    with pytest.raises(ValueError, match=message):
+        Tableau([[], [[HALF]]], [[0, 1]], **more)
+
+
+@pytest.mark.parametrize("more", [{"companion": 1}, {"extension": [1]}, {"extension": "ab"}])
+def test_a_companion_or_extension_of_wrong_type(more, no_shape_hook):
+    with pytest.raises(TypeError, match=f"{next(iter(more))}.* must be a"):
+        Tableau([[], [[HALF]]], [[0, 1]], **more)
 
 
 # The two families
@@ -188,7 +242,7 @@ def test_second_family_costs_three_flows(alpha):
 
 
 def test_families_at_known_members():
-    assert third_order_a(Fraction(2, 3)) == CF3
+    assert third_order_a(Fraction(2, 3)) == Tableau(CF3.alpha, CF3.beta)
     assert third_order_a(1) == Tableau(
         [[], [[THIRD]], [[-1, 2]]], [[THIRD], [-THIRD, Fraction(3, 4), Fraction(1, 4)]]
     )

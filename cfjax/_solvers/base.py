@@ -9,7 +9,7 @@ import equinox as eqx
 import jax.numpy as jnp
 import jax.tree_util as jtu
 from jax import lax
-from jaxtyping import Array, Inexact, PyTree
+from jaxtyping import Array, Inexact, PyTree, Real
 
 from .._components import by_components
 from .._dense import NodeInterpolation
@@ -29,13 +29,30 @@ class AbstractLieSolver(diffrax.AbstractSolver):
     """
 
     term_structure: ClassVar = diffrax.AbstractTerm
-    interpolation_cls: ClassVar[Callable[..., NodeInterpolation]] = NodeInterpolation
+
+    interpolation_cls: ClassVar[Callable[..., diffrax.AbstractLocalInterpolation]] = (
+        NodeInterpolation
+    )
+
+    @property
+    def first_same_as_last(self) -> bool:
+        """Whether the last evaluation of a step is the first one of the next step."""
+        return False
 
     @abc.abstractmethod
-    def end_point(self, field: Callable[[float, PyTree], PyTree], y0: PyTree) -> PyTree:
-        """The end of a step from `y0`; `field(c, y)` is `h f(t + c h, y)`, a frozen field."""
+    def move(self, field: Callable[[Any, PyTree], PyTree], y0: PyTree) -> "Move":
+        """A step from `y0`; `field(c, y)` is `h f(t + c h, y)`, a frozen field."""
 
     def init(self, terms, t0, t1, y0, args) -> PyTree:
+        """What the compensated sums have lost; and the field at `y0`, where a step reuses it."""
+        lost = self._no_loss(terms, t0, t1, y0, args)
+        return (lost, terms.vf(t0, y0, args)) if self.first_same_as_last else lost
+
+    def without_estimate(self) -> "AbstractLieSolver":
+        """The same method for steps that nobody controls: it keeps nothing for an estimate."""
+        return self
+
+    def _no_loss(self, terms, t0, t1, y0, args) -> PyTree:
         """Zeros for the compensated parts of the state, and None for the others."""
         if all(jnp.ndim(leaf) < 2 for leaf in jtu.tree_leaves(y0)):
             return jtu.tree_map(lambda y: None, y0)
@@ -54,39 +71,67 @@ class AbstractLieSolver(diffrax.AbstractSolver):
         )
 
     def step(self, terms, t0, t1, y0, args, solver_state, made_jump):
-        del made_jump
+        lost, first = solver_state, None
+        if self.first_same_as_last and solver_state is not None:
+            lost, first = solver_state
+        if first is not None and made_jump is not False:
+            first = _select(made_jump, lambda: terms.vf(t0, y0, args), first)
 
-        def end_point(y0):
+        def move(y0):
             control = terms.contr(t0, t1)
+            values = []
 
-            def field(c: float, y: PyTree) -> PyTree:
-                # The end of the step exactly, not up to rounding: the field may jump there.
-                t = t1 if c == 1 else t0 + c * (t1 - t0)
-                return terms.prod(terms.vf(t, value(y), args), control)
+            def field(c: float | Real[Array, ""], y: PyTree) -> PyTree:
+                if values or first is None:
+                    # The end of the step exactly, not up to rounding: the field may jump there.
+                    if isinstance(c, float):
+                        t = t1 if c == 1 else t0 + c * (t1 - t0)
+                    else:
+                        c = jnp.asarray(c, jnp.result_type(t0))
+                        t = jnp.where(c == 1, t1, t0 + c * (t1 - t0))
+                    values.append(terms.vf(t, value(y), args))
+                else:
+                    values.append(first)
+                return terms.prod(values[-1], control)
 
             start = jtu.tree_map(
-                lambda lost, y: y if lost is None else _at_rest(y),
-                solver_state,
-                y0,
-                is_leaf=_is_none,
+                lambda lost, y: y if lost is None else _at_rest(y), lost, y0, is_leaf=_is_none
             )
-            return self.end_point(field, start)
+            made = self.move(field, start)
+            return made, None if first is None else values[-1]
 
-        end = by_components(end_point, y0)
+        made, last = by_components(move, y0)
         sums = jtu.tree_map(
             lambda lost, p: (p, None) if lost is None else _sum(p, lost),
-            solver_state,
-            end,
+            lost,
+            made.end,
             is_leaf=_is_none,
         )
-        y1, lost = (
-            jtu.tree_map(lambda _, pair: pair[k], solver_state, sums, is_leaf=_is_none)  # noqa: B023
+        y1, new_lost = (
+            jtu.tree_map(lambda _, pair: pair[k], lost, sums, is_leaf=_is_none)  # noqa: B023
             for k in range(2)
         )
-        return y1, None, dict(y0=y0, y1=y1), lost, diffrax.RESULTS.successful
+        has_two = self.first_same_as_last and solver_state is not None
+        solver_state = (new_lost, last) if has_two else new_lost
+        dense_info = dict(y0=y0, y1=y1, **made.dense)
+        return y1, made.error, dense_info, solver_state, diffrax.RESULTS.successful
 
     def func(self, terms, t0, y0, args) -> Any:
         return terms.vf(t0, y0, args)
+
+
+class Move(eqx.Module):
+    """A step: where it ends, an estimate of its error, and what output within it needs."""
+
+    end: PyTree
+    error: PyTree = None
+    dense: dict[str, Any] = eqx.field(default_factory=dict)
+
+
+def _select(made_jump: Any, anew: Callable[[], PyTree], kept: PyTree) -> PyTree:
+    if made_jump is True:
+        return anew()
+    return lax.cond(made_jump, anew, lambda: kept)
 
 
 def _is_none(x: Any) -> bool:

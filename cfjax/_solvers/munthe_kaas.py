@@ -23,7 +23,7 @@ from .._frozen_field import (
     without_bracket,
 )
 from .._order_conditions import runge_kutta_order
-from .base import AbstractLieSolver
+from .base import AbstractLieSolver, Move
 
 
 class AbstractMuntheKaas(AbstractLieSolver):
@@ -33,9 +33,9 @@ class AbstractMuntheKaas(AbstractLieSolver):
     def increment(self, field: Callable[[float, PyTree], PyTree]) -> PyTree:
         """The element v; `field(c, u)` is `h f(t + c h, exp(u) y0)`, and `u = None` means zero."""
 
-    def end_point(self, field, y0):
+    def move(self, field, y0):
         v, start = self.logarithm(field, y0)
-        return leave(v, flow(v, start))
+        return Move(leave(v, flow(v, start)))
 
     def logarithm(self, field: Callable[[float, PyTree], PyTree], y0: PyTree) -> Any:
         """The element v with the end of the step `exp(v) y0`, and y0, in the step's coordinates."""

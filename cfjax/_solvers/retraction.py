@@ -7,7 +7,7 @@ from jaxtyping import Array, Float, PyTree
 
 from .._fields.low_rank import BorderedSkew, LowRankSkew
 from .._frozen_field import combine, is_field, tangent
-from .base import AbstractLieSolver
+from .base import AbstractLieSolver, Move
 
 
 class CayleyRK4(AbstractLieSolver):
@@ -31,7 +31,7 @@ class CayleyRK4(AbstractLieSolver):
     def order(self, terms) -> int:
         return 4
 
-    def end_point(self, field, y0):
+    def move(self, field, y0):
         first = field(0.0, y0)
         _check(first)
         curved = jtu.tree_map(is_field, first, is_leaf=is_field)
@@ -53,7 +53,7 @@ class CayleyRK4(AbstractLieSolver):
         k2 = rate(0.5, combine((1 / 2,), (k1,)))
         k3 = rate(0.5, combine((1 / 2,), (k2,)))
         k4 = rate(1.0, k3)
-        return end(combine((1 / 6, 1 / 3, 1 / 3, 1 / 6), (k1, k2, k3, k4)))
+        return Move(end(combine((1 / 6, 1 / 3, 1 / 3, 1 / 6), (k1, k2, k3, k4))))
 
 
 def _check(field: PyTree) -> None:

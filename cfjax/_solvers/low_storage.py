@@ -1,0 +1,246 @@
+"""Low-storage methods: one point and one sum of fields, whatever the number of stages."""
+
+from collections.abc import Callable
+from fractions import Fraction
+from typing import Any, ClassVar
+
+import jax.numpy as jnp
+import jax.tree_util as jtu
+from jax import lax
+
+from .._frozen_field import combine, enter, flow
+from .._frozen_field import value as value_of
+from .._tableau import Product, Row, Tableau
+from .base import Move
+from .commutator_free import AbstractCommutatorFree, minus, trimmed
+
+# Unrolled stages cost compile time quadratically. And XLA keeps the fields of several of them, to
+# add them up at once: as many as fit in a cache may be.
+_MAX_UNROLLED = 5
+_LARGE = 4096
+
+
+class AbstractLowStorage(AbstractCommutatorFree):
+    """`d <- a[i] d + h f(t + c[i] h, Y)`, `Y <- exp(b[i] d) Y` for every stage i, with a[0] = 0.
+
+    That takes two copies of the state's size, the point and the sum of fields that moves it.
+    Fields in coordinates of a step (`LowRankSkew`) need the memory of all stages all the same.
+    """
+
+    a: ClassVar[Row]
+    b: ClassVar[Row]
+
+    def element(self, rows, fields, kept):
+        i = len(rows) - 1
+        if trimmed(self.tableau.beta)[: i + 1] != rows:
+            # A flow of the companion's own.
+            return super().element(rows, fields, kept)
+        if i not in kept:
+            both = (float(self.a[i]), 1.0)
+            kept[i] = combine(both, (kept[i - 1], fields[i])) if i else fields[0]
+        return combine((float(self.b[i]),), (kept[i],))
+
+    def move(self, field, y0):
+        companion = None if self.estimate is None else self.tableau.companion
+        penultimate = companion is not None and trimmed(companion) == trimmed(
+            self.tableau.beta[:-1]
+        )
+        other = companion is not None and not (penultimate and self.estimate == "group")
+        size = sum(jnp.size(leaf) for leaf in jtu.tree_leaves(value_of(y0)))
+        if other or (len(self.b) <= _MAX_UNROLLED and size <= _LARGE):
+            return super().move(field, y0)
+        value = field(0.0, y0)
+        total, point = enter(value, y0, ())
+        if jtu.tree_structure((total, point)) != jtu.tree_structure((value, y0)):
+            return super().move(lambda c, y: value if y is y0 else field(c, y), y0)
+
+        def stage(carry, coefficients):
+            a, b, c = coefficients
+            total, point, _ = carry
+            total = combine((a, 1.0), (total, field(c, point)))
+            return (total, flow(combine((b,), (total,)), point), point), None
+
+        after = flow(combine((float(self.b[0]),), (total,)), point)
+        coefficients = tuple(
+            jnp.asarray([float(x) for x in row[1:]]) for row in (self.a, self.b, self.tableau.c)
+        )
+        (_, end, before), _ = lax.scan(stage, (total, after, point), coefficients)
+        return Move(end, minus(end, before) if penultimate else None)
+
+
+def _tableau(a: Row, b: Row, companion: Callable[[Product], Any] | None = None) -> Tableau:
+    """The method in the usual form; `companion` is a function of the end point's rows."""
+    rows: list[Any] = []
+    total: list[Any] = []
+    for factor, weight in zip(a, b, strict=True):
+        total = [*(Fraction(factor) * entry for entry in total), Fraction(1)]
+        row = [Fraction(weight) * entry for entry in total]
+        # Rounded once, where the coefficients are.
+        rows.append(row if isinstance(b[0], Fraction) else list(map(float, row)))
+    stages = [rows[:r] for r in range(len(rows))]
+    return Tableau(stages, rows, None if companion is None else companion(tuple(rows)))
+
+
+class Williamson3(AbstractLowStorage):
+    """Order 3, 3 evaluations, 3 flows.
+
+    Source: Williamson, J. Comput. Phys. 35 (1980); Bazavov, BIT 62 (2022).
+    """
+
+    a: ClassVar[Row] = (Fraction(0), Fraction(-5, 9), Fraction(-153, 128))
+    b: ClassVar[Row] = (Fraction(1, 3), Fraction(15, 16), Fraction(8, 15))
+    tableau: ClassVar[Tableau] = _tableau(a, b)
+
+
+class BWRRK33(AbstractLowStorage):
+    """Order 3, 3 evaluations, 3 flows.
+
+    Source: Bazavov, BIT 62 (2022).
+    """
+
+    a: ClassVar[Row] = (Fraction(0), -0.637694471842202, -1.306647717737108)
+    b: ClassVar[Row] = (0.457379997569388, 0.925296410920922, 0.393813594675071)
+    tableau: ClassVar[Tableau] = _tableau(a, b)
+
+
+class BWRRK53(AbstractLowStorage):
+    """Order 3, 5 evaluations, 5 flows. The estimate, of order 2, costs nothing.
+
+    Source: Bazavov, BIT 62 (2022).
+    """
+
+    a: ClassVar[Row] = (
+        Fraction(0),
+        Fraction(-5, 8),
+        Fraction(-4, 3),
+        Fraction(-3, 4),
+        Fraction(-8, 5),
+    )
+    b: ClassVar[Row] = (
+        Fraction(1, 4),
+        Fraction(2, 3),
+        Fraction(1, 2),
+        Fraction(2, 5),
+        Fraction(1, 9),
+    )
+    tableau: ClassVar[Tableau] = _tableau(a, b, lambda rows: rows[:-1])
+
+
+class CK34(AbstractLowStorage):
+    """Order 3, 4 evaluations, 4 flows. The estimate, of order 2, costs nothing.
+
+    Source: Carpenter & Kennedy, NASA TM-109112 (1994).
+    """
+
+    a: ClassVar[Row] = (Fraction(0), -0.7825460361923583, -2.042914325731225, -1.799337253940777)
+    b: ClassVar[Row] = (
+        0.06688758201974097,
+        2.876554598956719,
+        0.5534657361343982,
+        0.3912730180961791,
+    )
+    tableau: ClassVar[Tableau] = _tableau(a, b, lambda rows: rows[:-1])
+
+
+class CK54(AbstractLowStorage):
+    """Order 4, 5 evaluations, 5 flows.
+
+    Source: Carpenter & Kennedy, NASA TM-109112 (1994).
+    """
+
+    a: ClassVar[Row] = (
+        Fraction(0),
+        -567301805773 / 1357537059087,
+        -2404267990393 / 2016746695238,
+        -3550918686646 / 2091501179385,
+        -1275806237668 / 842570457699,
+    )
+    b: ClassVar[Row] = (
+        1432997174477 / 9575080441755,
+        5161836677717 / 13612068292357,
+        1720146321549 / 2090206949498,
+        3134564353537 / 4481467310338,
+        2277821191437 / 14882151754819,
+    )
+    tableau: ClassVar[Tableau] = _tableau(a, b)
+
+
+class Luscher3(AbstractLowStorage):
+    """Order 3, 3 evaluations, 3 flows. The estimate, of order 2, costs 1 flow more, and two more
+    copies of the state.
+
+    Source: Luscher, JHEP 08 (2010) 071; estimate: Fritzsch & Ramos, JHEP 10 (2013) 008.
+    """
+
+    a: ClassVar[Row] = (Fraction(0), Fraction(-17, 32), Fraction(-32, 27))
+    b: ClassVar[Row] = (Fraction(1, 4), Fraction(8, 9), Fraction(3, 4))
+    tableau: ClassVar[Tableau] = _tableau(a, b, lambda rows: [[-1, 2]])
+
+
+class YRK135(AbstractLowStorage):
+    """Order 5, 13 evaluations, 13 flows.
+
+    Source: Yan (2017); Bazavov, BIT 62 (2022).
+    """
+
+    a: ClassVar[Row] = (
+        Fraction(0),
+        -0.3367214311942741,
+        -1.2018205782908165,
+        -2.6261919625495067,
+        -1.5418507843260567,
+        -0.2845614242371758,
+        -0.1700096844304301,
+        -1.0839412680446805,
+        -11.61787957751822,
+        -4.520520805746419,
+        -35.86177355832474,
+        -2.1340899996007288e-05,
+        -0.06631151668786135,
+    )
+    b: ClassVar[Row] = (
+        0.0696326402470594,
+        0.08891846277809203,
+        1.046149012342678,
+        0.42761794305080486,
+        0.20975844551667144,
+        -0.11457151862012135,
+        -0.01392019988507068,
+        4.033065562695671,
+        0.3510684675245716,
+        -0.16066651367556575,
+        -0.005863316322503893,
+        0.07729613386515187,
+        0.054301254676908335,
+    )
+    tableau: ClassVar[Tableau] = _tableau(a, b)
+
+
+class CFEES25(AbstractLowStorage):
+    """Order 2, 3 evaluations, 3 flows; a step back undoes it to order 5. The estimate, of order 1,
+    costs 1 flow more, and one more copy of the state.
+
+    Source: Shmelev, Thompson & Salvi, arXiv:2509.20599 (2025).
+    """
+
+    a: ClassVar[Row] = (Fraction(0), Fraction(-7, 15), Fraction(-35, 32))
+    b: ClassVar[Row] = (Fraction(1, 3), Fraction(15, 16), Fraction(2, 5))
+    tableau: ClassVar[Tableau] = _tableau(
+        a, b, lambda rows: [*rows[:-1], [Fraction(5, 48), Fraction(1, 16)]]
+    )
+
+
+class CFEES27(AbstractLowStorage):
+    """Order 2, 4 evaluations, 4 flows; a step back undoes it to order 7.
+
+    Source: Shmelev, Thompson & Salvi, arXiv:2509.20599 (2025).
+    """
+
+    a: ClassVar[Row] = (Fraction(0), -0.4477152501692066, -0.9225889843221229, -1.205283153123382)
+    b: ClassVar[Row] = (
+        0.19526214587563498,
+        0.6767766952966369,
+        0.6796227589829593,
+        0.23879612503625855,
+    )
+    tableau: ClassVar[Tableau] = _tableau(a, b)

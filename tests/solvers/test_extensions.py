@@ -1,0 +1,340 @@
+"""Output within the steps: orders, the manifold, the nodes, events."""
+
+from fractions import Fraction
+from functools import lru_cache
+from typing import Any
+
+import diffrax
+import jax
+import jax.numpy as jnp
+import jax.tree_util as jtu
+import numpy as np
+import optimistix as optx
+import problems
+import pytest
+from scipy.integrate import solve_ivp
+
+import cfjax
+
+# The uniform order of each extension, one below that of the method but for the simplest two.
+EXTENDED: dict[str, Any] = {
+    "LieEuler": (cfjax.LieEuler(), 1),
+    "CF2": (cfjax.CF2(), 2),
+    "CF3": (cfjax.CF3(), 2),
+    "CF4": (cfjax.CF4(), 3),
+    "CF43": (cfjax.CF43(), 3),
+    "CF54": (cfjax.CF54(), 4),
+    "CG3": (cfjax.CG3(), 2),
+}
+methods = pytest.mark.parametrize("solver, order", EXTENDED.values(), ids=EXTENDED)
+BODY = problems.driven_body, jnp.asarray(problems.MOMENTUM), jnp.asarray(problems.INERTIA)
+
+
+# The order conditions, evaluated on their own: words of trees, their weights by recursion.
+
+
+@lru_cache
+def words(n):
+    if n == 0:
+        return [()]
+    return [(t, *w) for k in range(1, n + 1) for t in words(k - 1) for w in words(n - k)]
+
+
+def size(word):
+    return sum(1 + size(tree) for tree in word)
+
+
+def exact(word):
+    if not word:
+        return Fraction(1)
+    return exact(word[:-1]) * exact(word[-1]) / size(word)
+
+
+@methods
+def test_the_order_conditions_of_the_extension(solver, order):
+    """Its weights must be `theta^n` times those of the exact solution, for words of order n."""
+    tableau = solver.tableau
+    # Exact where the tableau is; Fraction(2) / 3 and 2.0 / 3 are both right below.
+    number = Fraction if tableau.is_exact else float
+    products = [[list(map(number, r)) for r in p] for p in (*tableau.alpha, tableau.beta)]
+
+    @lru_cache(None)
+    def stage(k, tree):
+        return weigher(products[k])(tree, len(products[k]))
+
+    def weigher(rows):
+        @lru_cache(None)
+        def weight(word, j):
+            """Over all splits of the word's letters into one group for each of j flows."""
+            if not word or not j:
+                return number(not word)
+            total = number(0)
+            for i in range(len(word) + 1):
+                term = weight(word[:i], j - 1)
+                for m, tree in enumerate(word[i:], 1):
+                    term *= sum(a * stage(k, tree) for k, a in enumerate(rows[j - 1]) if a) / m
+                total += term
+            return total
+
+        return weight
+
+    def defect(n, theta):
+        rows = [
+            [
+                sum(number(a) * theta ** (i + 1) for i, a in enumerate(column))
+                for column in zip(*powers, strict=True)
+            ]
+            for powers in tableau.extension
+        ]
+        weight = weigher(rows)
+        return max(abs(weight(w, len(rows)) - theta**n * number(exact(w))) for w in words(n))
+
+    for theta in (number(1) / 7, number(1) / 2, number(1)):
+        for n in range(1, order + 1):
+            # Coefficients up to 10 that are rounded, in products of up to four; or exact.
+            assert defect(n, theta) <= (0 if tableau.is_exact else 1e-14)
+    # And no more than that.
+    assert defect(order + 1, number(1) / 2) > 1e-5
+
+
+def dense(solver, n, field, y0, args, t1=1.0, **kwargs):
+    return diffrax.diffeqsolve(
+        cfjax.LieTerm(field),
+        solver,
+        0.0,
+        t1,
+        t1 / n,
+        y0,
+        args,
+        max_steps=n + 1,
+        saveat=diffrax.SaveAt(dense=True),
+        **kwargs,
+    )
+
+
+@methods
+def test_the_error_between_the_steps_falls_with_the_order_of_the_solution(solver, order):
+    """Within one step like h^(order + 1), so it keeps the order of the solution."""
+    steps = np.array([4, 8, 16, 32])
+    thetas = np.array([0.21, 0.5, 0.83])
+    field, y0, args = BODY
+
+    @jax.jit
+    def point(h, theta):
+        times = jnp.asarray(0.0), h
+        info = solver.step(cfjax.LieTerm(field), *times, y0, args, None, made_jump=False)[2]
+        return solver.interpolation_cls(t0=times[0], t1=times[1], **info).evaluate(theta * h)
+
+    errors = []
+    for n in steps:
+        h = 1 / (4 * n)
+        answer = solve_ivp(
+            lambda t, y: problems.driven_body_ode(t, y, problems.INERTIA),
+            (0, h),
+            problems.MOMENTUM,
+            method="DOP853",
+            rtol=2.3e-14,
+            atol=1e-16,
+            t_eval=thetas * h,
+        ).y.T
+        found = [point(jnp.asarray(h), jnp.asarray(theta)) for theta in thetas]
+        errors.append(np.linalg.norm(np.array(found) - answer))
+    errors = np.array(errors)
+    kept = errors > 3e-15
+    assert kept.sum() >= 3
+    slope = problems.slope(steps[kept], errors[kept])
+    assert abs(slope - (order + 1)) < 0.15
+
+
+@pytest.mark.parametrize("name", ["CF4", "CF54"])
+def test_random_times_are_on_the_manifold_and_nodes_are_the_steps(name):
+    solver, _ = EXTENDED[name]
+    field, y0, args = BODY
+    n = 8
+    sol = dense(solver, n, field, y0, args)
+    times = np.random.default_rng(0).uniform(0, 1, 200)
+    ys = jax.vmap(sol.evaluate)(jnp.asarray(times))
+    lengths = np.linalg.norm(ys, axis=1)
+    assert np.abs(lengths - np.linalg.norm(y0)).max() < 1e-13
+    steps = diffrax.diffeqsolve(
+        cfjax.LieTerm(field),
+        solver,
+        0.0,
+        1.0,
+        1 / n,
+        y0,
+        args,
+        saveat=diffrax.SaveAt(t0=True, steps=True),
+        max_steps=n,
+    )
+    for left in (True, False):
+        for t, y in zip(steps.ts, steps.ys, strict=True):
+            # The same flows in another order of rounding.
+            np.testing.assert_allclose(sol.evaluate(t, left=left), y, rtol=0, atol=1e-14)
+    saved = diffrax.diffeqsolve(
+        cfjax.LieTerm(field),
+        solver,
+        0.0,
+        1.0,
+        1 / n,
+        y0,
+        args,
+        saveat=diffrax.SaveAt(ts=jnp.sort(jnp.asarray(times))),
+        max_steps=n,
+    )
+    np.testing.assert_allclose(saved.ys, ys[np.argsort(times)], rtol=0, atol=1e-14)
+
+
+@pytest.mark.parametrize("name, direction", [("CF3", 1), ("CF4", -1), ("CF54", 1)])
+def test_derivatives_in_time(name, direction):
+    solver, order = EXTENDED[name]
+    field, y0, args = BODY
+    n = 16
+    sol = dense(solver, n, field, y0, args, t1=float(direction))
+    for t in (0.0, 0.03, 0.5, 0.97, 1.0):
+        t = direction * t
+        h = 1e-3 / n
+        found = sol.derivative(t)
+        # The velocity of the field at the point: to the order of the extension.
+        w = problems.driven_body_ode(t, np.asarray(sol.evaluate(t)), problems.INERTIA)
+        np.testing.assert_allclose(found, w, rtol=0, atol=3 * (1 / n) ** order)
+        if 0 < abs(t) < 1 and t * n % 1:
+            change = [sol.evaluate(t + k * h) for k in (-2, -1, 1, 2)]
+            slope = ((change[0] - change[3]) - 8 * (change[1] - change[2])) / (12 * h)
+            np.testing.assert_allclose(found, slope, rtol=0, atol=1e-9)
+
+
+def test_a_product_of_manifolds():
+    y0, args = problems.arrays(problems.FLIGHT_START), problems.arrays(problems.FLIGHT_ARGS)
+    sol = dense(cfjax.CF4(), 32, problems.body_in_flight, y0, args)
+    t = 0.517
+    answer = problems.reference(
+        lambda t, y: problems.body_in_flight_ode(t, y, problems.FLIGHT_ARGS),
+        0.0,
+        t,
+        problems.flat(problems.FLIGHT_START),
+    )
+    found = sol.evaluate(t)
+    np.testing.assert_allclose(problems.flat(found), answer, rtol=0, atol=1e-6)
+    q = np.asarray(found["attitude"])
+    np.testing.assert_allclose(q.T @ q, np.eye(3), rtol=0, atol=1e-14)
+
+
+def test_frames_in_coordinates_of_their_own(no_shape_hook):
+    """Low-rank fields share the columns of a step, also after diffrax has stored them."""
+    rng = np.random.default_rng(1)
+    y0 = jnp.asarray(np.linalg.qr(rng.standard_normal((12, 2)))[0])
+    scale = jnp.linspace(1.0, 2.0, 12)[:, None]
+
+    def field(t, y, args):
+        return cfjax.LowRankSkew(jnp.cos(t) * scale * y + jnp.roll(y, 1, axis=0))
+
+    def ode(t, y):
+        y = y.reshape(12, 2)
+        g = np.cos(t) * np.asarray(scale) * y + np.roll(y, 1, axis=0)
+        return ((g @ y.T - y @ g.T) @ y).ravel()
+
+    t = 0.637
+    answer = problems.reference(ode, 0.0, t, np.asarray(y0).ravel()).reshape(12, 2)
+    errors = []
+    for n in (20, 40):
+        sol = dense(cfjax.CF4(), n, field, y0, None)
+        found = np.asarray(sol.evaluate(t))
+        np.testing.assert_allclose(found.T @ found, np.eye(2), rtol=0, atol=1e-14)
+        errors.append(np.linalg.norm(found - answer))
+    assert errors[1] < 1e-6 and errors[0] < 1e-4
+    arrays = jtu.tree_leaves(sol.interpolation.infos["path"])
+    # The frame, and g of five evaluations: none of them twice.
+    assert sum(leaf.shape[1:] == (12, 2) for leaf in arrays) <= 7
+    adaptive = diffrax.diffeqsolve(
+        cfjax.LieTerm(field),
+        cfjax.CF4(),
+        0.0,
+        t,
+        0.1,
+        y0,
+        stepsize_controller=diffrax.PIDController(rtol=0.0, atol=1e-8),
+    )
+    assert np.linalg.norm(adaptive.ys[-1] - answer) < 1e-6
+
+
+# Events: a pendulum on the sphere, position q and angular velocity w
+
+
+def pendulum(t, y, gravity):
+    torque = gravity * jnp.stack([-y["q"][1], y["q"][0], jnp.zeros(())])
+    return {"q": cfjax.Rotation(y["w"]), "w": torque}
+
+
+def pendulum_ode(gravity):
+    def ode(t, y):
+        q, w = y[:3], y[3:]
+        return np.concatenate([np.cross(w, q), gravity * np.array([-q[1], q[0], 0.0])])
+
+    return ode
+
+
+@pytest.mark.parametrize("name", ["CF4"])
+def test_a_pendulum_passes_a_plane_on_the_sphere_at_the_right_time(name):
+    gravity = 2.0
+    y0 = {"q": jnp.asarray([0.6, 0.0, -0.8]), "w": jnp.asarray([0.3, 1.0, 0.2])}
+
+    def height(t, y, args, **kwargs):
+        return y["q"][1] - 0.25
+
+    def crossing(t, y):
+        return y[1] - 0.25
+
+    crossing.terminal = True
+    answer = solve_ivp(
+        pendulum_ode(gravity),
+        (0, 20),
+        problems.flat(y0),
+        method="DOP853",
+        rtol=2.3e-14,
+        atol=1e-15,
+        events=crossing,
+    )
+    time = answer.t_events[0][0]
+    event = diffrax.Event(height, optx.Newton(rtol=1e-12, atol=1e-12))
+    sol = diffrax.diffeqsolve(
+        cfjax.LieTerm(pendulum),
+        EXTENDED[name][0],
+        0.0,
+        20.0,
+        0.01,
+        y0,
+        jnp.asarray(gravity),
+        event=event,
+        stepsize_controller=diffrax.PIDController(rtol=0.0, atol=1e-10),
+        max_steps=10_000,
+    )
+    assert sol.result == diffrax.RESULTS.event_occurred
+    # The error of the solution at this tolerance; the root itself is found to 1e-12.
+    assert abs(float(sol.ts[-1]) - time) < 1e-8
+    assert abs(float(sol.ys["q"][-1, 1]) - 0.25) < 1e-11
+    assert abs(np.linalg.norm(sol.ys["q"][-1]) - 1) < 1e-14
+
+
+def test_gradients_through_output_between_steps():
+    field, y0, args = BODY
+
+    def saved(y0):
+        sol = diffrax.diffeqsolve(
+            cfjax.LieTerm(field),
+            cfjax.CF4(),
+            0.0,
+            1.0,
+            0.25,
+            y0,
+            args,
+            max_steps=4,
+            saveat=diffrax.SaveAt(ts=jnp.asarray([0.3, 0.61])),
+        )
+        return jnp.sum(jnp.sin(sol.ys))
+
+    gradient = jax.jit(jax.grad(saved))(y0)
+    direction = problems.random_like(y0, 3)
+    # 1e-3: the difference is good to 1e-12 and 1e-13 of rounding.
+    expected = problems.central_difference(jax.jit(saved), y0, direction, 1e-3)
+    assert abs(problems.inner(gradient, direction) - expected) < 1e-10

@@ -1,0 +1,117 @@
+"""Low-storage methods: the same step as their tableau's, in two copies of the state."""
+
+from typing import Any
+
+import diffrax
+import jax
+import jax.numpy as jnp
+import numpy as np
+import problems
+import pytest
+
+import cfjax
+
+# Orders, and those of the companions.
+METHODS: dict[str, Any] = {
+    "Williamson3": (3, None),
+    "BWRRK33": (3, None),
+    "BWRRK53": (3, 2),
+    "CK34": (3, 2),
+    "CK54": (4, None),
+    "Luscher3": (3, 2),
+    "CFEES25": (2, 1),
+    "CFEES27": (2, None),
+    "YRK135": (5, None),
+}
+names = pytest.mark.parametrize("name", METHODS)
+
+
+@names
+def test_the_orders_by_their_conditions(name):
+    order, below = METHODS[name]
+    tableau = getattr(cfjax, name).tableau
+    assert cfjax.order(tableau) == order
+    assert tableau.num_flows == tableau.num_evaluations
+    if below is None:
+        assert tableau.companion is None
+    else:
+        assert cfjax.order(tableau.companion_method) == below
+        assert tableau.num_companion_flows == {"Luscher3": 1, "CFEES25": 1}.get(name, 0)
+
+
+@names
+def test_a_step_is_that_of_the_tableau(name):
+    solver = getattr(cfjax, name)()
+    same = cfjax.CommutatorFree(solver.tableau)
+    y0, inertia = jnp.asarray(problems.MOMENTUM), jnp.asarray(problems.INERTIA)
+    term, times = cfjax.LieTerm(problems.driven_body), (jnp.asarray(0.3), jnp.asarray(0.5))
+    found, expected = (
+        jax.jit(lambda s=s: s.step(term, *times, y0, inertia, None, made_jump=False)[:2])()
+        for s in (solver, same)
+    )
+    # The sums of YRK135 grow to 36 times a field of size 1 and cancel again.
+    problems.assert_close(found, expected, 1e-13 if name == "YRK135" else 1e-15 * 5)
+
+
+@pytest.mark.parametrize("name", ["BWRRK33", "CK54", "YRK135"])
+def test_the_observed_order(body_problem, name):
+    field, y0, args, answer = body_problem
+    steps = [6, 8, 12, 16] if name == "YRK135" else [16, 32, 64, 128]
+    found = problems.errors(field, getattr(cfjax, name)(), 1.0, y0, args, answer, steps)
+    assert found.min() > 10 * problems.REFERENCE_ERROR
+    assert abs(problems.slope(steps, found) - METHODS[name][0]) < 0.15
+
+
+def test_a_frame_in_coordinates_of_its_own_takes_every_stage(no_shape_hook):
+    """Such a step changes its structure from stage to stage, so it cannot be a loop."""
+    y0 = jnp.asarray(np.linalg.qr(np.random.default_rng(1).standard_normal((8, 2)))[0])
+
+    def field(t, y, args):
+        return cfjax.LowRankSkew(jnp.roll(y, 1, axis=0) * (1 + t))
+
+    ends = [
+        cfjax.integrate(cfjax.LieTerm(field), solver, 0.0, 0.2, y0, num_steps=1).ys[-1]
+        for solver in (cfjax.CK54(), cfjax.CommutatorFree(cfjax.CK54.tableau))
+    ]
+    np.testing.assert_allclose(ends[0], ends[1], rtol=0, atol=1e-14)
+
+
+@names
+def test_memory_of_two_states(name):
+    """As the compiler plans it: the point and the sum, and what one evaluation needs."""
+    n = 1_000_000
+
+    def field(t, y, args):
+        # Not entry by entry, so the stages cannot be computed one entry after another.
+        return jnp.cumsum(y) / n - y
+
+    def run(solver):
+        def end(y0):
+            return cfjax.integrate(cfjax.LieTerm(field), solver, 0.0, 1.0, y0, num_steps=10).ys
+
+        compiled = jax.jit(end, donate_argnums=0).lower(jnp.zeros(n)).compile()
+        return compiled.memory_analysis().temp_size_in_bytes / (8 * n)
+
+    used = run(getattr(cfjax, name)())
+    assert used < 4.5
+
+
+@pytest.mark.parametrize("name", [name for name, (_, below) in METHODS.items() if below])
+def test_error_control(name):
+    y0, inertia = jnp.asarray(problems.MOMENTUM), jnp.asarray(problems.INERTIA)
+    answer = problems.reference(
+        lambda t, y: problems.driven_body_ode(t, y, problems.INERTIA), 0.0, 2.0, problems.MOMENTUM
+    )
+    controller = diffrax.PIDController(rtol=0.0, atol=1e-5)
+    sol = diffrax.diffeqsolve(
+        cfjax.LieTerm(problems.driven_body),
+        getattr(cfjax, name)(),
+        0.0,
+        2.0,
+        0.01,
+        y0,
+        inertia,
+        stepsize_controller=controller,
+        max_steps=10_000,
+    )
+    assert 1e-9 < np.linalg.norm(sol.ys[-1] - answer) < 1e-4

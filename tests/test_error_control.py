@@ -1,0 +1,230 @@
+"""Error control in every frame: norms, first steps, and what a pair costs."""
+
+import diffrax
+import jax
+import jax.numpy as jnp
+import numpy as np
+import problems
+import pytest
+from scipy.spatial.transform import Rotation as ScipyRotation
+
+import cfjax
+from cfjax.scenes import rigid_body
+
+TURN = jnp.asarray(ScipyRotation.from_rotvec([0.7, -0.4, 1.1]).as_matrix())
+INERTIA, Y0 = jnp.asarray(problems.INERTIA), jnp.asarray(problems.MOMENTUM)
+
+
+def turned_body(t, y, args):
+    """The driven body, seen from a turned frame."""
+    field = problems.driven_body(t, TURN.T @ y, args)
+    return cfjax.Rotation(TURN @ field.omega)
+
+
+@pytest.mark.parametrize("solver", [cfjax.CF3(), cfjax.CF4()], ids=["CF3", "CF4"])
+def test_a_turned_copy_takes_the_same_steps(solver):
+    @jax.jit
+    def solve(turned, rtol):
+        def field(t, y, args):
+            plain, turned_ = problems.driven_body(t, y, args), turned_body(t, y, args)
+            return cfjax.Rotation(jnp.where(turned, turned_.omega, plain.omega))
+
+        y0 = jnp.where(turned, TURN @ Y0, Y0)
+        controller = diffrax.PIDController(rtol=rtol, atol=jnp.asarray(1e-6))
+        sol = diffrax.diffeqsolve(
+            cfjax.LieTerm(field),
+            solver,
+            0.0,
+            10.0,
+            0.01,
+            y0,
+            INERTIA,
+            stepsize_controller=controller,
+            max_steps=10_000,
+        )
+        return sol.ys[-1], sol.stats["num_steps"]
+
+    (y, plain), (turned, steps) = solve(False, 0.0), solve(True, 0.0)
+    assert steps == plain
+    np.testing.assert_allclose(turned, TURN @ y, rtol=0, atol=1e-10)
+    # With a relative tolerance, entry by entry, it depends on the frame: the test can fail.
+    assert solve(True, 1e-6)[1] != solve(False, 1e-6)[1]
+
+
+def test_the_norm_of_a_product():
+    norm = cfjax.ErrorNorm({"a": 2.0, "b": 0.5})
+    y = {"a": jnp.asarray([3.0, 4.0]), "b": {"c": jnp.full((2, 2), 1.0), "d": jnp.asarray(3.0)}}
+    # Means of squares 12.5 and 13 / 5, by scale 3.125 and 10.4.
+    assert float(norm(y)) == pytest.approx(np.sqrt((12.5 / 4 + 13 / 5 / 0.25) / 2), rel=1e-15)
+    assert float(norm({"a": jnp.asarray([3j, 4.0]), "b": jnp.zeros(1)})) == pytest.approx(1.25)
+    assert float(cfjax.ErrorNorm(2.0)(y["a"])) == pytest.approx(np.sqrt(12.5) / 2)
+
+
+def test_a_part_of_small_scale_is_controlled_at_its_scale():
+    """Two oscillations of equal frequency, one of them a million times smaller."""
+    size = 1e-6
+
+    def field(t, y, args):
+        turn = lambda x: jnp.stack([x[1], -x[0]])  # noqa: E731
+        return {"large": turn(y["large"]), "small": turn(y["small"]) * (1 + 2 * jnp.sin(9 * t))}
+
+    y0 = {"large": jnp.asarray([1.0, 0.0]), "small": jnp.asarray([size, 0.0])}
+    # The small one's angle is the integral of its speed.
+    angle = 3 + 2 * (1 - np.cos(27.0)) / 9
+    exact = size * np.array([np.cos(angle), -np.sin(angle)])
+    errors = []
+    for scales in ({"large": 1.0, "small": 1.0}, {"large": 1.0, "small": size}):
+        controller = diffrax.PIDController(rtol=0.0, atol=1e-5, norm=cfjax.ErrorNorm(scales))
+        sol = diffrax.diffeqsolve(
+            cfjax.LieTerm(field),
+            cfjax.CF43(),
+            0.0,
+            3.0,
+            0.01,
+            y0,
+            stepsize_controller=controller,
+            max_steps=10_000,
+        )
+        errors.append(np.linalg.norm(sol.ys["small"][-1] - exact) / size)
+    assert errors[1] < 1e-4 < errors[0]
+
+
+def test_mistaken_scales():
+    with pytest.raises(ValueError, match=r"scales\['a'\] must be a scalar, got shape \(3,\)"):
+        cfjax.ErrorNorm({"a": jnp.ones(3)})
+    with pytest.raises(Exception, match="scales must be positive"):
+        cfjax.ErrorNorm(-1.0)
+    with pytest.raises(ValueError):
+        cfjax.ErrorNorm({"a": 1.0})((jnp.ones(3),))
+
+
+# The first step
+
+
+@pytest.mark.parametrize("speed", [1e-4, 1.0, 1e4])
+@pytest.mark.parametrize("direction", [1.0, -1.0])
+def test_a_first_step_is_accepted_and_not_far_too_short(speed, direction):
+    """It follows the time scale of the problem over eight orders of magnitude."""
+
+    def field(t, y, args):
+        return cfjax.Rotation(-speed * y / args)
+
+    term, solver, t1 = cfjax.LieTerm(field), cfjax.CF4(), direction * 10 / speed
+    dt0 = cfjax.starting_step(term, solver, 0.0, t1, Y0, INERTIA, atol=1e-8)
+    assert np.sign(dt0) == direction
+    solution = diffrax.diffeqsolve(
+        term,
+        solver,
+        0.0,
+        t1,
+        dt0,
+        Y0,
+        INERTIA,
+        max_steps=10_000,
+        stepsize_controller=diffrax.PIDController(rtol=0.0, atol=1e-8),
+        saveat=diffrax.SaveAt(steps=True),
+    )
+    steps = np.abs(np.diff(solution.ts[np.isfinite(solution.ts)], prepend=0))
+    assert steps[0] == pytest.approx(abs(float(dt0)), rel=1e-12)
+    # Hairer, Norsett & Wanner aim at an error 100 times smaller than is allowed.
+    assert 1 / 30 < abs(float(dt0)) / np.median(steps) < 2
+
+
+def test_a_first_step_where_nothing_moves_and_in_other_precision():
+    def field(t, y, args):
+        return cfjax.Rotation(0 * y)
+
+    term = cfjax.LieTerm(field)
+    step = cfjax.starting_step(term, cfjax.CF4(), 0.0, 1.0, Y0, atol=1e-6)
+    assert 0 < float(step) <= 1
+    assert float(cfjax.starting_step(term, cfjax.CF4(), 0.0, 0.0, Y0, atol=1e-6)) == 0
+    single = cfjax.starting_step(
+        cfjax.LieTerm(problems.rigid_body),
+        cfjax.CF4(),
+        0.0,
+        1.0,
+        jnp.ones(3, jnp.float32),
+        jnp.asarray(INERTIA, jnp.float32),
+        atol=1e-3,
+    )
+    assert single.dtype == jnp.float32 and 0 < single <= 1
+
+
+def test_a_first_step_needs_a_term_of_an_ordinary_equation():
+    term = diffrax.ControlTerm(lambda t, y, args: y, lambda t0, t1: t1 - t0)
+    with pytest.raises(TypeError, match=r"term must be a cfjax\.LieTerm or a diffrax\.ODETerm"):
+        cfjax.starting_step(term, cfjax.CF4(), 0.0, 1.0, Y0, atol=1e-3)
+
+
+# What a pair costs, against step doubling
+
+
+class StepDoubling(diffrax.AbstractSolver):
+    """The paper's estimate: a step and two of half its size, and on with the step."""
+
+    solver: cfjax.CommutatorFree
+    term_structure = diffrax.AbstractTerm
+    interpolation_cls = diffrax.LocalLinearInterpolation
+
+    def order(self, terms):
+        return self.solver.order(terms)
+
+    def error_order(self, terms):
+        return self.order(terms) + 1
+
+    def init(self, terms, t0, t1, y0, args):
+        return None
+
+    def step(self, terms, t0, t1, y0, args, solver_state, made_jump):
+        def inner(t0, t1, y):
+            return self.solver.step(terms, t0, t1, y, args, None, made_jump=False)[0]
+
+        half = (t0 + t1) / 2
+        y1, better = inner(t0, t1, y0), inner(half, t1, inner(t0, half, y0))
+        error = (y1 - better) / (2 ** self.order(terms) - 1)
+        return y1, error, dict(y0=y0, y1=y1), None, diffrax.RESULTS.successful
+
+    def func(self, terms, t0, y0, args):
+        return terms.vf(t0, y0, args)
+
+
+def test_a_pair_needs_less_than_half_of_the_flows_of_step_doubling():
+    """The rigid body of the paper, flows at equal error, read off on logarithmic scales."""
+    y0, inertia = jnp.asarray(rigid_body.y0), jnp.asarray(rigid_body.inertia)
+    answer = problems.reference(
+        lambda t, y: np.cross(y, y / rigid_body.inertia), 0.0, 10.0, np.asarray(rigid_body.y0)
+    )
+    tolerances = [1e-4, 1e-6, 1e-8, 1e-10]
+
+    def curve(solver, flows_per_step):
+        flows, errors = [], []
+        for atol in tolerances:
+            sol = diffrax.diffeqsolve(
+                cfjax.LieTerm(rigid_body.field),
+                solver,
+                0.0,
+                10.0,
+                0.01,
+                y0,
+                inertia,
+                stepsize_controller=diffrax.PIDController(rtol=0.0, atol=jnp.asarray(atol)),
+                max_steps=None,
+            )
+            flows.append(flows_per_step * int(sol.stats["num_steps"]))
+            errors.append(np.linalg.norm(sol.ys[-1] - answer))
+        return np.log(flows), np.log(errors), np.array(errors)
+
+    tableau = cfjax.CF4().tableau
+    pair = curve(cfjax.CF4(), tableau.num_flows + tableau.num_companion_flows)
+    plain = cfjax.CommutatorFree(cfjax.Tableau(tableau.alpha, tableau.beta))
+    doubling = curve(StepDoubling(plain), 3 * tableau.num_flows)
+    # Where both curves have errors to compare.
+    low = max(c[1].min() for c in (pair, doubling))
+    high = min(c[1].max() for c in (pair, doubling))
+    at = np.linspace(low, high, 9)
+    flows = [np.interp(at, c[1][::-1], c[0][::-1]) for c in (pair, doubling)]
+    ratio = np.exp(flows[0] - flows[1])
+    assert ratio.max() <= 0.45
+    # Error per tolerance, along the whole range.
+    per_tolerance = pair[2] / np.array(tolerances)
+    assert per_tolerance.max() < 10 * per_tolerance.min()
