@@ -179,7 +179,8 @@ def heat_contrast(axes: Axes) -> None:
                 num_steps=200,
                 throw=False,
             )
-            return jnp.linalg.norm(heat.to_grid(sol.ys[-1]) - exact)
+            last = jax.tree.map(lambda ys: ys[-1], sol.ys)
+            return jnp.linalg.norm(heat.to_grid(last) - exact)
 
         errors = jax.vmap(error)(np.max(full.mu) / ratios)
         axes.semilogy(ratios, errors, color=color, label=f"{name}, h = 1/400")
