@@ -42,10 +42,10 @@ class ErrorNorm(eqx.Module):
 
     def __call__(self, y: PyTree) -> Real[Array, ""]:
         scales, treedef = jtu.tree_flatten(self.scales)
-        squares = [
-            _mean_square(part) / jnp.square(scale)
-            for scale, part in zip(scales, treedef.flatten_up_to(y), strict=True)
-        ]
+        squares = []
+        for scale, part in zip(scales, treedef.flatten_up_to(y), strict=True):
+            square = _mean_square(part)
+            squares.append(square / jnp.square(scale.astype(square.dtype)))
         # The root has no derivative at zero; error control asks for none.
         return jnp.sqrt(lax.stop_gradient(sum(squares) / len(squares)))
 
@@ -58,7 +58,7 @@ def _checked(scale: Any) -> Real[Array, ""]:
 def _mean_square(y: PyTree) -> Real[Array, ""]:
     leaves = jtu.tree_leaves(y)
     total = sum(jnp.sum(jnp.square(jnp.abs(leaf))) for leaf in leaves)
-    return total / max(1, sum(jnp.size(leaf) for leaf in leaves))
+    return jnp.asarray(total / max(1, sum(jnp.size(leaf) for leaf in leaves)))
 
 
 def starting_step(

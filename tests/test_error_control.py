@@ -57,6 +57,8 @@ def test_the_norm_of_a_product():
     # Means of squares 12.5 and 13 / 5, by scale 3.125 and 10.4.
     assert float(norm(y)) == pytest.approx(np.sqrt((12.5 / 4 + 13 / 5 / 0.25) / 2), rel=1e-15)
     assert float(norm({"a": jnp.asarray([3j, 4.0]), "b": jnp.zeros(1)})) == pytest.approx(1.25)
+    single = cfjax.ErrorNorm(2.0)(jnp.ones(3, jnp.float32))
+    assert single.dtype == jnp.float32 and float(single) == 0.5
     assert float(cfjax.ErrorNorm(2.0)(y["a"])) == pytest.approx(np.sqrt(12.5) / 2)
 
 

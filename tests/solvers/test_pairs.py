@@ -62,13 +62,14 @@ def test_the_companion_has_the_order_below(name):
 @estimates
 def test_the_estimate_falls_with_the_order_of_the_companion(name, estimate):
     """On a group that does not commute, in state and time: like h^p."""
-    steps = np.array([1 / 16, 1 / 32, 1 / 64, 1 / 128])
+    # Longer steps at order 5, whose estimate would else meet rounding.
+    steps = np.array([1 / 8, 1 / 16, 1 / 32]) / (1 if name == "CF54" else 4)
     problem = problems.driven_body, problems.MOMENTUM
     args = jnp.asarray(problems.INERTIA)
     step = jax.jit(lambda h: one_step(solver_of(name, estimate), *problem, h, args)[1])
     sizes = [np.linalg.norm(step(h)) for h in steps]
-    # The smallest is 1e-12, far above the rounding of a step.
-    assert min(sizes) > 1e-13
+    # Ten times above the rounding of a step.
+    assert min(sizes) > 1e-14
     slope = problems.slope(1 / steps, np.array(sizes))
     assert abs(slope - cfjax.order(PAIRS[name].tableau)) < 0.15
 
