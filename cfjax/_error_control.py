@@ -47,7 +47,7 @@ class ErrorNorm(eqx.Module):
             square = _mean_square(part)
             squares.append(square / jnp.square(scale.astype(square.dtype)))
         # The root has no derivative at zero; error control asks for none.
-        return jnp.sqrt(lax.stop_gradient(sum(squares) / len(squares)))
+        return jnp.sqrt(lax.stop_gradient(jnp.asarray(sum(squares)) / len(squares)))
 
 
 def _checked(scale: Any) -> Real[Array, ""]:

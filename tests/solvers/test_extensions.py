@@ -220,7 +220,7 @@ def test_a_product_of_manifolds():
     np.testing.assert_allclose(q.T @ q, np.eye(3), rtol=0, atol=1e-14)
 
 
-def test_frames_in_coordinates_of_their_own(no_shape_hook):
+def test_frames_in_coordinates_of_their_own():
     """Low-rank fields share the columns of a step, also after diffrax has stored them."""
     rng = np.random.default_rng(1)
     y0 = jnp.asarray(np.linalg.qr(rng.standard_normal((12, 2)))[0])
