@@ -19,7 +19,7 @@ from jaxtyping import Array, Float
 
 from .._fields.affine import Affine
 from .._functions.transforms import SineTransform
-from .._solvers.commutator_free import CF4
+from .._solvers.commutator_free import CF4, CF43
 from .._solvers.munthe_kaas import RKMK4
 from .._solvers.richardson import Richardson
 from .._term import LieTerm
@@ -94,7 +94,7 @@ def reference(
 
 
 def chart(**options: Any) -> WorkPrecision:
-    """Heat conduction, N = 100, tolerances 1e-2 to 1e-7; Kvaerno5 is an implicit method."""
+    """Heat conduction, N = 100, tolerances 1e-2 to 1e-7. CF4, RKMK4 and RK4 double steps."""
     args = diffusivity()
 
     def velocity(t, y, args):
@@ -108,6 +108,7 @@ def chart(**options: Any) -> WorkPrecision:
         args,
         methods={
             "CF4": Richardson(CF4()),
+            "CF43": CF43(),
             "RKMK4": Richardson(RKMK4()),
             # On translations CF4 is the classical Runge-Kutta method.
             "RK4": (LieTerm(velocity), Richardson(CF4())),

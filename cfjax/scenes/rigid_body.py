@@ -17,7 +17,7 @@ from jax import lax
 from jaxtyping import Array, Float
 
 from .._fields.rotation import Rotation
-from .._solvers.commutator_free import CF3, CF4
+from .._solvers.commutator_free import CF3, CF4, CF43
 from .._solvers.munthe_kaas import RKMK3, RKMK4
 from .._term import LieTerm
 from .._work_precision import WorkPrecision, work_precision
@@ -88,6 +88,7 @@ def chart(**options: Any) -> WorkPrecision:
             "RKMK3": RKMK3(),
             "CF4": CF4(),
             "RKMK4": RKMK4(),
+            "CF43": CF43(),
             "Dopri5": (space, diffrax.Dopri5()),
             "Tsit5": (space, diffrax.Tsit5()),
         },
