@@ -9,7 +9,7 @@ import pytest
 from scipy.spatial.transform import Rotation as ScipyRotation
 
 import cfjax
-from cfjax.scenes import rigid_body
+from cfjax.scenes import rigid_body, stiefel
 
 TURN = jnp.asarray(ScipyRotation.from_rotvec([0.7, -0.4, 1.1]).as_matrix())
 INERTIA, Y0 = jnp.asarray(problems.INERTIA), jnp.asarray(problems.MOMENTUM)
@@ -161,65 +161,55 @@ def test_a_first_step_needs_a_term_of_an_ordinary_equation():
 # What a pair costs, against step doubling
 
 
-class StepDoubling(diffrax.AbstractSolver):
-    """The paper's estimate: a step and two of half its size, and on with the step."""
-
-    solver: cfjax.CommutatorFree
-    term_structure = diffrax.AbstractTerm
-    interpolation_cls = diffrax.LocalLinearInterpolation
-
-    def order(self, terms):
-        return self.solver.order(terms)
-
-    def error_order(self, terms):
-        return self.order(terms) + 1
-
-    def init(self, terms, t0, t1, y0, args):
-        return None
-
-    def step(self, terms, t0, t1, y0, args, solver_state, made_jump):
-        def inner(t0, t1, y):
-            return self.solver.step(terms, t0, t1, y, args, None, made_jump=False)[0]
-
-        half = (t0 + t1) / 2
-        y1, better = inner(t0, t1, y0), inner(half, t1, inner(t0, half, y0))
-        error = (y1 - better) / (2 ** self.order(terms) - 1)
-        return y1, error, dict(y0=y0, y1=y1), None, diffrax.RESULTS.successful
-
-    def func(self, terms, t0, y0, args):
-        return terms.vf(t0, y0, args)
-
-
-def test_a_pair_needs_less_than_half_of_the_flows_of_step_doubling():
-    """The rigid body of the paper, flows at equal error, read off on logarithmic scales."""
-    y0, inertia = jnp.asarray(rigid_body.y0), jnp.asarray(rigid_body.inertia)
+def rigid_body_problem():
     answer = problems.reference(
         lambda t, y: np.cross(y, y / rigid_body.inertia), 0.0, 10.0, np.asarray(rigid_body.y0)
     )
-    tolerances = [1e-4, 1e-6, 1e-8, 1e-10]
+    return rigid_body.field, 10.0, rigid_body.y0, rigid_body.inertia, answer
+
+
+def stiefel_problem():
+    n, p = 20, 2
+    answer = stiefel.reference("first", n, p)
+    return stiefel.first, 1.0, stiefel.y0(n, p), stiefel.diagonals(n, p), answer
+
+
+@pytest.mark.parametrize(
+    "problem, estimate", [(rigid_body_problem, "group"), (stiefel_problem, "algebra")]
+)
+def test_a_pair_needs_less_than_half_of_the_flows_of_step_doubling(problem, estimate):
+    """Flows at equal error, read off on logarithmic scales, and the error for each tolerance.
+
+    On the Stiefel manifold step doubling takes 4 to 30 steps only, and the estimate on the group,
+    which costs a sixth flow, makes the ratio 0.41 to 0.48.
+    """
+    field, t1, y0, args, answer = problem()
+    y0, args = jnp.asarray(y0), jax.tree.map(jnp.asarray, args)
+    tolerances = np.array([1e-4, 1e-6, 1e-8, 1e-10])
 
     def curve(solver, flows_per_step):
         flows, errors = [], []
         for atol in tolerances:
             sol = diffrax.diffeqsolve(
-                cfjax.LieTerm(rigid_body.field),
+                cfjax.LieTerm(field),
                 solver,
                 0.0,
-                10.0,
+                t1,
                 0.01,
                 y0,
-                inertia,
+                args,
                 stepsize_controller=diffrax.PIDController(rtol=0.0, atol=jnp.asarray(atol)),
                 max_steps=None,
             )
             flows.append(flows_per_step * int(sol.stats["num_steps"]))
             errors.append(np.linalg.norm(sol.ys[-1] - answer))
-        return np.log(flows), np.log(errors), np.array(errors)
+        return np.log(flows), np.log(errors)
 
     tableau = cfjax.CF4().tableau
-    pair = curve(cfjax.CF4(), tableau.num_flows + tableau.num_companion_flows)
+    companion_flows = tableau.num_companion_flows if estimate == "group" else 0
+    pair = curve(cfjax.CF4(estimate=estimate), tableau.num_flows + companion_flows)
     plain = cfjax.CommutatorFree(cfjax.Tableau(tableau.alpha, tableau.beta))
-    doubling = curve(StepDoubling(plain), 3 * tableau.num_flows)
+    doubling = curve(cfjax.Richardson(plain), 3 * tableau.num_flows)
     # Where both curves have errors to compare.
     low = max(c[1].min() for c in (pair, doubling))
     high = min(c[1].max() for c in (pair, doubling))
@@ -227,6 +217,5 @@ def test_a_pair_needs_less_than_half_of_the_flows_of_step_doubling():
     flows = [np.interp(at, c[1][::-1], c[0][::-1]) for c in (pair, doubling)]
     ratio = np.exp(flows[0] - flows[1])
     assert ratio.max() <= 0.45
-    # Error per tolerance, along the whole range.
-    per_tolerance = pair[2] / np.array(tolerances)
-    assert per_tolerance.max() < 10 * per_tolerance.min()
+    error_per_tolerance = pair[1] - np.log(tolerances)
+    assert np.ptp(error_per_tolerance) <= np.log(10)

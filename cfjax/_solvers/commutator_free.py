@@ -105,7 +105,7 @@ class AbstractCommutatorFree(AbstractLieSolver):
         if companion is not None:
             if self.estimate == "algebra":
                 difference = _combined(_difference(companion, tableau.beta), fields)
-                error = tangent(difference, point(stages[-1]))
+                error = tangent(difference, value(end))
             else:
                 other = leave(fields[0], point(trimmed(companion)))
                 error = minus(end, other)

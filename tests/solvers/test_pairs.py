@@ -268,3 +268,24 @@ def test_error_per_tolerance_is_steady(name):
         ratios.append(np.linalg.norm(sol.ys[-1] - answer) / atol)
     assert max(ratios) < 10 * min(ratios)
     assert max(ratios) < 20
+
+
+def test_both_estimates_of_cf4_have_one_size_for_a_matrix_to_leading_order():
+    """Where steps are compensated sums. The signs differ, which no controller sees."""
+    args = jnp.asarray(problems.GENERATORS)
+
+    def difference(h):
+        sizes = []
+        for estimate in ("group", "algebra"):
+            solver, term = solver_of("CF4", estimate), cfjax.LieTerm(problems.left_matrix)
+            y0 = jnp.asarray(problems.ORTHOGONAL)
+            t0, t1 = jnp.asarray(0.3), jnp.asarray(0.3 + h)
+            state = solver.init(term, t0, t1, y0, args)
+            error = solver.step(term, t0, t1, y0, args, state, made_jump=False)[1]
+            sizes.append(jnp.linalg.norm(error))
+        group, algebra = sizes
+        return jnp.abs(group - algebra) / group
+
+    large, small = jax.jit(jax.vmap(difference))(jnp.array([1 / 8, 1 / 32]))
+    # The relative difference falls at least like h.
+    assert small < large / 3 and small < 0.1
