@@ -11,7 +11,7 @@ import numpy as np
 from jax import lax
 from jaxtyping import Array, Bool, PyTree, Real
 
-from ._solvers.base import AbstractLieSolver
+from ._solvers.base import without_estimate
 
 
 def integrate(
@@ -51,8 +51,7 @@ def integrate(
     """
     check_term_and_solver(term, solver)
     check_state(y0)
-    if isinstance(solver, AbstractLieSolver):
-        solver = solver.without_estimate()
+    solver = without_estimate(solver)
     num_steps = count("num_steps", num_steps)
     save_every = num_steps if save_every is None else count("save_every", save_every)
     if num_steps % save_every:

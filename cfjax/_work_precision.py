@@ -20,6 +20,7 @@ from jaxtyping import Array, Float, PyTree
 from ._flops import count_flops
 from ._frozen_field import AbstractAlgebraElement, bracket, combine, flow, is_field, tangent
 from ._integrate import check_state, check_term_and_solver, count, integrate, time_dtype
+from ._solvers.base import without_estimate
 
 if TYPE_CHECKING:
     import matplotlib.figure
@@ -242,6 +243,7 @@ def work_precision(
         for name, method in methods.items():
             with _about(name):
                 own_term, solver = _term_and_solver(method, term)
+                solver = solver if is_adaptive else without_estimate(solver)
                 problem = _Problem(own_term, solver, start, end, first, y0, args)
                 cost = _cost(problem, is_adaptive)
                 executable, seconds = None, 0.0

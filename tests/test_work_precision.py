@@ -431,7 +431,10 @@ def test_progress_is_reported():
         (dict(num_steps=[]), "at least one entry"),
         (dict(num_steps=[0]), "num_steps must be an integer of at least 1"),
         (dict(num_steps=None, tolerances=[0.0]), "tolerances must be positive"),
-        (dict(num_steps=None, tolerances=[1e-3]), "CF4 has none: use diffrax.HalfSolver"),
+        (
+            dict(num_steps=None, tolerances=[1e-3], methods={"m": cfjax.CG4()}),
+            "CG4 has none: use diffrax.HalfSolver",
+        ),
         (dict(methods={}), "at least one solver"),
         (dict(methods={"m": "CF4"}), "solver must be a diffrax solver"),
         (dict(methods={"m": (1, cfjax.CF4())}), "term must be a diffrax term"),

@@ -61,7 +61,9 @@ def observed_order(problem, solver, steps=STEPS, **kwargs) -> float:
 @methods
 @pytest.mark.parametrize("side", ["left", "right"])
 def test_order_on_matrices(matrix_problems, side, solver):
-    order = observed_order(matrix_problems[side], solver)
+    # The smallest step of CF54 meets the error of the reference.
+    steps = STEPS[:-1] if isinstance(solver, cfjax.CF54) else STEPS
+    order = observed_order(matrix_problems[side], solver, steps)
     assert abs(order - solver.order(None)) < TOLERANCE
 
 
