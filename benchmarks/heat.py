@@ -7,7 +7,6 @@ programs take turns in one run, so that the ratios mean something on a busy mach
 
 import argparse
 import statistics
-import time
 from collections.abc import Callable
 
 import jax
@@ -18,6 +17,7 @@ from rich.console import Console
 from rich.table import Table
 
 import cfjax
+from cfjax._work_precision import take_turns
 from cfjax.scenes import heat
 
 SIZES = (100, 1000, 10_000)
@@ -42,7 +42,9 @@ def main() -> None:
             "the same with grid values as the state": compiled(size, steps, coefficients=False),
         }
         check(*(program() for program in programs.values()))
-        times = take_turns(programs, rounds)
+        times = dict(
+            zip(programs, take_turns(list(programs.values()), repeats=rounds), strict=True)
+        )
         base = times["NumPy and SciPy"]
         for name, values in times.items():
             low, middle, high = statistics.quantiles(
@@ -122,16 +124,6 @@ def check(reference: np.ndarray, *others: np.ndarray) -> None:
     for other in others:
         if not np.allclose(other, reference, atol=1e-10, rtol=0):
             raise RuntimeError(f"Programs disagree by {np.abs(other - reference).max()}.")
-
-
-def take_turns(programs: dict[str, Callable[[], object]], rounds: int) -> dict[str, list[float]]:
-    times: dict[str, list[float]] = {name: [] for name in programs}
-    for _ in range(rounds):
-        for name, program in programs.items():
-            start = time.perf_counter()
-            program()
-            times[name].append(time.perf_counter() - start)
-    return times
 
 
 if __name__ == "__main__":

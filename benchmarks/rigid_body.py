@@ -22,6 +22,7 @@ from rich.console import Console
 from rich.table import Table
 
 import cfjax
+from cfjax._work_precision import take_turns
 from cfjax.scenes import rigid_body
 
 STEP = 0.1
@@ -169,19 +170,13 @@ def _check(c, ours) -> None:
         raise RuntimeError(f"C and cfjax disagree: {c} and {ours}.")
 
 
-def _take_turns(programs: dict[str, Callable[[], object]], rounds: int) -> dict[str, list[float]]:
-    times: dict[str, list[float]] = {name: [] for name in programs}
+def _take_turns(programs: dict[str, Callable[[], object]], rounds: int) -> dict[str, np.ndarray]:
     for program in programs.values():
         program()  # warm-up
-    for _ in range(rounds):
-        for name, program in programs.items():
-            start = time.perf_counter()
-            program()
-            times[name].append(time.perf_counter() - start)
-    return times
+    return dict(zip(programs, take_turns(list(programs.values()), repeats=rounds), strict=True))
 
 
-def _table(title: str, times: dict[str, list[float]], steps: int) -> Table:
+def _table(title: str, times: dict[str, np.ndarray], steps: int) -> Table:
     """Ratios are taken round by round to the first program, or to Tsit5 if that is not C."""
     first = next(iter(times))
     base = first if first.startswith("C") else "diffrax, Tsit5"

@@ -4,13 +4,13 @@ from typing import Any
 
 import diffrax
 import equinox as eqx
-import jax
 import jax.numpy as jnp
 import jax.tree_util as jtu
 from jax import lax
 from jaxtyping import Array, PyTree, Real
 
 from ._frozen_field import flow, tangent
+from ._integrate import time_dtype
 from ._term import LieTerm
 
 
@@ -93,8 +93,7 @@ def starting_step(
         )
     norm = (lambda y: jnp.sqrt(_mean_square(y))) if norm is None else norm
     y0 = jtu.tree_map(jnp.asarray, y0)
-    with jax.numpy_dtype_promotion("standard"):
-        dtype = jnp.finfo(jnp.result_type(*jtu.tree_leaves(y0))).dtype
+    dtype = time_dtype(y0)
     t0, t1, atol = (jnp.asarray(x, dtype) for x in (t0, t1, atol))
     longest = jnp.abs(t1 - t0)
     sign = jnp.sign(t1 - t0)

@@ -19,8 +19,14 @@ from jaxtyping import Array, Float, PyTree
 
 from ._flops import count_flops
 from ._frozen_field import AbstractAlgebraElement, bracket, combine, flow, is_field, tangent
-from ._integrate import check_state, check_term_and_solver, count, integrate, time_dtype
-from ._solvers.base import without_estimate
+from ._integrate import (
+    check_state,
+    check_term_and_solver,
+    count,
+    integrate,
+    time_dtype,
+    without_estimate,
+)
 
 if TYPE_CHECKING:
     import matplotlib.figure

@@ -181,7 +181,7 @@ def test_a_pair_needs_less_than_half_of_the_flows_of_step_doubling(problem, esti
     """Flows at equal error, read off on logarithmic scales, and the error for each tolerance.
 
     On the Stiefel manifold step doubling takes 4 to 30 steps only, and the estimate on the group,
-    which costs a sixth flow, makes the ratio 0.41 to 0.48.
+    which costs a sixth flow, makes the ratio 0.41 to 0.47.
     """
     field, t1, y0, args, answer = problem()
     y0, args = jnp.asarray(y0), jax.tree.map(jnp.asarray, args)

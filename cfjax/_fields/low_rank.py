@@ -12,6 +12,7 @@ from jaxtyping import Array, Float
 
 from .._frozen_field import AbstractAlgebraElement, AbstractFrozenField, Weight, combine
 from .._functions.expm_action import phi_1_action
+from .._functions.matmul import matmul
 
 
 class LowRankSkew(AbstractFrozenField):
@@ -48,9 +49,7 @@ class LowRankSkew(AbstractFrozenField):
 
     def tangent(self, point: Float[Array, "n p"]) -> Float[Array, "n p"]:
         _check_point(self, self.g, point)
-        return _product(self.g, _product(point.T, point)) - _product(
-            point, _product(self.g.T, point)
-        )
+        return matmul(self.g, matmul(point.T, point)) - matmul(point, matmul(self.g.T, point))
 
     def enter(self, point: Any, earlier: Sequence[Any]) -> tuple["SpanSkew", "SpanPoint"]:
         if earlier:
@@ -92,14 +91,14 @@ class BorderedSkew(AbstractAlgebraElement):
         p = point.shape[1]
         corner, border = self.gamma[:p], self.gamma[p:]
         corner = corner - corner.T
-        square = _product(border.T, border)
+        square = matmul(border.T, border)
         top, rest = point[:p], point[p:]
         # The rest moves in the span of the border: rest + border w, with top' = corner top -
         # square w - border^T rest and w' = top.
         row = jnp.concatenate([corner, -square], axis=1)
 
         def product(x: Array) -> Array:
-            return jnp.concatenate([_product(row, x), x[:p]])
+            return jnp.concatenate([matmul(row, x), x[:p]])
 
         # Norms that are no less than the 2-norm. A skew matrix has its singular values in pairs.
         half = jnp.sqrt(lax.stop_gradient(jnp.sum(corner * corner)) / 2) / 2
@@ -110,20 +109,20 @@ class BorderedSkew(AbstractAlgebraElement):
             scale = 1 / jnp.sqrt(jnp.maximum(size, 1))
             return a, jnp.repeat(jnp.stack([jnp.ones_like(scale), scale]), p)
 
-        velocity = _product(corner, top) - _product(border.T, rest)
+        velocity = matmul(corner, top) - matmul(border.T, rest)
         change = phi_1_action(
             product,
             jnp.concatenate([velocity, top]),
             half + jnp.sqrt(half * half + size),
             dense,
         )
-        return jnp.concatenate([top + change[:p], rest + _product(border, change[p:])])
+        return jnp.concatenate([top + change[:p], rest + matmul(border, change[p:])])
 
     def tangent(self, point: Float[Array, "n p"]) -> Float[Array, "n p"]:
         _check_point(self, self.gamma, point)
         p = point.shape[1]
-        velocity = _product(self.gamma, point[:p])
-        return jnp.concatenate([velocity[:p] - _product(self.gamma.T, point), velocity[p:]])
+        velocity = matmul(self.gamma, point[:p])
+        return jnp.concatenate([velocity[:p] - matmul(self.gamma.T, point), velocity[p:]])
 
     @classmethod
     def combine(cls, weights: Sequence[Weight], fields: Sequence[Any]) -> Any:
@@ -137,7 +136,7 @@ class BorderedSkew(AbstractAlgebraElement):
     def enter(self, point: Any, earlier: Sequence[Any]) -> tuple["BorderedSkew", Any]:
         if not earlier:
             _check_point(self, self.gamma, point)
-            point = point + _product(point, _correction(_square(point)))
+            point = point + matmul(point, _correction(_square(point)))
         return self, point
 
 
@@ -198,8 +197,8 @@ class SpanSkew(AbstractAlgebraElement):
         m = len(span.gram)
         y = jnp.pad(z, ((0, m - p - length), (0, 0)))
         k = jnp.block([[jnp.zeros((m - p, m - p), z.dtype), -y], [y.T, jnp.zeros((p, p), z.dtype)]])
-        g_rows, y_rows = span.gram[m - p :], _product(z.T, span.gram[:length])
-        top = jnp.pad(_product(z, g_rows), ((0, m - p - length), (0, 0)))
+        g_rows, y_rows = span.gram[m - p :], matmul(z.T, span.gram[:length])
+        top = jnp.pad(matmul(z, g_rows), ((0, m - p - length), (0, 0)))
         return cls(k, jnp.concatenate([-top, y_rows]), span)
 
     def flow(self, point: Any) -> Any:
@@ -207,14 +206,14 @@ class SpanSkew(AbstractAlgebraElement):
             a = lax.stop_gradient(self.a)
             # A real skew matrix has its eigenvalues in pairs, and here is one that is similar.
             bound = jnp.sqrt(jnp.maximum(-jnp.sum(a * a.T) / 2, 0))
-            return phi_1_action(lambda x: _product(self.a, x), velocity, bound, self._dense)
+            return phi_1_action(lambda x: matmul(self.a, x), velocity, bound, self._dense)
 
         if isinstance(point, SpanPoint):
             length, m = len(point.z), len(self.a)
             z = jnp.pad(point.z, ((0, m - length), (0, 0)))
-            z = z + change(_product(self.a[:, :length], point.z))
+            z = z + change(matmul(self.a[:, :length], point.z))
             return SpanPoint(z, self.span.blocks)
-        velocity = _product(self.k, _inner(self.span.blocks, point))
+        velocity = matmul(self.k, _inner(self.span.blocks, point))
         return _plus_product(point, self.span.blocks, change(velocity))
 
     def _dense(self) -> tuple[Array, Array]:
@@ -224,7 +223,7 @@ class SpanSkew(AbstractAlgebraElement):
 
     def tangent(self, point: Float[Array, "n p"]) -> Float[Array, "n p"]:
         blocks = self.span.blocks
-        velocity = _product(self.k, _inner(blocks, point))
+        velocity = matmul(self.k, _inner(blocks, point))
         return _plus_product(jnp.zeros_like(point), blocks, velocity)
 
     @classmethod
@@ -235,14 +234,14 @@ class SpanSkew(AbstractAlgebraElement):
 
     def bracket(self, other: Any) -> "SpanSkew":
         x, y = _on_one_span((self, other))
-        half = _product(x.a, y.k)
+        half = matmul(x.a, y.k)
         k = half - half.T
-        return type(self)(k, _product(k, x.span.gram), x.span)
+        return type(self)(k, matmul(k, x.span.gram), x.span)
 
     def leave(self, point: Any) -> Any:
         if isinstance(point, SpanPoint):
             p = point.z.shape[1]
-            return _product(_columns(point.blocks[: len(point.z) // p]), point.z)
+            return matmul(_columns(point.blocks[: len(point.z) // p]), point.z)
         return point
 
     def on(self, span: _Span) -> "SpanSkew":
@@ -254,13 +253,13 @@ class SpanSkew(AbstractAlgebraElement):
         rest = m - len(self.k)
         if places == list(range(len(places))):
             k = jnp.pad(self.k, (0, rest))
-            new = _product(self.k, span.gram[: m - rest, m - rest :])
+            new = matmul(self.k, span.gram[: m - rest, m - rest :])
             return SpanSkew(
                 k, jnp.pad(jnp.concatenate([self.a, new], 1), ((0, rest), (0, 0))), span
             )
         index = np.concatenate([np.arange(p) + p * place for place in places])
         k = jnp.zeros((m, m), self.k.dtype).at[np.ix_(index, index)].set(self.k)
-        return SpanSkew(k, _product(k, span.gram), span)
+        return SpanSkew(k, matmul(k, span.gram), span)
 
 
 def _spanned(field: Any) -> SpanSkew:
@@ -291,9 +290,9 @@ def _columns(blocks: _Blocks) -> Float[Array, "n m"]:
 def _inner(blocks: _Blocks, x: Float[Array, "n p"]) -> Float[Array, "m p"]:
     """`W^T x`. A corner can only be the first block."""
     if not isinstance(blocks[0], _Corner):
-        return _product(_columns(blocks).T, x)
+        return matmul(_columns(blocks).T, x)
     top = x[: blocks[0].p]
-    return jnp.concatenate([top, _product(_columns(blocks[1:]).T, x)])
+    return jnp.concatenate([top, matmul(_columns(blocks[1:]).T, x)])
 
 
 def _plus_product(
@@ -304,7 +303,7 @@ def _plus_product(
         p = blocks[0].p
         x = jnp.concatenate([x[:p] + z[:p], x[p:]])
         blocks, z = blocks[1:], z[p:]
-    return x + _product(_columns(blocks), z)
+    return x + matmul(_columns(blocks), z)
 
 
 def _correction(square: Float[Array, "p p"]) -> Float[Array, "p p"]:
@@ -321,12 +320,7 @@ def _square(y: Float[Array, "n p"]) -> Float[Array, "p p"]:
     count = math.isqrt(n)
     rows = -(-n // count)
     blocks = jnp.pad(y, ((0, rows * count - n), (0, 0))).reshape(count, rows, p)
-    return jnp.sum(_product(jnp.swapaxes(blocks, 1, 2), blocks), axis=0)
-
-
-def _product(a: Array, b: Array) -> Array:
-    # The default precision drops digits of float32 on GPU and TPU.
-    return jnp.matmul(a, b, precision=lax.Precision.HIGHEST)
+    return jnp.sum(matmul(jnp.swapaxes(blocks, 1, 2), blocks), axis=0)
 
 
 def _check_factor(name: str, factor: Array) -> None:

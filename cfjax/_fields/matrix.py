@@ -5,11 +5,11 @@ from typing import Any
 import equinox as eqx
 import jax.numpy as jnp
 import numpy as np
-from jax import lax
 from jaxtyping import Array, Inexact
 
 from .._frozen_field import AbstractAlgebraElement
 from .._functions.expm import expm_parts
+from .._functions.matmul import matmul
 
 
 class LeftMatrix(AbstractAlgebraElement):
@@ -100,5 +100,4 @@ def _product(a: Array, b: Array) -> Array:
     if jnp.finfo(a.dtype).dtype == jnp.finfo(b.dtype).dtype:
         dtype = np.promote_types(a.dtype, b.dtype)
         a, b = a.astype(dtype), b.astype(dtype)
-    # The default precision drops digits of float32 on GPU and TPU.
-    return jnp.matmul(a, b, precision=lax.Precision.HIGHEST)
+    return matmul(a, b)

@@ -9,6 +9,8 @@ from jax import lax
 from jax.custom_batching import custom_vmap
 from jaxtyping import Array, Inexact
 
+from .matmul import matmul
+
 
 class _Scheme(NamedTuple):
     """A Taylor polynomial and the largest scaled norm it may be used for.
@@ -74,8 +76,7 @@ def _product(x: Array, y: Array) -> Array:
     # to four times slower than a sum, which fuses.
     if x.shape[0] == 4 or (x.shape[0] < 4 and jnp.iscomplexobj(x)):
         return jnp.sum(x[:, :, None] * y[None, :, :], axis=1)
-    # The default precision drops digits of float32 on GPU and TPU.
-    return jnp.matmul(x, y, precision=lax.Precision.HIGHEST)
+    return matmul(x, y)
 
 
 def _combine(weights: Sequence[float], matrices: Sequence[Array]) -> Array:

@@ -13,6 +13,7 @@ from jax import lax
 from jaxtyping import Array, Float
 
 from .expm import max_over_batch
+from .matmul import matmul
 
 # On shorter intervals the error of the second derivative at zero, `eps / length^2`, would show.
 _SHORTEST = 0.1
@@ -120,15 +121,14 @@ def _phi_1(
     s = jnp.maximum(jnp.ceil(jnp.log2(bound)), 0)
     top = jnp.concatenate([a * scale.T / scale, b / scale], axis=1) * jnp.exp2(-s)
     x = jnp.pad(top, ((0, k), (0, 0)))
-    product = functools.partial(jnp.matmul, precision=lax.Precision.HIGHEST)
 
     def add(carry: tuple[Array, Array], degree: Array) -> tuple[tuple[Array, Array], None]:
         term, total = carry
-        term = product(x, term) / degree
+        term = matmul(x, term) / degree
         return (term, total + term), None
 
     def square(x: Array, n: Array) -> tuple[Array, None]:
-        return lax.cond(n < s, lambda x: product(x, x), lambda x: x, x), None
+        return lax.cond(n < s, lambda x: matmul(x, x), lambda x: x, x), None
 
     one = jnp.eye(m + k, dtype=b.dtype)
     # The norm is 1 at most, and 1 / 20! is below rounding.

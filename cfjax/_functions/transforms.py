@@ -10,6 +10,8 @@ import numpy as np
 from jax import lax
 from jaxtyping import Array, Complex, Float, Inexact
 
+from .matmul import matmul
+
 # Up to here a product with the dense matrix is faster than a fast transform, on a CPU.
 _MAX_DENSE = 160
 
@@ -182,8 +184,4 @@ def _by_parts(
 
 
 def _product(matrix: Float[np.ndarray, "n n"], x: Inexact[Array, "n *k"]) -> Inexact[Array, "n *k"]:
-    # The default precision drops digits of float32 on GPU and TPU.
-    product = jnp.matmul(
-        jnp.asarray(matrix, x.dtype), x.reshape(len(x), -1), precision=lax.Precision.HIGHEST
-    )
-    return product.reshape(x.shape)
+    return matmul(jnp.asarray(matrix, x.dtype), x.reshape(len(x), -1)).reshape(x.shape)

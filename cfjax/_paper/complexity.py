@@ -9,8 +9,8 @@ from rich.progress import Progress
 from rich.table import Table
 
 from .._frozen_field import AbstractAlgebraElement
+from .._integrate import without_estimate
 from .._report import Report
-from .._solvers.base import without_estimate
 from .._solvers.commutator_free import CF3, CF4, CG3, CG4, CG5
 from .._solvers.munthe_kaas import RKMK, RKMK3, RKMK4
 from .._term import LieTerm

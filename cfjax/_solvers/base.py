@@ -120,12 +120,6 @@ class AbstractLieSolver(diffrax.AbstractSolver):
         return terms.vf(t0, y0, args)
 
 
-def without_estimate(solver: Any) -> diffrax.AbstractSolver:
-    """The same method for steps that nobody controls, if the solver is one of cfjax's."""
-    # Not `isinstance`: for diffrax a wrapped solver is an instance of what it wraps.
-    return solver.without_estimate() if hasattr(solver, "without_estimate") else solver
-
-
 class Move(eqx.Module):
     """A step: where it ends, an estimate of its error, and what output within it needs."""
 

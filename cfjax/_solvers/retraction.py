@@ -2,11 +2,11 @@
 
 import jax.numpy as jnp
 import jax.tree_util as jtu
-from jax import lax
 from jaxtyping import Array, Float, PyTree
 
 from .._fields.low_rank import BorderedSkew, LowRankSkew
 from .._frozen_field import combine, is_field, tangent
+from .._functions.matmul import matmul
 from .base import AbstractLieSolver, Move
 
 
@@ -71,16 +71,14 @@ class _Cayley:
 
     def __init__(self, q: Float[Array, "n p"], v: Float[Array, "n p"]):
         p = q.shape[1]
-        g = v - _product(q, _product(q.T, v)) / 2
+        g = v - matmul(q, matmul(q.T, v)) / 2
         self.q = q
         # a = left right^T, of rank 2 p.
         self.left = jnp.concatenate([g, -q], axis=1)
         self.right = jnp.concatenate([q, g], axis=1)
-        small = jnp.eye(2 * p, dtype=q.dtype) - _product(self.right.T, self.left) / 2
+        small = jnp.eye(2 * p, dtype=q.dtype) - matmul(self.right.T, self.left) / 2
         # Halfway between Q and Y: (I - a / 2)^-1 Q, by the Sherman-Morrison-Woodbury formula.
-        self.middle = (
-            q + _product(self.left, jnp.linalg.solve(small, _product(self.right.T, q))) / 2
-        )
+        self.middle = q + matmul(self.left, jnp.linalg.solve(small, matmul(self.right.T, q))) / 2
 
     def end(self) -> Float[Array, "n p"]:
         return 2 * self.middle - self.q
@@ -92,14 +90,9 @@ class _Cayley:
         `a' = Q w Q^T + x Q^T - Q x^T` for `v' = Q w + x` with `Q^T x = 0`.
         """
         q = self.q
-        target = velocity - _product(self.left, _product(self.right.T, velocity)) / 2
-        along = _product(q.T, target)
-        inverse = jnp.linalg.inv(_product(q.T, self.middle))
-        x = _product(target - _product(q, along), inverse)
-        w = _product(along + _product(x.T, self.middle), inverse)
-        return x + _product(q, w)
-
-
-def _product(a: Array, b: Array) -> Array:
-    # The default precision drops digits of float32 on GPU and TPU.
-    return jnp.matmul(a, b, precision=lax.Precision.HIGHEST)
+        target = velocity - matmul(self.left, matmul(self.right.T, velocity)) / 2
+        along = matmul(q.T, target)
+        inverse = jnp.linalg.inv(matmul(q.T, self.middle))
+        x = matmul(target - matmul(q, along), inverse)
+        w = matmul(along + matmul(x.T, self.middle), inverse)
+        return x + matmul(q, w)

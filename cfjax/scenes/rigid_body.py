@@ -13,10 +13,10 @@ from typing import Any
 import diffrax
 import jax.numpy as jnp
 import numpy as np
-from jax import lax
 from jaxtyping import Array, Float
 
 from .._fields.rotation import Rotation
+from .._functions.matmul import matmul
 from .._solvers.commutator_free import CF3, CF4, CF43
 from .._solvers.munthe_kaas import RKMK3, RKMK4
 from .._term import LieTerm
@@ -44,7 +44,7 @@ def energy(
 ) -> Float[Array, "*batch"]:
     """The kinetic energy `y^T I^-1 y / 2`."""
     # The default precision of a product drops digits of float32 on GPU and TPU.
-    return jnp.matmul(y * y, 0.5 / inertia, precision=lax.Precision.HIGHEST)
+    return matmul(y * y, 0.5 / inertia)
 
 
 def reference(
