@@ -11,11 +11,12 @@ from typing import Any
 import jax
 import jax.numpy as jnp
 import jax.tree_util as jtu
-import numpy as np
 from jax import lax
 from jax.custom_batching import custom_vmap
 from jax.extend.core import ClosedJaxpr, DropVar, Jaxpr, JaxprEqn, Literal, jaxpr_as_fun
 from jaxtyping import Array, PyTree
+
+from ._functions.pack import pack, pack_p, unpack, unpack_p
 
 # Longer vectors fuse well as they are, and the program grows with the number of components.
 _MAX_LENGTH = 6
@@ -32,70 +33,111 @@ _EXPENSIVE = frozenset(
 )
 
 
-class _Vector(tuple):
+@jtu.register_pytree_node_class
+class Components(tuple):
     """A vector as the tuple of its components, which are scalars."""
 
+    def tree_flatten(self) -> tuple[tuple, None]:
+        return tuple(self), None
 
-def by_components(fun: Callable[[PyTree], PyTree], y: PyTree) -> PyTree:
-    """`fun(y)`, computed with every vector of at most six entries in components.
+    @classmethod
+    def tree_unflatten(cls, _, children):
+        return cls(children)
 
-    The result agrees with `fun(y)` to rounding. `fun` may close over traced values. Operations
-    that have no rule here get the vector whole, so every function works. Where no leaf of `y` is
-    a short vector, this is `fun(y)`.
+
+def split(tree: PyTree) -> PyTree:
+    """The tree with every vector of at most six entries in components."""
+    return jtu.tree_map(lambda x: _entries(x) if _is_short(x) else x, tree)
+
+
+def join(tree: PyTree) -> PyTree:
+    """The reverse of `split`."""
+    return jtu.tree_map(_whole, tree, is_leaf=lambda x: isinstance(x, Components))
+
+
+def by_components(fun: Callable[..., PyTree], y: PyTree, *parameters: PyTree) -> PyTree:
+    """`fun(y, *parameters)`, computed with every vector of at most six entries in components.
+    Arguments and result are trees that are split.
+
+    The result agrees with that of `fun` to rounding. `fun` may close over traced values.
+    Operations that have no rule here get the vector whole, so every function works.
+
+    Divisions by what no `y` changes become products with the reciprocal, as XLA does for literals:
+    a loop then computes the reciprocal once, and a division would be a barrier to fusion.
     """
-    if not any(_is_short(leaf) for leaf in jtu.tree_leaves(y)):
-        return fun(y)
-    jaxpr, out = jax.make_jaxpr(fun, return_shape=True)(y)
-    values = _evaluate(jaxpr.jaxpr, jaxpr.consts, jtu.tree_leaves(y))
-    return jtu.tree_unflatten(jtu.tree_structure(out), [_whole(v) for v in values])
+    args = (y, *parameters)
+    jaxpr, out = jax.make_jaxpr(fun, return_shape=True)(*map(join, args))
+    is_split = lambda x: isinstance(x, Components)  # noqa: E731
+    values = jtu.tree_leaves(args, is_leaf=is_split)
+    moving = len(jtu.tree_leaves(y, is_leaf=is_split))
+    fixed = [False] * moving + [True] * (len(values) - moving)
+    outs, _ = _evaluate(jaxpr.jaxpr, jaxpr.consts, values, fixed)
+    return split(jtu.tree_unflatten(jtu.tree_structure(out), outs))
 
 
-def _evaluate(jaxpr: Jaxpr, consts: Sequence[Any], args: Sequence[Any]) -> list[Any]:
+def _evaluate(
+    jaxpr: Jaxpr, consts: Sequence[Any], args: Sequence[Any], fixed: Sequence[bool]
+) -> tuple[list[Any], list[bool]]:
+    """The values of a program, and which of them are fixed: depend on nothing that is not."""
     env: dict[Any, Any] = {}
+    loose: set[Any] = set()
 
     def read(v: Any) -> Any:
         aval: Any = v.aval
         return jnp.asarray(v.val, aval.dtype) if isinstance(v, Literal) else env[v]
 
+    def is_fixed(v: Any) -> bool:
+        return isinstance(v, Literal) or v not in loose
+
     for variable, value in zip((*jaxpr.constvars, *jaxpr.invars), (*consts, *args), strict=True):
-        if not isinstance(value, _Vector):
+        if not isinstance(value, Components):
             # What is known before the program runs may still be NumPy's.
             value = jnp.asarray(value)
         env[variable] = _entries(value) if _is_short(value) else value
+    loose.update(v for v, is_one in zip(jaxpr.invars, fixed, strict=True) if not is_one)
     for eqn in jaxpr.eqns:
         values = [read(v) for v in eqn.invars]
+        fixed = [is_fixed(v) for v in eqn.invars]
+        outs_fixed = [all(fixed)] * len(eqn.outvars)
         name = eqn.primitive.name
         if name in ("jit", "pjit"):
             inner = eqn.params["jaxpr"]
-            outs = _evaluate(inner.jaxpr, inner.consts, values)
+            outs, outs_fixed = _evaluate(inner.jaxpr, inner.consts, values, fixed)
+        elif eqn.primitive is unpack_p and isinstance(values[0], Components):
+            outs = values[0]
         else:
-            out = _in_components(eqn, name, values)
+            out = _in_components(eqn, name, values, fixed)
             outs = [out] if out is not None else _on_whole_arrays(jaxpr, eqn, values)
         env.update(zip(eqn.outvars, outs, strict=True))
-    return [read(v) for v in jaxpr.outvars]
+        loose.update(v for v, is_one in zip(eqn.outvars, outs_fixed, strict=True) if not is_one)
+    return [read(v) for v in jaxpr.outvars], [is_fixed(v) for v in jaxpr.outvars]
 
 
-def _in_components(eqn: JaxprEqn, name: str, values: list[Any]) -> Any:
+def _in_components(eqn: JaxprEqn, name: str, values: list[Any], fixed: Sequence[bool]) -> Any:
     """The result of one operation, if there is a rule for it, else None."""
     aval: Any = eqn.outvars[0].aval if not eqn.primitive.multiple_results else None
     shape = getattr(aval, "shape", None)
+    if name == "div" and fixed == [False, True] and _is_small_and_real(aval):
+        return _by_reciprocal(values[0], values[1], aval.size)
     if shape is not None and len(shape) == 1 and 1 <= shape[0] <= _MAX_LENGTH:
         if name in _CHEAP or name in _EXPENSIVE:
             rows = list(zip(*(_entries(v, shape[0]) for v in values), strict=True))
             if name in _CHEAP:
-                return _Vector(eqn.primitive.bind(*row, **eqn.params) for row in rows)
+                return Components(eqn.primitive.bind(*row, **eqn.params) for row in rows)
             return _expensive(eqn, rows)
         if name == "broadcast_in_dim" and _ndim(values[0]) == 0:
-            return _Vector(values * shape[0])
-        if name == "slice" and isinstance(values[0], _Vector):
+            return Components(values * shape[0])
+        if name == "slice" and isinstance(values[0], Components):
             (start,), (stop,) = eqn.params["start_indices"], eqn.params["limit_indices"]
             (stride,) = eqn.params["strides"] or (1,)
-            return _Vector(values[0][start:stop:stride])
+            return Components(values[0][start:stop:stride])
+        if eqn.primitive is pack_p:
+            return Components(values)
         if name == "concatenate":
-            return _Vector(entry for v in values for entry in _entries(v))
+            return Components(entry for v in values for entry in _entries(v))
         if name == "dot_general" and _is_plain_product(eqn, values):
             return _product(eqn, *values)
-    elif shape == () and values and isinstance(values[0], _Vector):
+    elif shape == () and values and isinstance(values[0], Components):
         if name in ("squeeze", "reshape"):
             return values[0][0]
         if name == "reduce_sum":
@@ -119,7 +161,20 @@ def _on_whole_arrays(jaxpr: Jaxpr, eqn: JaxprEqn, values: Sequence[Any]) -> Sequ
     return [None if isinstance(v, DropVar) else next(outs) for v in eqn.outvars]
 
 
-def _expensive(eqn: JaxprEqn, rows: Sequence[tuple]) -> _Vector:
+def _is_small_and_real(aval: Any) -> bool:
+    return aval.ndim <= 1 and aval.size <= _MAX_LENGTH and jnp.issubdtype(aval.dtype, jnp.floating)
+
+
+def _by_reciprocal(x: Any, divisor: Any, length: int) -> Any:
+    if _ndim(x) == 0 and _ndim(divisor) == 0:
+        return x * lax.integer_pow(divisor, -1)
+    # Each reciprocal once, also if there is one divisor for all entries.
+    reciprocals = [lax.integer_pow(entry, -1) for entry in _entries(divisor)]
+    entries = zip(_entries(x, length), _entries(Components(reciprocals), length), strict=True)
+    return Components(a * b for a, b in entries)
+
+
+def _expensive(eqn: JaxprEqn, rows: Sequence[tuple]) -> Components:
     """An operation that XLA never repeats, but writes to memory as often as it occurs.
 
     For a single system one vector goes through memory faster than several scalars. In a batch
@@ -130,13 +185,13 @@ def _expensive(eqn: JaxprEqn, rows: Sequence[tuple]) -> _Vector:
         return tuple(eqn.primitive.bind(*row, **eqn.params) for row in rows)
 
     def whole(rows):
-        columns = (jnp.stack(column) for column in zip(*rows, strict=True))
-        return tuple(eqn.primitive.bind(*columns, **eqn.params))
+        columns = (pack(column) for column in zip(*rows, strict=True))
+        return tuple(unpack(eqn.primitive.bind(*columns, **eqn.params)))
 
     rows = jtu.tree_map(jnp.asarray, tuple(rows))
     # A constant by the time XLA sees it, so only one of the two is compiled.
     batched = _is_batched(jtu.tree_map(lambda x: x != x, rows))
-    return _Vector(lax.cond(batched, by_component, whole, rows))
+    return Components(lax.cond(batched, by_component, whole, rows))
 
 
 @custom_vmap
@@ -155,19 +210,19 @@ def _is_plain_product(eqn: JaxprEqn, values: Sequence[Any]) -> bool:
     contracted, batched = eqn.params["dimension_numbers"]
     avals: list[Any] = [v.aval for v in (*eqn.invars, *eqn.outvars)]
     return (
-        any(isinstance(v, _Vector) for v in values)
+        any(isinstance(v, Components) for v in values)
         and all(aval.size <= _MAX_PRODUCT for aval in avals)
         and len({aval.dtype for aval in avals}) == 1
         and tuple(map(len, (*contracted, *batched))) == (1, 1, 0, 0)
     )
 
 
-def _product(eqn: JaxprEqn, left: Any, right: Any) -> _Vector:
+def _product(eqn: JaxprEqn, left: Any, right: Any) -> Components:
     (left_axes, right_axes), _ = eqn.params["dimension_numbers"]
-    if isinstance(left, _Vector):
+    if isinstance(left, Components):
         left, right, left_axes = right, left, right_axes
     rows = left if left_axes == (1,) else left.T
-    return _Vector(_dot(_entries(row), right) for row in rows)
+    return Components(_dot(_entries(row), right) for row in rows)
 
 
 def _dot(a: Sequence[Any], b: Sequence[Any]) -> Any:
@@ -180,22 +235,16 @@ def _is_short(x: Any) -> bool:
 
 
 def _ndim(x: Any) -> int:
-    return 1 if isinstance(x, _Vector) else jnp.ndim(x)
+    return 1 if isinstance(x, Components) else jnp.ndim(x)
 
 
-def _entries(x: Any, length: int | None = None) -> _Vector:
+def _entries(x: Any, length: int | None = None) -> Components:
     """The components of a vector; `length` copies of a scalar or of the only entry."""
     if _ndim(x) == 0:
-        return _Vector([x] * (length or 1))
-    entries = _Vector(x[i] for i in range(len(x)))
-    return _Vector(entries * length) if length and len(entries) == 1 else entries
+        return Components([x] * (length or 1))
+    entries = x if isinstance(x, Components) else Components(unpack(x))
+    return Components(entries * length) if length and len(entries) == 1 else entries
 
 
 def _whole(x: Any) -> Any:
-    """The array of some components. Not `jnp.stack`: see `_functions/rotate.py`."""
-    if not isinstance(x, _Vector):
-        return x
-    whole = jnp.broadcast_to(x[-1], (len(x),))
-    for i, entry in enumerate(x[:-1]):
-        whole = jnp.where(np.arange(len(x)) == i, entry, whole)
-    return whole
+    return pack(x) if isinstance(x, Components) else x

@@ -11,6 +11,8 @@ import numpy as np
 from jax import lax
 from jaxtyping import Array, Bool, PyTree, Real
 
+from ._loop import Loop
+
 
 def integrate(
     term: PyTree[diffrax.AbstractTerm],
@@ -22,13 +24,14 @@ def integrate(
     *,
     num_steps: int | np.integer,
     save_every: int | np.integer | None = None,
+    checkpoint_every: int | np.integer | None = None,
     throw: bool = True,
 ) -> diffrax.Solution:
     """Integrates from `t0` to `t1` with `num_steps` equal steps of any diffrax solver.
 
     A leaner loop than `diffrax.diffeqsolve` for the case that needs no more: one scan, constant
     memory, one compilation for each shape of the arguments and each number of steps, none for new
-    values. Reverse mode keeps one state a step and computes the step again.
+    values. Reverse mode keeps one state a step and computes every step again.
 
     **Arguments:**
 
@@ -37,6 +40,9 @@ def integrate(
     - `num_steps`: how many steps, at least 1.
     - `save_every`: saves the state after every so many steps; must divide `num_steps`. By default
       only the final state is saved.
+    - `checkpoint_every`: for reverse mode with little memory. It then keeps one state in so many
+      steps and computes the steps between again, a second time. About `sqrt(num_steps)` is best,
+      and makes the memory proportional to `sqrt(num_steps)` states.
     - `throw`: whether a failure is an error, as in diffrax. If not, `result` of the solution says
       what happened. In a batch made by `jax.vmap` one failure is an error for all.
 
@@ -54,11 +60,15 @@ def integrate(
     save_every = num_steps if save_every is None else count("save_every", save_every)
     if num_steps % save_every:
         raise ValueError(f"save_every must divide num_steps={num_steps}, got {save_every}.")
+    if checkpoint_every is not None:
+        checkpoint_every = count("checkpoint_every", checkpoint_every)
     y0 = jtu.tree_map(jnp.asarray, y0)
     dtype = time_dtype(y0)
     t0, t1 = jnp.asarray(t0, dtype), jnp.asarray(t1, dtype)
     args = jtu.tree_map(lambda x: jnp.asarray(x) if isinstance(x, float | complex) else x, args)
-    return _integrate(term, solver, t0, t1, y0, args, num_steps, save_every, throw)
+    return _integrate(
+        term, solver, t0, t1, y0, args, num_steps, save_every, checkpoint_every, throw
+    )
 
 
 @eqx.filter_jit
@@ -71,6 +81,7 @@ def _integrate(
     args: PyTree,
     num_steps: int,
     save_every: int,
+    checkpoint_every: int | None,
     throw: bool,
 ) -> diffrax.Solution:
     if throw:
@@ -81,9 +92,11 @@ def _integrate(
         # From the step's number, so that rounding does not add up, and t1 is met exactly.
         return jnp.where(n == num_steps, t1, t0 + n.astype(t0.dtype) * ((t1 - t0) / num_steps))
 
-    @jax.checkpoint
-    def step(carry, _):
+    arrays, structure = eqx.partition((term, solver, args), eqx.is_array)
+
+    def step(carry, arrays):
         n, y, solver_state, result = carry
+        term, solver, args = eqx.combine(arrays, structure)
         y, _, _, solver_state, step_result = solver.step(
             term, time(n), time(n + 1), y, args, solver_state, made_jump=False
         )
@@ -91,15 +104,29 @@ def _integrate(
         if step_result is not diffrax.RESULTS.successful:
             is_first = result == diffrax.RESULTS.successful
             result = diffrax.RESULTS.where(is_first, step_result, result)
-        return (n + 1, y, solver_state, result), None
-
-    def steps_and_save(carry, _):
-        carry, _ = lax.scan(step, carry, length=save_every)
-        return carry, (time(carry[0]), carry[1])
+        return (n + 1, y, solver_state, result)
 
     solver_state = solver.init(term, t0, time(jnp.asarray(1)), y0, args)
-    carry = (jnp.asarray(0), y0, solver_state, diffrax.RESULTS.successful)
+    n = jnp.asarray(0, jnp.int32 if num_steps < 2**31 else int)
+    carry = (n, y0, solver_state, diffrax.RESULTS.successful)
+    steps = Loop(step, carry, arrays)
+
+    def advance(carry, number: int):
+        if checkpoint_every is None:
+            return steps(carry, number)
+        length, rest = checkpoint_every, number % checkpoint_every
+        block = jax.checkpoint(lambda carry, _: (steps(carry, length), None))
+        carry, _ = lax.scan(block, carry, length=number // length)
+        return steps(carry, rest)
+
+    def steps_and_save(carry, _):
+        carry = advance(carry, save_every)
+        n, y, *_ = steps.leave(carry)
+        return carry, (time(n), y)
+
+    carry = steps.enter(carry)
     carry, (ts, ys) = lax.scan(steps_and_save, carry, length=num_steps // save_every)
+    carry = steps.leave(carry)
     result = carry[3]
     # Of the saved states alone, outside the loop: sums and products keep infinity and NaN, so a
     # blow-up shows in what is saved after it.

@@ -329,17 +329,20 @@ def test_a_hessian():
 BIG = 8  # The state is a matrix of this size.
 
 
-def temporary_bytes(num_steps, save_every=None, reverse=False) -> int:
+def temporary_bytes(num_steps, reverse=False, y0=jnp.eye(BIG), **options) -> int:  # noqa: B008
     def run(y0):
-        term = cfjax.LieTerm(lambda t, y, args: cfjax.LeftMatrix((y - y.T) / 2))
-        sol = cfjax.integrate(
-            term, cfjax.CF4(), 0.0, 1.0, y0, num_steps=num_steps, save_every=save_every
-        )
+        def field(t, y, args):
+            return (
+                cfjax.LeftMatrix((y - y.T) / 2) if y.ndim == 2 else problems.rigid_body(t, y, args)
+            )
+
+        term = cfjax.LieTerm(field)
+        sol = cfjax.integrate(term, cfjax.CF4(), 0.0, 1.0, y0, ARGS, num_steps=num_steps, **options)
         assert sol.ys is not None
         return jnp.sum(sol.ys)
 
     fun = jax.grad(run) if reverse else run
-    memory = jax.jit(fun).lower(jnp.eye(BIG)).compile().memory_analysis()
+    memory = jax.jit(fun).lower(y0).compile().memory_analysis()
     assert memory is not None
     return memory.temp_size_in_bytes
 
@@ -349,7 +352,7 @@ def test_the_memory_forwards_does_not_grow_with_the_steps():
 
 
 def test_the_memory_forwards_grows_by_what_is_saved():
-    few, many = temporary_bytes(1000, 100), temporary_bytes(1000, 1)
+    few, many = temporary_bytes(1000, save_every=100), temporary_bytes(1000, save_every=1)
     saved = 990 * (BIG**2 + 1) * 8
     # Up to a copy of the output, for its sum.
     assert 0.9 * saved < many - few < 2.1 * saved
@@ -360,6 +363,38 @@ def test_the_memory_backwards_is_one_state_for_each_step():
     a_step = (many - few) / 1000
     # The state, and at most four numbers more: the count, the result, and their padding.
     assert BIG**2 * 8 <= a_step <= (BIG**2 + 4) * 8
+
+
+def test_the_memory_backwards_of_a_small_system_is_its_state_and_a_count_for_each_step():
+    few, many = (temporary_bytes(n, reverse=True, y0=Y0) for n in (100, 10_100))
+    assert (many - few) / 10_000 <= 3 * 8 + 4
+
+
+def test_the_memory_backwards_grows_with_the_root_of_the_steps_on_request():
+    """A hundred times the steps take ten times the states, and some that do not grow."""
+
+    def states(root):
+        return temporary_bytes(root**2, reverse=True, checkpoint_every=root) / (BIG**2 * 8)
+
+    assert 2 * 90 <= states(100) - states(10) <= 2.2 * 90
+
+
+@pytest.mark.parametrize("checkpoint_every", [1, 4, 5, 12, 30])
+@pytest.mark.parametrize("save_every", [None, 6])
+def test_fewer_checkpoints_give_the_same_numbers(checkpoint_every, save_every):
+    def run(y0, **options):
+        sol = cfjax.integrate(
+            TERM, cfjax.CF4(), 0.0, 1.0, y0, ARGS, num_steps=12, save_every=save_every, **options
+        )
+        assert sol.ys is not None
+        return jnp.sum(jnp.sin(sol.ys)), sol.ys
+
+    want = jax.jit(jax.value_and_grad(run, has_aux=True))(Y0)
+    found = jax.jit(
+        jax.value_and_grad(lambda y: run(y, checkpoint_every=checkpoint_every), has_aux=True)
+    )(Y0)
+    # The same steps, in which fusion may differ in the last bits.
+    jax.tree.map(lambda a, b: close(a, b, atol=1e-14), found, want)
 
 
 # What it refuses
@@ -375,6 +410,21 @@ def test_a_mistaken_number_of_steps(num_steps):
 def test_a_mistaken_number_of_steps_between_saves(save_every):
     with pytest.raises((ValueError, TypeError), match="save_every"):
         cfjax.integrate(TERM, cfjax.CF4(), 0.0, 1.0, Y0, ARGS, num_steps=12, save_every=save_every)
+
+
+@pytest.mark.parametrize("checkpoint_every", [0, -1, 1.0, True])
+def test_a_mistaken_number_of_steps_between_checkpoints(checkpoint_every):
+    with pytest.raises(ValueError, match="checkpoint_every"):
+        cfjax.integrate(
+            TERM,
+            cfjax.CF4(),
+            0.0,
+            1.0,
+            Y0,
+            ARGS,
+            num_steps=12,
+            checkpoint_every=checkpoint_every,
+        )
 
 
 @pytest.mark.parametrize("y0", [1, np.arange(3), jnp.arange(3), True, np.array([True]), "y", None])

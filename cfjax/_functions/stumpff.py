@@ -49,7 +49,8 @@ def _(n, primals, tangents):
 def stumpff_1_2(s: Float[Array, "*batch"]) -> tuple[Float[Array, "*batch"], Float[Array, "*batch"]]:
     """`stumpff(1, s)` and `stumpff(2, s)` together, for the price of one and a half."""
     constants = _DOUBLE if s.dtype == jnp.float64 else _SINGLE
-    scale = _reduction(s, constants)
+    turns, inverse = _turns(s, constants)
+    scale = 1 - turns * ((2 * pi) * inverse)
     square = scale * scale
     z = s * square
     return scale * polynomial(constants.sin, z), square * polynomial(constants.versin, z)
@@ -58,9 +59,37 @@ def stumpff_1_2(s: Float[Array, "*batch"]) -> tuple[Float[Array, "*batch"], Floa
 @stumpff_1_2.defjvp
 def _(primals, tangents):
     (s,), (s_dot,) = primals, tangents
-    c1, c2 = stumpff_1_2(s)
-    c3, c4 = stumpff(3, s), stumpff(4, s)
+    c1, c2, c3, c4 = _stumpff_1_to_4(s)
     return (c1, c2), ((c3 - c2) / 2 * s_dot, (c4 - c3 / 2) * s_dot)
+
+
+@jax.custom_jvp
+def _stumpff_1_to_4(s: Float[Array, "*batch"]) -> tuple[Float[Array, "*batch"], ...]:
+    """Without the branches and divisions of `stumpff`, which a loop of small steps would feel."""
+    constants = _DOUBLE if s.dtype == jnp.float64 else _SINGLE
+    turns, inverse = _turns(s, constants)
+    # Without a full turn `inverse` may be too large to be squared.
+    inverse = jnp.where(turns == 0, 0, inverse)
+    excess = turns * ((2 * pi) * inverse)
+    scale = 1 - excess
+    square = scale * scale
+    z = s * square
+    c1, c3 = (polynomial(c, z) for c in (constants.sin, [-c for c in constants.sin[1:]]))
+    c2, c4 = (polynomial(c, z) for c in (constants.versin, [-c for c in constants.versin[1:]]))
+    # With the reduced angle y = scale x: x - sin x = (x - y) + (y - sin y), and likewise c_4.
+    inverse = inverse * inverse
+    c3 = scale * (square * c3) + excess * inverse
+    c4 = square * (square * c4) + (excess * (1 + scale)) * (inverse / 2)
+    return scale * c1, square * c2, c3, c4
+
+
+@_stumpff_1_to_4.defjvp
+def _(primals, tangents):
+    (s,), (s_dot,) = primals, tangents
+    c1, c2, c3, c4 = _stumpff_1_to_4(s)
+    c5, c6 = stumpff(5, s), stumpff(6, s)
+    slopes = ((c3 - c2) / 2, c4 - c3 / 2, (3 * c5 - c4) / 2, 2 * c6 - c5 / 2)
+    return (c1, c2, c3, c4), tuple(slope * s_dot for slope in slopes)
 
 
 class _Constants(NamedTuple):
@@ -73,12 +102,14 @@ class _Constants(NamedTuple):
     bits: type
 
 
-def _reduction(s: Float[Array, "*batch"], constants: _Constants) -> Float[Array, "*batch"]:
-    """The factor that takes `x = sqrt(s)` to the angle in [-pi, pi] that differs by full turns.
+def _turns(
+    s: Float[Array, "*batch"], constants: _Constants
+) -> tuple[Float[Array, "*batch"], Float[Array, "*batch"]]:
+    """The number of full turns that take `x = sqrt(s)` to an angle in [-pi, pi], and `1 / x`.
 
     XLA materialises every square root and division, which would cost a loop of small steps more
     than the arithmetic does. So 1/x comes from its exponent bits and one polynomial. No branch:
-    without a full turn the factor is exactly 1.
+    without a full turn `turns` is exactly 0, and `1 / x` is finite at x = 0 too.
     """
     bits = lax.bitcast_convert_type(s, constants.bits)
     guess = lax.bitcast_convert_type(constants.seed - (bits >> 1), s.dtype)
@@ -87,8 +118,7 @@ def _reduction(s: Float[Array, "*batch"], constants: _Constants) -> Float[Array,
     turns = jnp.round(((s * (0.5 / pi)) * guess) * correction)
     # Beyond, an angle is known to a hundredth of a radian at best, and further on to no digit.
     limit = 2.0 ** (2 * (jnp.finfo(s.dtype).nmant - 7))
-    guess = jnp.where(s <= limit, guess, jnp.nan)
-    return 1 - turns * (((2 * pi) * guess) * correction)
+    return turns, jnp.where(s <= limit, guess, jnp.nan) * correction
 
 
 _DOUBLE = _Constants(

@@ -11,7 +11,7 @@ import jax.tree_util as jtu
 from jax import lax
 from jaxtyping import Array, Inexact, PyTree, Real
 
-from .._components import by_components
+from .._components import by_components, join, split
 from .._dense import NodeInterpolation
 from .._frozen_field import Displaced, flow, is_displaced, value
 
@@ -64,7 +64,7 @@ class AbstractLieSolver(diffrax.AbstractSolver):
         # Where the field offers no displacement, its flow ends in a plain point.
         end = eqx.filter_eval_shape(first_flow, y0)
         return jtu.tree_map(
-            lambda p, y: jnp.zeros_like(y) if is_displaced(p) else None,
+            lambda p, y: jnp.zeros_like(y) if is_displaced(p) and jnp.ndim(y) >= 2 else None,
             end,
             y0,
             is_leaf=is_displaced,
@@ -94,15 +94,12 @@ class AbstractLieSolver(diffrax.AbstractSolver):
                     values.append(first)
                 return terms.prod(values[-1], control)
 
-            start = jtu.tree_map(
-                lambda lost, y: y if lost is None else _at_rest(y), lost, y0, is_leaf=_is_none
-            )
-            made = self.move(field, start)
+            made = self.move(field, jtu.tree_map(_at_rest, y0))
             return made, None if first is None else values[-1]
 
-        made, last = by_components(move, y0)
+        made, last = join(by_components(move, split(y0)))
         sums = jtu.tree_map(
-            lambda lost, p: (p, None) if lost is None else _sum(p, lost),
+            lambda lost, p: (value(p), None) if lost is None else _sum(p, lost),
             lost,
             made.end,
             is_leaf=_is_none,
@@ -139,7 +136,7 @@ def _is_none(x: Any) -> bool:
 
 
 def _at_rest(y: Inexact[Array, "..."]) -> Displaced | Inexact[Array, "..."]:
-    return Displaced(y, jnp.zeros_like(y)) if jnp.ndim(y) >= 2 else y
+    return Displaced(y, jnp.zeros_like(y)) if jnp.ndim(y) >= 1 else y
 
 
 def _sum(end: Displaced, lost: Array) -> tuple[Array, Array]:

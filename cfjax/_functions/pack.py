@@ -1,0 +1,106 @@
+"""Arrays taken apart along an axis and put together, in a form that XLA fuses.
+
+As primitives of JAX, because the derivatives matter most. `jnp.stack` makes XLA compute what it
+stacks once for every entry, and what JAX transposes `x[i]` or `jnp.where` into breaks a program of
+scalars into many small ones. Here each of the two is the transpose of the other.
+"""
+
+from collections.abc import Sequence
+
+import jax.core
+import jax.numpy as jnp
+import numpy as np
+from jax import lax
+from jax.extend.core import Primitive
+from jax.interpreters import ad, batching, mlir
+from jaxtyping import Array
+
+
+def pack(entries: Sequence[Array], axis: int = 0) -> Array:
+    """`jnp.stack` of arrays of one shape and dtype."""
+    return pack_p.bind(*entries, axis=axis)
+
+
+def unpack(x: Array, axis: int = 0) -> list[Array]:
+    """`jnp.unstack`."""
+    return unpack_p.bind(x, axis=axis)
+
+
+pack_p = Primitive("cfjax_pack")
+unpack_p = Primitive("cfjax_unpack")
+unpack_p.multiple_results = True
+
+
+@pack_p.def_impl
+def _pack_impl(*entries, axis):
+    shape = (*entries[0].shape[:axis], len(entries), *entries[0].shape[axis:])
+    rest = [n for n in range(len(shape)) if n != axis]
+    *first, whole = (lax.broadcast_in_dim(entry, shape, rest) for entry in entries)
+    place = lax.broadcasted_iota(np.int32, shape, axis)
+    for n, entry in enumerate(first):
+        whole = lax.select(place == n, entry, whole)
+    return whole
+
+
+@unpack_p.def_impl
+def _unpack_impl(x, *, axis):
+    return [lax.index_in_dim(x, n, axis, keepdims=False) for n in range(x.shape[axis])]
+
+
+@pack_p.def_abstract_eval
+def _(*entries, axis):
+    shape = entries[0].shape
+    return jax.core.ShapedArray((*shape[:axis], len(entries), *shape[axis:]), entries[0].dtype)
+
+
+@unpack_p.def_abstract_eval
+def _(x, *, axis):
+    shape = (*x.shape[:axis], *x.shape[axis + 1 :])
+    return [jax.core.ShapedArray(shape, x.dtype)] * x.shape[axis]
+
+
+def _pack_jvp(entries, tangents, *, axis):
+    tangents = map(ad.instantiate_zeros, tangents)
+    return pack_p.bind(*entries, axis=axis), pack_p.bind(*tangents, axis=axis)
+
+
+def _unpack_jvp(xs, tangents, *, axis):
+    (x,), (tangent,) = xs, map(ad.instantiate_zeros, tangents)
+    return unpack_p.bind(x, axis=axis), unpack_p.bind(tangent, axis=axis)
+
+
+def _pack_transpose(cotangent, *entries, axis):
+    if type(cotangent) is ad.Zero:
+        return [None] * len(entries)
+    return unpack_p.bind(cotangent, axis=axis)
+
+
+def _unpack_transpose(cotangents, x, *, axis):
+    if all(type(cotangent) is ad.Zero for cotangent in cotangents):
+        return [None]
+    return [pack_p.bind(*map(ad.instantiate_zeros, cotangents), axis=axis)]
+
+
+def _pack_batch(entries, dims, *, axis):
+    (size,) = {x.shape[d] for x, d in zip(entries, dims, strict=True) if d is not None}
+    entries = [
+        lax.broadcast(x, (size,)) if d is None else jnp.moveaxis(x, d, 0)
+        for x, d in zip(entries, dims, strict=True)
+    ]
+    return pack_p.bind(*entries, axis=axis + 1), 0
+
+
+def _unpack_batch(xs, dims, *, axis):
+    (x,), (dim,) = xs, dims
+    entries = unpack_p.bind(jnp.moveaxis(x, dim, 0), axis=axis + 1)
+    return entries, [0] * len(entries)
+
+
+ad.primitive_jvps[pack_p] = _pack_jvp
+ad.primitive_jvps[unpack_p] = _unpack_jvp
+ad.primitive_transposes[pack_p] = _pack_transpose
+ad.primitive_transposes[unpack_p] = _unpack_transpose
+batching.primitive_batchers[pack_p] = _pack_batch
+batching.primitive_batchers[unpack_p] = _unpack_batch
+mlir.register_lowering(pack_p, mlir.lower_fun(_pack_impl, multiple_results=False))
+mlir.register_lowering(unpack_p, mlir.lower_fun(_unpack_impl, multiple_results=True))
