@@ -371,12 +371,12 @@ def test_the_memory_backwards_of_a_small_system_is_its_state_and_a_count_for_eac
 
 
 def test_the_memory_backwards_grows_with_the_root_of_the_steps_on_request():
-    """A hundred times the steps take ten times the states, and some that do not grow."""
+    """A block keeps the state and what the last sum lost; within one block a step keeps a state."""
 
     def states(root):
         return temporary_bytes(root**2, reverse=True, checkpoint_every=root) / (BIG**2 * 8)
 
-    assert 2 * 90 <= states(100) - states(10) <= 2.2 * 90
+    assert 3 * 90 <= states(100) - states(10) <= 3.1 * 90
 
 
 @pytest.mark.parametrize("checkpoint_every", [1, 4, 5, 12, 30])
@@ -414,7 +414,7 @@ def test_a_mistaken_number_of_steps_between_saves(save_every):
 
 @pytest.mark.parametrize("checkpoint_every", [0, -1, 1.0, True])
 def test_a_mistaken_number_of_steps_between_checkpoints(checkpoint_every):
-    with pytest.raises(ValueError, match="checkpoint_every"):
+    with pytest.raises((ValueError, TypeError), match="checkpoint_every"):
         cfjax.integrate(
             TERM,
             cfjax.CF4(),
