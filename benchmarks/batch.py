@@ -110,6 +110,7 @@ def _whole(function: Callable[[Member], Any], members: Member) -> Program:
 
 def _memory(executable: jax.stages.Compiled) -> int:
     plan = executable.memory_analysis()
+    assert plan is not None
     return plan.temp_size_in_bytes + plan.argument_size_in_bytes + plan.output_size_in_bytes
 
 
