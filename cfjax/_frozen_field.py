@@ -41,6 +41,14 @@ class AbstractFrozenField(eqx.Module):
     def tangent(self, point: Any) -> Any:
         """The ambient velocity at `point`, the derivative of the flow at time zero."""
 
+    def __array__(self, *args: Any, **kwargs: Any) -> Any:
+        # What diffrax's Runge-Kutta methods try, in an error that says nothing to their user.
+        raise TypeError(
+            f"{type(self).__name__} is a frozen vector field and not an array. A solver of linear "
+            "spaces cannot take it: use a method of cfjax, for example cfjax.CF4(), or give the "
+            "velocity as an array."
+        )
+
     def displacement(self, point: Any) -> Any:
         """`flow(point) - point`, with a rounding as small as the displacement; None if not offered.
 

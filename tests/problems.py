@@ -162,6 +162,9 @@ def slope(steps: Sequence[int], errors: np.ndarray) -> float:
 
 # Derivatives.
 
+# For `jax.jit` where most of the time of a test is the compilation of a derivative.
+QUICK: Any = {"xla_backend_optimization_level": 0, "xla_llvm_disable_expensive_passes": True}
+
 
 def central_difference(fun: Callable[[Any], Any], x: Any, direction: Any, step: float) -> Any:
     """Of order 4: error of about step^4 (fifth derivative) / 30 and 1.5 rounding / step."""

@@ -410,19 +410,98 @@ def test_batches_of_gradients_and_gradients_of_batches():
     close(jax.jit(jax.grad(total))(batch), each, atol=1e-12)
 
 
-def test_the_backsolve_adjoint_with_a_linear_solver_for_the_way_back():
-    """`vf_prod` is the tangent in the ambient space, which Tsit5 integrates backwards."""
-    adjoint = diffrax.BacksolveAdjoint(solver=diffrax.Tsit5())
+def test_the_backsolve_adjoint():
+    """`vf_prod` is the tangent in the ambient space, where every solver integrates backwards.
+
+    What goes backwards is the state with its adjoint: arrays, on which CF4 is a Runge-Kutta method.
+    """
 
     def fun(x, adjoint):
-        y0, args = x
-        sol = solve(cfjax.CF4(), y0=y0, args=args, adjoint=adjoint, dt0=0.01)
-        assert sol.ys is not None
+        strength, y0, args = x
+        term = cfjax.LieTerm(Driven(strength))
+        sol = solve(cfjax.CF4(), y0=y0, args=args, term=term, adjoint=adjoint, dt0=0.01)
         return jnp.sum(jnp.sin(sol.ys[-1]))
 
-    expected = jax.grad(fun)((Y0, ARGS), diffrax.RecursiveCheckpointAdjoint())
+    expected, with_tsit5, with_cf4 = (
+        jax.jit(jax.grad(lambda x, a=a: fun(x, a)), compiler_options=problems.QUICK)(X)
+        for a in (
+            diffrax.RecursiveCheckpointAdjoint(),
+            diffrax.BacksolveAdjoint(solver=diffrax.Tsit5()),
+            diffrax.BacksolveAdjoint(),
+        )
+    )
     # Two discretisations, with errors of h^4 = 1e-8 each.
-    close(jax.grad(fun)((Y0, ARGS), adjoint), expected, atol=1e-7)
+    close(with_tsit5, expected, atol=1e-7)
+    close(with_cf4, expected, atol=1e-7)
+
+
+def in_the_times(adjoint, t0, t1):
+    """Of a step and a half; diffrax holds the size of the first and ends the last at t1."""
+    sol = diffrax.diffeqsolve(
+        TERM, cfjax.CF2(), t0, t1, 0.5, Y0, ARGS, adjoint=adjoint, max_steps=4
+    )
+    return jnp.sum(jnp.sin(sol.ys[-1]))
+
+
+@pytest.mark.parametrize("adjoint", ADJOINTS)
+def test_derivatives_in_the_times(adjoint):
+    fun = lambda times: in_the_times(ADJOINTS[adjoint], *times)  # noqa: E731
+    times, direction = (jnp.asarray(0.1), jnp.asarray(0.85)), (jnp.asarray(1.0), jnp.asarray(-0.5))
+
+    def derivative(times):
+        if adjoint == "forward":
+            return jax.jvp(fun, (times,), (direction,))[1]
+        return problems.inner(jax.grad(fun)(times), direction)
+
+    expected = problems.central_difference(jax.jit(fun), times, direction, DIFFERENCE_STEP)
+    assert abs(expected) > 0.1
+    found = jax.jit(derivative, compiler_options=problems.QUICK)(times)
+    np.testing.assert_allclose(found, expected, rtol=0, atol=DIFFERENCE_ERROR)
+
+
+@pytest.mark.parametrize("adjoint", ["checkpointed", "direct"])
+def test_hessian_vector_products(adjoint):
+    """The same steps as `cfjax.integrate`, whose products are tested against differences."""
+    solver = cfjax.CF2(estimate=None)
+    _, v, _ = problems.random_like(X, 2)
+
+    def by_diffrax(y):
+        sol = solve(solver, dt0=0.5, y0=y, adjoint=ADJOINTS[adjoint], max_steps=2)
+        return jnp.sum(jnp.sin(sol.ys[-1]))
+
+    def by_integrate(y):
+        sol = cfjax.integrate(TERM, solver, 0.0, 1.0, y, ARGS, num_steps=2)
+        return jnp.sum(jnp.sin(sol.ys[-1]))
+
+    def forward_over_reverse(fun):
+        product = lambda y: jax.jvp(jax.grad(fun), (y,), (v,))[1]  # noqa: E731
+        return jax.jit(product, compiler_options=problems.QUICK)(Y0)
+
+    def reverse_over_forward(fun):
+        product = jax.grad(lambda y: jax.jvp(fun, (y,), (v,))[1])
+        return jax.jit(product, compiler_options=problems.QUICK)(Y0)
+
+    expected = forward_over_reverse(by_integrate)
+    assert np.abs(expected).max() > 0.1
+    # Sums of some 1000 products in another order.
+    close(forward_over_reverse(by_diffrax), expected, atol=1e-13)
+    if adjoint == "direct":
+        close(reverse_over_forward(by_diffrax), expected, atol=1e-13)
+
+
+@pytest.mark.parametrize(
+    "adjoint, derivative, message",
+    [
+        (diffrax.RecursiveCheckpointAdjoint(), jax.jacfwd, "forward-mode autodiff"),
+        (diffrax.ForwardMode(), jax.grad, "Reverse-mode differentiation does not work"),
+        (diffrax.BacksolveAdjoint(), jax.grad, "cannot be autodifferentiated"),
+    ],
+    ids=lambda x: getattr(x, "__name__", type(x).__name__),
+)
+def test_what_an_adjoint_cannot_do_is_an_error(adjoint, derivative, message):
+    """diffrax's own errors, in the start or, going backwards, in the times."""
+    with pytest.raises((TypeError, ValueError, RuntimeError), match=message):
+        derivative(lambda t1: in_the_times(adjoint, 0.1, t1))(0.85)
 
 
 # Transformations
@@ -504,8 +583,14 @@ def test_solvers_of_linear_spaces_refuse_frozen_fields(solver):
 
     Euler, Midpoint, Heun and Ralston ask for `vf_prod` alone, which is the ambient tangent.
     """
-    with pytest.raises((TypeError, ValueError)):
+    ours = isinstance(solver, diffrax.AbstractERK)
+    # The last one never asks for an array, so the error is diffrax's.
+    message = r"Rotation is a frozen vector field and not an array.*CF4" if ours else "structures"
+    with pytest.raises((TypeError, ValueError), match=message):
         solve(solver)
+    if ours:
+        with pytest.raises(TypeError, match=message):
+            cfjax.integrate(TERM, solver, 0.0, 1.0, Y0, ARGS, num_steps=2)
 
 
 @pytest.mark.parametrize("solver", [diffrax.Tsit5(), diffrax.Heun()])
