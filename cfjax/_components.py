@@ -55,24 +55,35 @@ def join(tree: PyTree) -> PyTree:
     return jtu.tree_map(_whole, tree, is_leaf=lambda x: isinstance(x, Components))
 
 
-def by_components(fun: Callable[..., PyTree], y: PyTree, *parameters: PyTree) -> PyTree:
-    """`fun(y, *parameters)`, computed with every vector of at most six entries in components.
-    Arguments and result are trees that are split.
+def by_components(fun: Callable[[PyTree], PyTree], y: PyTree) -> PyTree:
+    """`fun(y)`, computed with every vector of at most six entries in components.
 
-    The result agrees with that of `fun` to rounding. `fun` may close over traced values.
-    Operations that have no rule here get the vector whole, so every function works.
+    `fun` takes whole arrays; `y` and the result are trees that are split. The result agrees with
+    that of `fun` to rounding. `fun` may close over traced values. Operations that have no rule here
+    get the vector whole, so every function works.
 
     Divisions by what no `y` changes become products with the reciprocal, as XLA does for literals:
     a loop then computes the reciprocal once, and a division would be a barrier to fusion.
     """
-    args = (y, *parameters)
-    jaxpr, out = jax.make_jaxpr(fun, return_shape=True)(*map(join, args))
-    is_split = lambda x: isinstance(x, Components)  # noqa: E731
-    values = jtu.tree_leaves(args, is_leaf=is_split)
-    moving = len(jtu.tree_leaves(y, is_leaf=is_split))
-    fixed = [False] * moving + [True] * (len(values) - moving)
-    outs, _ = _evaluate(jaxpr.jaxpr, jaxpr.consts, values, fixed)
-    return split(jtu.tree_unflatten(jtu.tree_structure(out), outs))
+    program, parameters = trace(fun, y)
+    return program(y, parameters)
+
+
+def trace(
+    fun: Callable[[PyTree], PyTree], y: PyTree
+) -> tuple[Callable[[PyTree, PyTree], PyTree], PyTree]:
+    """A program for `by_components`, and what `fun` closes over, split: `program(y, parameters)`.
+
+    The program itself closes over nothing that is traced.
+    """
+    jaxpr, out = jax.make_jaxpr(fun, return_shape=True)(join(y))
+
+    def program(y: PyTree, parameters: PyTree) -> PyTree:
+        values = jtu.tree_leaves(y, is_leaf=lambda x: isinstance(x, Components))
+        outs, _ = _evaluate(jaxpr.jaxpr, parameters, values, [False] * len(values))
+        return split(jtu.tree_unflatten(jtu.tree_structure(out), outs))
+
+    return program, split(list(map(jnp.asarray, jaxpr.consts)))
 
 
 def _evaluate(

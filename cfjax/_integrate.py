@@ -11,7 +11,7 @@ import numpy as np
 from jax import lax
 from jaxtyping import Array, Bool, PyTree, Real
 
-from ._loop import Loop
+from ._loop import repeat
 
 
 def integrate(
@@ -92,11 +92,8 @@ def _integrate(
         # From the step's number, so that rounding does not add up, and t1 is met exactly.
         return jnp.where(n == num_steps, t1, t0 + n.astype(t0.dtype) * ((t1 - t0) / num_steps))
 
-    arrays, structure = eqx.partition((term, solver, args), eqx.is_array)
-
-    def step(carry, arrays):
+    def step(carry):
         n, y, solver_state, result = carry
-        term, solver, args = eqx.combine(arrays, structure)
         y, _, _, solver_state, step_result = solver.step(
             term, time(n), time(n + 1), y, args, solver_state, made_jump=False
         )
@@ -109,24 +106,21 @@ def _integrate(
     solver_state = solver.init(term, t0, time(jnp.asarray(1)), y0, args)
     n = jnp.asarray(0, jnp.int32 if num_steps < 2**31 else int)
     carry = (n, y0, solver_state, diffrax.RESULTS.successful)
-    steps = Loop(step, carry, arrays)
 
     def advance(carry, number: int):
         if checkpoint_every is None:
-            return steps(carry, number)
+            return repeat(step, carry, number)
         length, rest = checkpoint_every, number % checkpoint_every
-        block = jax.checkpoint(lambda carry, _: (steps(carry, length), None))
+        block = jax.checkpoint(lambda carry, _: (repeat(step, carry, length), None))
         carry, _ = lax.scan(block, carry, length=number // length)
-        return steps(carry, rest)
+        return repeat(step, carry, rest)
 
     def steps_and_save(carry, _):
         carry = advance(carry, save_every)
-        n, y, *_ = steps.leave(carry)
+        n, y, *_ = carry
         return carry, (time(n), y)
 
-    carry = steps.enter(carry)
     carry, (ts, ys) = lax.scan(steps_and_save, carry, length=num_steps // save_every)
-    carry = steps.leave(carry)
     result = carry[3]
     # Of the saved states alone, outside the loop: sums and products keep infinity and NaN, so a
     # blow-up shows in what is saved after it.

@@ -1,90 +1,112 @@
 """Many equal steps in one loop, which XLA turns into one function; so it does its derivative."""
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from typing import Any
 
+import equinox as eqx
 import jax
 import jax.numpy as jnp
 import jax.tree_util as jtu
 from jax import lax
 from jaxtyping import Array, PyTree
 
-from ._components import by_components, join, split
+from ._components import join, split, trace
 from ._functions.pack import pack, unpack
 
 # Beyond, the derivative gains less than copying them costs.
-_MAX_PARAMETERS = 16
+_MAX_TRAVELLERS = 16
 
 
-class Loop:
-    """Repeats `carry = step(carry, parameters)`.
+def repeat(step: Callable[[PyTree], PyTree], carry: PyTree, num_steps: int) -> PyTree:
+    """Replaces `carry` by `step(carry)`, `num_steps` times.
 
-    Reverse mode keeps one carry a step, and computes the step again.
+    `step` may close over traced values. Reverse mode keeps one carry a step, and computes the step
+    again.
 
     On CPU a loop of small steps is fast if XLA has few operations left after fusion, and it fuses
     towards each result all that leads to it. So there is one result: the components of all short
-    vectors of the carry travel as one vector. Those of the parameters travel with them unchanged
-    for the sake of the reversed loop, in which they are the sums of the derivatives.
+    vectors of the carry travel as one vector. In a derivative the components of the parameters,
+    that is, what `step` closes over, travel with them unchanged: in the reversed loop they are the
+    sums of the derivatives, which else would be results of their own.
     """
+    leaves, structure = jtu.tree_flatten(split(carry))
+    program, parameters = trace(step, split(carry))
+    values, parameter_structure = jtu.tree_flatten(parameters)
 
-    def __init__(self, step: Callable[[PyTree, PyTree], PyTree], carry: PyTree, parameters: PyTree):
-        self._step = jax.checkpoint(lambda *args: by_components(step, *args))
-        leaves, self._carry_tree = jtu.tree_flatten(split(carry))
-        numbers = [x for x in leaves if _is_real_number(x)]
-        self._dtype = numbers[0].dtype if numbers else None
-        self._is_packed = list(map(self._is_packable, leaves))
-        self._parameters, self._parameter_tree = jtu.tree_flatten(split(parameters))
-        self._is_packed_parameter = list(map(self._is_packable, self._parameters))
-        if sum(self._is_packed_parameter) > _MAX_PARAMETERS:
-            self._is_packed_parameter = [False] * len(self._parameters)
+    def split_step(leaves: list[Any], values: list[Any]) -> list[Any]:
+        carry = jtu.tree_unflatten(structure, leaves)
+        return jtu.tree_leaves(program(carry, jtu.tree_unflatten(parameter_structure, values)))
 
-    def enter(self, carry: PyTree) -> tuple[Array | None, list[Any]]:
-        """The carry in the form in which it travels."""
-        numbers, rest = _part(jtu.tree_leaves(split(carry)), self._is_packed)
-        travelling, _ = _part(self._parameters, self._is_packed_parameter)
-        return (pack([*numbers, *travelling]) if numbers else None), rest
-
-    def leave(self, packed: tuple[Array | None, list[Any]]) -> PyTree:
-        """The reverse of `enter`."""
-        vector, rest = packed
-        numbers = [] if vector is None else unpack(vector)
-        leaves = _join(numbers, rest, self._is_packed)
-        return join(jtu.tree_unflatten(self._carry_tree, leaves))
-
-    def __call__(self, packed: tuple[Array | None, list[Any]], num_steps: int) -> Any:
-        """The carry after some steps, both in the form in which it travels."""
-        values, others = _part(self._parameters, self._is_packed_parameter)
-        count = sum(self._is_packed)
-
-        def body(packed, _):
-            vector, rest = packed
-            numbers = [] if vector is None else unpack(vector)
-            travelling = numbers[count:]
-            borrowed = [_borrow(*pair) for pair in zip(values, travelling, strict=True)]
-            parameters = _join(borrowed, others, self._is_packed_parameter)
-            carry = self._step(
-                jtu.tree_unflatten(self._carry_tree, _join(numbers[:count], rest, self._is_packed)),
-                jtu.tree_unflatten(self._parameter_tree, parameters),
-            )
-            numbers, rest = _part(jtu.tree_leaves(carry), self._is_packed)
-            return ((pack([*numbers, *travelling]) if numbers else None), rest), None
-
-        return lax.scan(body, packed, length=num_steps)[0]
-
-    def _is_packable(self, x: Any) -> bool:
-        return self._dtype is not None and _is_real_number(x) and x.dtype == self._dtype
+    leaves = _repeat(list(map(jnp.asarray, leaves)), values, step=split_step, num_steps=num_steps)
+    return join(jtu.tree_unflatten(structure, leaves))
 
 
-def _is_real_number(x: Any) -> bool:
-    return jnp.ndim(x) == 0 and jnp.issubdtype(jnp.result_type(x), jnp.floating)
+@eqx.filter_custom_jvp
+def _repeat(
+    leaves: list[Array], values: list[Array], *, step: Callable, num_steps: int
+) -> list[Array]:
+    return _scan(step, num_steps, leaves, values, [False] * len(values))
 
 
-def _part(leaves: list[Any], where: list[bool]) -> tuple[list[Any], list[Any]]:
+@_repeat.def_jvp
+def _(primals, tangents, *, step, num_steps):
+    leaves, values = primals
+    numbers, _ = _part(leaves, _packed(leaves))
+    travels = [
+        tangent is not None and bool(numbers) and _is_number(value, numbers[0].dtype)
+        for value, tangent in zip(values, tangents[1], strict=True)
+    ]
+    if sum(travels) > _MAX_TRAVELLERS:
+        travels = [False] * len(values)
+    return eqx.filter_jvp(
+        lambda leaves, values: _scan(step, num_steps, leaves, values, travels), primals, tangents
+    )
+
+
+def _scan(
+    step: Callable[[list[Array], list[Array]], list[Array]],
+    num_steps: int,
+    leaves: list[Array],
+    values: list[Array],
+    travels: Sequence[bool],
+) -> list[Array]:
+    packed = _packed(leaves)
+    numbers, rest = _part(leaves, packed)
+    known, others = _part(values, travels)
+    step = jax.checkpoint(step)
+
+    def body(carry: tuple[Array | None, list[Array]], _: None) -> tuple[Any, None]:
+        vector, rest = carry
+        entries = [] if vector is None else unpack(vector)
+        numbers, travellers = entries[: sum(packed)], entries[sum(packed) :]
+        values = _join(
+            [_borrow(*pair) for pair in zip(known, travellers, strict=True)], others, travels
+        )
+        numbers, rest = _part(step(_join(numbers, rest, packed), values), packed)
+        return (pack([*numbers, *travellers]) if numbers else None, rest), None
+
+    vector = pack([*numbers, *known]) if numbers else None
+    (vector, rest), _ = lax.scan(body, (vector, rest), length=num_steps)
+    numbers = [] if vector is None else unpack(vector)[: sum(packed)]
+    return _join(numbers, rest, packed)
+
+
+def _packed(leaves: list[Array]) -> list[bool]:
+    """Which leaves of the carry travel in the vector: real numbers, of one precision."""
+    numbers = [x for x in leaves if _is_number(x, x.dtype)]
+    return [bool(numbers) and _is_number(x, numbers[0].dtype) for x in leaves]
+
+
+def _is_number(x: Array, dtype: Any) -> bool:
+    return x.ndim == 0 and x.dtype == dtype and jnp.issubdtype(dtype, jnp.floating)
+
+
+def _part(leaves: Sequence[Any], where: Sequence[bool]) -> tuple[list[Any], list[Any]]:
     pairs = list(zip(leaves, where, strict=True))
     return [x for x, is_one in pairs if is_one], [x for x, is_one in pairs if not is_one]
 
 
-def _join(ones: list[Any], others: list[Any], where: list[bool]) -> list[Any]:
+def _join(ones: Sequence[Any], others: Sequence[Any], where: Sequence[bool]) -> list[Any]:
     sources = iter(ones), iter(others)
     return [next(sources[0 if is_one else 1]) for is_one in where]
 

@@ -1,4 +1,6 @@
-"""`Loop`: the numbers and derivatives of a plain scan, whatever travels packed."""
+"""`repeat`: the numbers and derivatives of a plain scan, whatever travels packed."""
+
+from typing import Any
 
 import equinox as eqx
 import jax
@@ -8,7 +10,7 @@ import numpy as np
 import pytest
 from jax import lax
 
-from cfjax._loop import Loop
+from cfjax._loop import repeat
 
 VECTOR = jnp.asarray([0.3, -0.7, 1.1])
 MATRIX = jnp.asarray(np.random.default_rng(0).normal(size=(2, 3)))
@@ -19,7 +21,7 @@ NUM_STEPS = 5
 def mix(carry, parameters):
     """A step that couples everything with everything."""
     floats = [x for x in jtu.tree_leaves((carry, parameters)) if jnp.issubdtype(x.dtype, float)]
-    total = sum(jnp.sum(jnp.sin((n + 1) * x)).astype(float) for n, x in enumerate(floats))
+    total: Any = sum(jnp.sum(jnp.sin((n + 1) * x)).astype(float) for n, x in enumerate(floats))
 
     def advance(x):
         if not jnp.issubdtype(x.dtype, jnp.floating):
@@ -47,8 +49,7 @@ def plain(carry, parameters):
 
 
 def looped(carry, parameters):
-    loop = Loop(mix, carry, parameters)
-    return loop.leave(loop(loop.enter(carry), NUM_STEPS))
+    return repeat(lambda c: mix(c, parameters), carry, NUM_STEPS)
 
 
 def scalar(run):
@@ -95,17 +96,36 @@ def test_derivatives(case, transform):
     close(found, want)
 
 
-def test_a_batch():
-    carry, parameters = CASES["vector and parameters"]
-    carry = jnp.stack([carry, carry * 2])
-    for axes in ((0, None), (None, 0)):
-        values = (carry, parameters) if axes[0] == 0 else (carry[0], {"a": carry, "b": carry[:, 0]})
-        want, found = (jax.jit(jax.vmap(run, axes))(*values) for run in (plain, looped))
-        close(found, want)
-        want, found = (
-            jax.jit(jax.vmap(jax.grad(lambda c, p, run=run: scalar(run)((c, p), (c, p))), axes))(
-                *values
-            )
-            for run in (plain, looped)
-        )
-        close(found, want)
+@pytest.mark.parametrize("axes", [(0, None), (None, 0)], ids=["carry", "parameters"])
+@pytest.mark.parametrize("order", ["grad in vmap", "vmap in grad", "none"])
+def test_a_batch(axes, order):
+    def batched(run):
+        if order == "grad in vmap":
+            return jax.vmap(jax.grad(lambda c, p: scalar(run)((c, p), (c, p)), (0, 1)), axes)
+        many = jax.vmap(run, axes)
+        if order == "none":
+            return many
+        return jax.grad(lambda c, p: scalar(many)((c, p), (c, p)), (0, 1))
+
+    vectors = jnp.stack([VECTOR, VECTOR * 2])
+    case = (vectors, (VECTOR, VECTOR[0])) if axes[0] == 0 else (VECTOR, (vectors, vectors[:, 0]))
+    want, found = (jax.jit(batched(run))(*case) for run in (plain, looped))
+    close(found, want)
+
+
+def test_only_what_is_differentiated():
+    """One parameter among those that the step closes over, and one in an inner program."""
+
+    def run(repeated):
+        @jax.jit
+        def fun(a, b):
+            def step(y):
+                return y + jnp.sin(a * y) / (1 + jax.jit(lambda: b * b)())
+
+            if repeated:
+                return jnp.sum(repeat(step, VECTOR, NUM_STEPS))
+            return jnp.sum(lax.fori_loop(0, NUM_STEPS, lambda _, y: step(y), VECTOR))
+
+        return jax.jacfwd(jax.grad(fun, 1), 0)(VECTOR, jnp.asarray(0.7)), jax.grad(fun)(VECTOR, 0.7)
+
+    close(run(True), run(False))
