@@ -47,12 +47,12 @@ class Components(tuple):
 
 def split(tree: PyTree) -> PyTree:
     """The tree with every vector of at most six entries in components."""
-    return jtu.tree_map(lambda x: _entries(x) if _is_short(x) else x, tree)
+    return jtu.tree_map(lambda x: _entries(x) if is_short(x) else x, tree)
 
 
 def join(tree: PyTree) -> PyTree:
     """The reverse of `split`."""
-    return jtu.tree_map(_whole, tree, is_leaf=lambda x: isinstance(x, Components))
+    return jtu.tree_map(_whole, tree, is_leaf=_is_components)
 
 
 def by_components(fun: Callable[[PyTree], PyTree], y: PyTree) -> PyTree:
@@ -60,11 +60,13 @@ def by_components(fun: Callable[[PyTree], PyTree], y: PyTree) -> PyTree:
 
     `fun` takes whole arrays; `y` and the result are trees that are split. The result agrees with
     that of `fun` to rounding. `fun` may close over traced values. Operations that have no rule here
-    get the vector whole, so every function works.
+    get the vector whole, so every function works. Where nothing in `y` is split, this is `fun(y)`.
 
     Divisions by what no `y` changes become products with the reciprocal, as XLA does for literals:
     a loop then computes the reciprocal once, and a division would be a barrier to fusion.
     """
+    if not any(_is_components(x) for x in jtu.tree_leaves(y, is_leaf=_is_components)):
+        return split(fun(y))
     program, parameters = trace(fun, y)
     return program(y, parameters)
 
@@ -79,7 +81,7 @@ def trace(
     jaxpr, out = jax.make_jaxpr(fun, return_shape=True)(join(y))
 
     def program(y: PyTree, parameters: PyTree) -> PyTree:
-        values = jtu.tree_leaves(y, is_leaf=lambda x: isinstance(x, Components))
+        values = jtu.tree_leaves(y, is_leaf=_is_components)
         outs, _ = _evaluate(jaxpr.jaxpr, parameters, values, [False] * len(values))
         return split(jtu.tree_unflatten(jtu.tree_structure(out), outs))
 
@@ -104,7 +106,7 @@ def _evaluate(
         if not isinstance(value, Components):
             # What is known before the program runs may still be NumPy's.
             value = jnp.asarray(value)
-        env[variable] = _entries(value) if _is_short(value) else value
+        env[variable] = _entries(value) if is_short(value) else value
     loose.update(v for v, is_one in zip(jaxpr.invars, fixed, strict=True) if not is_one)
     for eqn in jaxpr.eqns:
         values = [read(v) for v in eqn.invars]
@@ -241,7 +243,11 @@ def _dot(a: Sequence[Any], b: Sequence[Any]) -> Any:
     return sum(rest, start=total)
 
 
-def _is_short(x: Any) -> bool:
+def _is_components(x: Any) -> bool:
+    return isinstance(x, Components)
+
+
+def is_short(x: Any) -> bool:
     return _ndim(x) == 1 and 1 <= len(x) <= _MAX_LENGTH
 
 
