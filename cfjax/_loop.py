@@ -92,13 +92,13 @@ def _scan(
 
 
 def _packed(leaves: list[Array]) -> list[bool]:
-    """Which leaves of the carry travel in the vector: real numbers, of one precision."""
+    """Which leaves of the carry travel in the vector: numbers of one dtype."""
     numbers = [x for x in leaves if _is_number(x, x.dtype)]
     return [bool(numbers) and _is_number(x, numbers[0].dtype) for x in leaves]
 
 
 def _is_number(x: Array, dtype: Any) -> bool:
-    return x.ndim == 0 and x.dtype == dtype and jnp.issubdtype(dtype, jnp.floating)
+    return x.ndim == 0 and x.dtype == dtype and jnp.issubdtype(dtype, jnp.inexact)
 
 
 def _part(leaves: Sequence[Any], where: Sequence[bool]) -> tuple[list[Any], list[Any]]:

@@ -14,17 +14,18 @@ from cfjax._loop import repeat
 
 VECTOR = jnp.asarray([0.3, -0.7, 1.1])
 MATRIX = jnp.asarray(np.random.default_rng(0).normal(size=(2, 3)))
+COMPLEX = jnp.asarray([0.4 + 0.2j, -0.3j])
 LONG = jnp.linspace(-1.0, 1.0, 9)
 NUM_STEPS = 5
 
 
 def mix(carry, parameters):
     """A step that couples everything with everything."""
-    floats = [x for x in jtu.tree_leaves((carry, parameters)) if jnp.issubdtype(x.dtype, float)]
-    total: Any = sum(jnp.sum(jnp.sin((n + 1) * x)).astype(float) for n, x in enumerate(floats))
+    floats = [x for x in jtu.tree_leaves((carry, parameters)) if x.dtype.kind in "fc"]
+    total: Any = sum(jnp.sum(jnp.sin((n + 1) * x)).real.astype(float) for n, x in enumerate(floats))
 
     def advance(x):
-        if not jnp.issubdtype(x.dtype, jnp.floating):
+        if x.dtype.kind not in "fc":
             return x + 1
         share = total.astype(x.dtype)
         return x + jnp.cos(share * x) / (1 + share**2)
@@ -40,6 +41,8 @@ CASES = {
     "two precisions": ((VECTOR, VECTOR.astype(np.float32)), (VECTOR.astype(np.float32), VECTOR)),
     "more parameters than travel": (VECTOR, [VECTOR * k for k in range(1, 9)]),
     "integers among the parameters": (VECTOR, (jnp.arange(3), VECTOR, jnp.asarray(True))),
+    "complex": (COMPLEX, (VECTOR, COMPLEX * 2)),
+    "real and complex": ((VECTOR, COMPLEX), (VECTOR, COMPLEX)),
     "empty": ((VECTOR, jnp.zeros(0)), jnp.zeros(0)),
 }
 
@@ -55,17 +58,22 @@ def looped(carry, parameters):
 def scalar(run):
     def fun(floats, rest):
         leaves = jtu.tree_leaves(run(*eqx.combine(floats, rest)))
-        return sum(jnp.sum(jnp.exp(x.astype(float) / (n + 2))) for n, x in enumerate(leaves))
+        return sum(
+            jnp.sum(jnp.exp(jnp.sin(x.astype(complex)) / (n + 2))).real
+            for n, x in enumerate(leaves)
+        )
 
     return fun
 
 
-def close(found, want):
-    leaves = [x for x in jtu.tree_leaves(want) if jnp.issubdtype(x.dtype, jnp.floating)]
+def close(found, want, case):
+    def numbers(tree):
+        return [x for x in jtu.tree_leaves(tree) if x.dtype.kind in "fc"]
+
     # Every number depends on all, so on the roundings of the coarsest and the size of the largest.
     # Five coupled steps magnify them a hundredfold.
-    eps = max(float(jnp.finfo(x.dtype).eps) for x in leaves)
-    scale = max(1.0, *(float(jnp.max(jnp.abs(x), initial=0)) for x in leaves))
+    eps = max(float(jnp.finfo(x.dtype).eps) for x in numbers(case))
+    scale = max(1.0, *(float(jnp.max(jnp.abs(x), initial=0)) for x in numbers(want)))
     jtu.tree_map(
         lambda a, b: np.testing.assert_allclose(a, b, rtol=0, atol=1e3 * eps * scale), found, want
     )
@@ -76,7 +84,7 @@ def close(found, want):
 def test_values(case):
     want = jax.jit(plain)(*case)
     found = jax.jit(looped)(*case)
-    close(found, want)
+    close(found, want, case)
     assert jtu.tree_map(lambda x: x.dtype, found) == jtu.tree_map(lambda x: x.dtype, want)
 
 
@@ -93,7 +101,7 @@ def test_values(case):
 def test_derivatives(case, transform):
     x, rest = eqx.partition(case, eqx.is_inexact_array)
     want, found = (jax.jit(transform(scalar(run)))(x, rest) for run in (plain, looped))
-    close(found, want)
+    close(found, want, case)
 
 
 @pytest.mark.parametrize("axes", [(0, None), (None, 0)], ids=["carry", "parameters"])
@@ -110,7 +118,7 @@ def test_a_batch(axes, order):
     vectors = jnp.stack([VECTOR, VECTOR * 2])
     case = (vectors, (VECTOR, VECTOR[0])) if axes[0] == 0 else (VECTOR, (vectors, vectors[:, 0]))
     want, found = (jax.jit(batched(run))(*case) for run in (plain, looped))
-    close(found, want)
+    close(found, want, case)
 
 
 def test_only_what_is_differentiated():
@@ -128,4 +136,4 @@ def test_only_what_is_differentiated():
 
         return jax.jacfwd(jax.grad(fun, 1), 0)(VECTOR, jnp.asarray(0.7)), jax.grad(fun)(VECTOR, 0.7)
 
-    close(run(True), run(False))
+    close(run(True), run(False), VECTOR)
