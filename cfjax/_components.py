@@ -65,7 +65,7 @@ def by_components(fun: Callable[[PyTree], PyTree], y: PyTree) -> PyTree:
     Divisions by what no `y` changes become products with the reciprocal, as XLA does for literals:
     a loop then computes the reciprocal once, and a division would be a barrier to fusion.
     """
-    if not any(_is_components(x) for x in jtu.tree_leaves(y, is_leaf=_is_components)):
+    if not _has_components(y):
         return split(fun(y))
     program, parameters = trace(fun, y)
     return program(y, parameters)
@@ -81,8 +81,11 @@ def trace(
     jaxpr, out = jax.make_jaxpr(fun, return_shape=True)(join(y))
 
     def program(y: PyTree, parameters: PyTree) -> PyTree:
-        values = jtu.tree_leaves(y, is_leaf=_is_components)
-        outs, _ = _evaluate(jaxpr.jaxpr, parameters, values, [False] * len(values))
+        if _has_components(y):
+            values = jtu.tree_leaves(y, is_leaf=_is_components)
+            outs, _ = _evaluate(jaxpr.jaxpr, parameters, values, [False] * len(values))
+        else:
+            outs = jaxpr_as_fun(ClosedJaxpr(jaxpr.jaxpr, join(parameters)))(*jtu.tree_leaves(y))
         return split(jtu.tree_unflatten(jtu.tree_structure(out), outs))
 
     return program, split(list(map(jnp.asarray, jaxpr.consts)))
@@ -241,6 +244,10 @@ def _product(eqn: JaxprEqn, left: Any, right: Any) -> Components:
 def _dot(a: Sequence[Any], b: Sequence[Any]) -> Any:
     total, *rest = (x * y for x, y in zip(a, b, strict=True))
     return sum(rest, start=total)
+
+
+def _has_components(tree: PyTree) -> bool:
+    return any(map(_is_components, jtu.tree_leaves(tree, is_leaf=_is_components)))
 
 
 def _is_components(x: Any) -> bool:
