@@ -63,7 +63,9 @@ def by_components(fun: Callable[[PyTree], PyTree], y: PyTree) -> PyTree:
     get the vector whole, so every function works. Where nothing in `y` is split, this is `fun(y)`.
 
     Divisions by what no `y` changes become products with the reciprocal, as XLA does for literals:
-    a loop then computes the reciprocal once, and a division would be a barrier to fusion.
+    a loop then computes the reciprocal once, and a division would be a barrier to fusion. Not so
+    where a part of `y` stays whole: there the barrier saves XLA from computing the components anew
+    for every entry of that part.
     """
     if not _has_components(y):
         return split(fun(y))
@@ -83,7 +85,9 @@ def trace(
     def program(y: PyTree, parameters: PyTree) -> PyTree:
         if _has_components(y):
             values = jtu.tree_leaves(y, is_leaf=_is_components)
-            outs, _ = _evaluate(jaxpr.jaxpr, parameters, values, [False] * len(values))
+            is_all = all(_is_components(value) or jnp.ndim(value) == 0 for value in values)
+            fixed = [is_all] * len(parameters) + [False] * len(values)
+            outs, _ = _evaluate(jaxpr.jaxpr, (*parameters, *values), fixed)
         else:
             outs = jaxpr_as_fun(ClosedJaxpr(jaxpr.jaxpr, join(parameters)))(*jtu.tree_leaves(y))
         return split(jtu.tree_unflatten(jtu.tree_structure(out), outs))
@@ -92,9 +96,12 @@ def trace(
 
 
 def _evaluate(
-    jaxpr: Jaxpr, consts: Sequence[Any], args: Sequence[Any], fixed: Sequence[bool]
+    jaxpr: Jaxpr, values: Sequence[Any], fixed: Sequence[bool]
 ) -> tuple[list[Any], list[bool]]:
-    """The values of a program, and which of them are fixed: depend on nothing that is not."""
+    """What a program makes of values for its constants and arguments, some of which are fixed.
+
+    Fixed results are those that depend on nothing else.
+    """
     env: dict[Any, Any] = {}
     loose: set[Any] = set()
 
@@ -105,12 +112,14 @@ def _evaluate(
     def is_fixed(v: Any) -> bool:
         return isinstance(v, Literal) or v not in loose
 
-    for variable, value in zip((*jaxpr.constvars, *jaxpr.invars), (*consts, *args), strict=True):
+    variables = (*jaxpr.constvars, *jaxpr.invars)
+    for variable, value, is_one in zip(variables, values, fixed, strict=True):
         if not isinstance(value, Components):
             # What is known before the program runs may still be NumPy's.
             value = jnp.asarray(value)
         env[variable] = _entries(value) if is_short(value) else value
-    loose.update(v for v, is_one in zip(jaxpr.invars, fixed, strict=True) if not is_one)
+        if not is_one:
+            loose.add(variable)
     for eqn in jaxpr.eqns:
         values = [read(v) for v in eqn.invars]
         fixed = [is_fixed(v) for v in eqn.invars]
@@ -118,7 +127,10 @@ def _evaluate(
         name = eqn.primitive.name
         if name in ("jit", "pjit"):
             inner = eqn.params["jaxpr"]
-            outs, outs_fixed = _evaluate(inner.jaxpr, inner.consts, values, fixed)
+            constants = [True] * len(inner.consts)
+            outs, outs_fixed = _evaluate(
+                inner.jaxpr, (*inner.consts, *values), (*constants, *fixed)
+            )
         elif eqn.primitive is unpack_p and isinstance(values[0], Components):
             outs = values[0]
         else:
