@@ -112,7 +112,8 @@ def flops_of_step(method: diffrax.AbstractSolver) -> int:
     """Floating-point operations of one step, evaluations of the field included."""
 
     def step(t0, t1, y, inertia):
-        return method.step(_TERM, t0, t1, y, inertia, None, made_jump=False)[0]
+        state = method.init(_TERM, t0, t1, y, inertia)
+        return method.step(_TERM, t0, t1, y, inertia, state, made_jump=False)[0]
 
     scalar, vector = jax.ShapeDtypeStruct((), float), jax.ShapeDtypeStruct((3,), float)
     return count_flops(step, scalar, scalar, vector, vector)
