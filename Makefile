@@ -1,7 +1,7 @@
 PYTHON ?= python3
 BIN := .venv/bin
 
-.PHONY: paper test clean
+.PHONY: paper test test-all clean
 
 # Tables and figures of the paper, in figures/.
 paper: .venv/paper
@@ -13,6 +13,10 @@ test: .venv/dev
 	$(BIN)/ruff format --check .
 	$(BIN)/pyright
 	$(BIN)/python -m pytest --numprocesses auto --dist worksteal
+
+# The slow ones too.
+test-all: .venv/dev
+	$(BIN)/python -m pytest --numprocesses auto --dist worksteal -m "slow or not slow"
 
 .venv/paper .venv/dev: pyproject.toml
 	test -x $(BIN)/python || $(PYTHON) -m venv .venv

@@ -224,7 +224,11 @@ METHODS = {
 # The low-storage methods ask nothing more of a field: they get one of each kind of points.
 PAIRS = [
     *((kind, "CF4") for kind in GRID),
-    *((kind, "RKMK3") for kind in GRID if kind != "own class"),
+    *(
+        pytest.param(kind, "RKMK3", marks=[pytest.mark.slow] * (kind not in ("vector", "affine")))
+        for kind in GRID
+        if kind != "own class"
+    ),
     *((kind, "Williamson3") for kind in ("right", "low rank", "affine on points")),
     *((kind, "CayleyRK4") for kind in ("low rank", "bordered")),
 ]
@@ -396,6 +400,7 @@ def test_hessian_vector_products(solver, problem, num_steps):
     np.testing.assert_allclose(left, right, rtol=1e-11, atol=1e-11)
 
 
+@pytest.mark.slow
 def test_a_gradient_of_a_gradient():
     """Reverse over reverse, against differences of gradients."""
     field, y0, args = BODY

@@ -314,7 +314,7 @@ def test_a_hessian():
     def fun(y):
         return jnp.sum(jnp.sin(end(*POINT[:2], y, ARGS)))
 
-    hessian = jax.jit(jax.hessian(fun))(Y0)
+    hessian = jax.jit(jax.hessian(fun), compiler_options=problems.QUICK)(Y0)
     assert np.abs(hessian).max() > 0.1
     close(hessian, hessian.T, atol=1e-13)
     gradient = jax.jit(jax.grad(fun))
@@ -401,8 +401,7 @@ def test_the_memory_backwards_grows_with_the_root_of_the_steps_on_request():
     assert 3 * 90 <= states(100) - states(10) <= 3.1 * 90
 
 
-@pytest.mark.parametrize("checkpoint_every", [1, 4, 5, 12, 30])
-@pytest.mark.parametrize("save_every", [None, 6])
+@pytest.mark.parametrize("checkpoint_every, save_every", [(1, None), (5, None), (4, 6), (30, 6)])
 def test_fewer_checkpoints_give_the_same_numbers(checkpoint_every, save_every):
     def run(y0, **options):
         sol = cfjax.integrate(
@@ -698,13 +697,13 @@ def test_compensation_serves_matrices_whose_field_offers_a_displacement():
     for solver in (cfjax.CF4(estimate=None), cfjax.RKMK4()):
         term = cfjax.LieTerm(field)
         state = solver.init(term, 0.0, 0.1, y0, None)
-        assert state["vector"] is state["shift"] is None
+        assert state["vector"].lost is state["shift"] is None
         for _ in range(2):
             y1, _, _, state, _ = solver.step(term, 0.0, 0.1, y0, None, state, made_jump=False)
             for name in ("rotated", "left", "right"):
-                assert state[name].dtype == y1[name].dtype == y0[name].dtype
+                assert state[name].lost.dtype == y1[name].dtype == y0[name].dtype
                 # What a sum loses is at most half a unit in the last place.
-                lost = np.abs(state[name]) / np.spacing(np.abs(np.asarray(y1[name])))
+                lost = np.abs(state[name].lost) / np.spacing(np.abs(np.asarray(y1[name])))
                 assert 0 < lost.max() <= 0.5
 
 

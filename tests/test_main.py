@@ -58,6 +58,7 @@ def test_every_chart_says_what_it_shows():
         assert chart.__doc__ and len(chart.__doc__.splitlines()[0]) > 10, name
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("name", ["heat", "stiefel_first", "stiefel_second"])
 def test_charts_of_the_other_scenes(name, monkeypatch):
     module = getattr(scenes, name.partition("_")[0])

@@ -70,6 +70,7 @@ def test_rk4_at_its_limit():
 # RKMK4 and CF4 against the number of intervals
 
 
+@pytest.mark.slow
 def test_steps_needed_against_the_number_of_intervals():
     for name in ("RKMK4", "RK4"):
         few, many = (adaptive(METHODS[name], 1e-3, n).num_steps for n in (50, 200))
