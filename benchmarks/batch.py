@@ -150,7 +150,8 @@ def _gradients(options: argparse.Namespace) -> Table:
 
     solves = {
         "cfjax.integrate, CF4": _solve,
-        "diffrax, CF4": by_diffrax(TERM, cfjax.CF4(estimate=None)),
+        "diffrax, CF4": by_diffrax(TERM, cfjax.CF4()),
+        "diffrax, CF4, no estimate": by_diffrax(TERM, cfjax.CF4(estimate=None)),
         "diffrax, Tsit5": by_diffrax(space, diffrax.Tsit5()),
     }
     table = _table(f"Gradients of {GRADIENTS} trajectories", "gradient / values")

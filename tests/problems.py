@@ -160,6 +160,18 @@ def slope(steps: Sequence[int], errors: np.ndarray) -> float:
     return -float(np.polyfit(np.log(steps), np.log(errors), 1)[0])
 
 
+class Growth(cfjax.AbstractFrozenField):
+    """A class of a user's own, without a bracket."""
+
+    rate: jax.Array
+
+    def flow(self, point):
+        return point * jnp.exp(self.rate)
+
+    def tangent(self, point):
+        return point * self.rate
+
+
 # Derivatives.
 
 # For `jax.jit` where most of the time of a test is the compilation of a derivative.

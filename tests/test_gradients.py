@@ -184,20 +184,8 @@ def translation(t, y, args):
     return args * jnp.sin(y + t)
 
 
-class Growth(cfjax.AbstractFrozenField):
-    """A class of a user's own, without a bracket."""
-
-    rate: jax.Array
-
-    def flow(self, point):
-        return point * jnp.exp(self.rate)
-
-    def tangent(self, point):
-        return point * self.rate
-
-
 def growth(t, y, args):
-    return Growth(args * jnp.stack([1 - y[1], y[0] - t]))
+    return problems.Growth(args * jnp.stack([1 - y[1], y[0] - t]))
 
 
 _rng = np.random.default_rng(2)

@@ -455,18 +455,9 @@ def test_mistakes(change, message, no_shape_hook):
 
 
 def test_a_mistake_names_its_method():
-    class Growth(cfjax.AbstractFrozenField):
-        rate: jax.Array
-
-        def flow(self, point):
-            return point * jnp.exp(self.rate)
-
-        def tangent(self, point):
-            return point * self.rate
-
     with pytest.raises(TypeError, match="needs brackets") as info:
         cfjax.work_precision(
-            cfjax.LieTerm(lambda t, y, args: Growth(-y)),
+            cfjax.LieTerm(lambda t, y, args: problems.Growth(-y)),
             0.0,
             1.0,
             jnp.ones(2),

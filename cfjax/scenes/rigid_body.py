@@ -43,7 +43,6 @@ def energy(
     y: Float[Array | np.ndarray, "*batch 3"], inertia: Float[Array | np.ndarray, "3"]
 ) -> Float[Array, "*batch"]:
     """The kinetic energy `y^T I^-1 y / 2`."""
-    # The default precision of a product drops digits of float32 on GPU and TPU.
     return matmul(y * y, 0.5 / inertia)
 
 
