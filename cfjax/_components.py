@@ -1,26 +1,32 @@
-"""Evaluation of a function with short vectors held as their components.
+"""Evaluation of a function with small arrays held as their components.
 
 XLA fuses scalars well and vectors of three badly: it computes what several components need once
 for each of them, or sends it through memory. A step of a small system runs several times faster
-when no short vector is ever built inside it, above all in a batch.
+when no small array is ever built inside it, above all in a batch.
 """
 
-from collections.abc import Callable, Sequence
-from typing import Any
+import functools
+import math
+import operator
+from collections.abc import Callable, Iterable, Sequence
+from contextvars import ContextVar
+from typing import Any, NamedTuple, SupportsIndex
 
 import jax
 import jax.numpy as jnp
 import jax.tree_util as jtu
+import numpy as np
 from jax import lax
 from jax.custom_batching import custom_vmap
 from jax.extend.core import ClosedJaxpr, DropVar, Jaxpr, JaxprEqn, Literal, jaxpr_as_fun
 from jaxtyping import Array, PyTree
 
-from ._functions.pack import pack, pack_p, unpack, unpack_p
+from ._functions.pack import held, held_p, pack, pack_p, unpack, unpack_p
 
-# Longer vectors fuse well as they are, and the program grows with the number of components.
+# Larger arrays fuse well as they are, and the program grows with the number of components.
 _MAX_LENGTH = 6
-_MAX_PRODUCT = 16
+_MAX_SIZE = 9
+_MAX_PRODUCT = 36
 
 _CHEAP = frozenset(
     "abs add add_any and ceil clamp complex conj convert_element_type copy eq floor ge gt imag "
@@ -32,22 +38,38 @@ _EXPENSIVE = frozenset(
     "logistic pow rem rsqrt sin sinh sqrt tan tanh".split()
 )
 
+_CALLS = frozenset(("jit", "pjit"))
+_BRANCHES = frozenset(("cond", "scan", "while"))
+
 
 @jtu.register_pytree_node_class
-class Components(tuple):
-    """A vector as the tuple of its components, which are scalars."""
+class Components:
+    """A small array as its entries, which are scalars, row by row."""
 
-    def tree_flatten(self) -> tuple[tuple, None]:
-        return tuple(self), None
+    def __init__(self, entries: Iterable[Any], shape: tuple[int, ...]):
+        self.entries = tuple(entries)
+        self.shape = shape
+
+    def at(self, places: np.ndarray) -> Any:
+        """The entries at some places, which are their numbers: an array, or one entry."""
+        if places.ndim == 0:
+            return self.entries[int(places)]
+        return Components([self.entries[k] for k in places.flat], places.shape)
+
+    def tree_flatten(self) -> tuple[tuple, tuple[int, ...]]:
+        return self.entries, self.shape
 
     @classmethod
-    def tree_unflatten(cls, _, children):
-        return cls(children)
+    def tree_unflatten(cls, shape, children):
+        return cls(children, shape)
 
 
-def split(tree: PyTree) -> PyTree:
-    """The tree with every vector of at most six entries in components."""
-    return jtu.tree_map(lambda x: _entries(x) if is_short(x) else x, tree)
+def split(tree: PyTree, matrices: bool) -> PyTree:
+    """The tree with every vector of at most six entries in components.
+
+    With `matrices` every array of at most nine entries, such as a matrix of 3 x 3.
+    """
+    return jtu.tree_map(lambda x: _components(x) if _is_small(np.shape(x), matrices) else x, tree)
 
 
 def join(tree: PyTree) -> PyTree:
@@ -55,48 +77,95 @@ def join(tree: PyTree) -> PyTree:
     return jtu.tree_map(_whole, tree, is_leaf=_is_components)
 
 
-def by_components(fun: Callable[[PyTree], PyTree], y: PyTree) -> PyTree:
-    """`fun(y)`, computed with every vector of at most six entries in components.
+def is_small(x: Any) -> bool:
+    """Whether an array has at most nine entries."""
+    return _is_small(np.shape(x), matrices=True)
 
-    `fun` takes whole arrays; `y` and the result are trees that are split. The result agrees with
-    that of `fun` to rounding. `fun` may close over traced values. Operations that have no rule here
-    get the vector whole, so every function works. Where nothing in `y` is split, this is `fun(y)`.
+
+def is_short(x: Any) -> bool:
+    """Whether an array is a vector of at most six entries."""
+    return _is_small(np.shape(x), matrices=False)
+
+
+def num_components(tree: PyTree) -> int:
+    """The number of components of all arrays that can be split."""
+    return sum(np.size(x) for x in jtu.tree_leaves(tree) if is_small(x))
+
+
+def by_components(fun: Callable[[PyTree], PyTree], y: PyTree) -> PyTree:
+    """`fun(y)`, computed with every small array in components.
+
+    The result agrees with that of `fun` to rounding. `fun` may close over traced values. Operations
+    that have no rule here get the array whole, so every function works. Where nothing in `y` is
+    split, and inside of `trace`, this is `fun(y)`.
 
     Divisions by what no `y` changes become products with the reciprocal, as XLA does for literals:
     a loop then computes the reciprocal once, and a division would be a barrier to fusion. Not so
     where a part of `y` stays whole: there the barrier saves XLA from computing the components anew
     for every entry of that part.
     """
-    if not _has_components(y):
-        return split(fun(y))
-    program, parameters = trace(fun, y)
-    return program(y, parameters)
+    if _is_inside.get() or num_components(y) == 0:
+        return fun(y)
+    program, parameters, is_straight = trace(fun, y)
+    matrices = is_straight and num_components(y) <= _MAX_SIZE
+    return join(program(split(y, matrices), split(parameters, matrices), matrices))
+
+
+_is_inside: ContextVar[bool] = ContextVar("is_inside", default=False)
 
 
 def trace(
     fun: Callable[[PyTree], PyTree], y: PyTree
-) -> tuple[Callable[[PyTree, PyTree], PyTree], PyTree]:
-    """A program for `by_components`, and what `fun` closes over, split: `program(y, parameters)`.
+) -> tuple[Callable[[PyTree, PyTree, bool], PyTree], list[Array], bool]:
+    """A program for `by_components`, what `fun` closes over, and whether to split matrices.
 
-    The program itself closes over nothing that is traced.
+    `program(y, parameters, matrices)` takes both split, with the same `matrices`, and returns what
+    is split. It closes over nothing that is traced. Matrices that go through branches or loops, as
+    in `expm`, are better left whole: XLA fuses nothing across these.
     """
-    jaxpr, out = jax.make_jaxpr(fun, return_shape=True)(join(y))
+    token = _is_inside.set(True)
+    try:
+        jaxpr, out = jax.make_jaxpr(fun, return_shape=True)(y)
+    finally:
+        _is_inside.reset(token)
 
-    def program(y: PyTree, parameters: PyTree) -> PyTree:
+    def program(y: PyTree, parameters: PyTree, matrices: bool) -> PyTree:
+        values = jtu.tree_leaves(y, is_leaf=_is_components)
         if _has_components(y):
-            values = jtu.tree_leaves(y, is_leaf=_is_components)
             is_all = all(_is_components(value) or jnp.ndim(value) == 0 for value in values)
-            fixed = [is_all] * len(parameters) + [False] * len(values)
-            outs, _ = _evaluate(jaxpr.jaxpr, (*parameters, *values), fixed)
+            fixed = [True] * len(parameters) + [False] * len(values)
+            rules = _Rules(matrices, reciprocals=is_all)
+            outs, _ = _evaluate(jaxpr.jaxpr, (*parameters, *values), fixed, rules)
         else:
-            outs = jaxpr_as_fun(ClosedJaxpr(jaxpr.jaxpr, join(parameters)))(*jtu.tree_leaves(y))
-        return split(jtu.tree_unflatten(jtu.tree_structure(out), outs))
+            outs = jaxpr_as_fun(ClosedJaxpr(jaxpr.jaxpr, join(parameters)))(*values)
+        return split(jtu.tree_unflatten(jtu.tree_structure(out), outs), matrices)
 
-    return program, split(list(map(jnp.asarray, jaxpr.consts)))
+    return program, list(map(jnp.asarray, jaxpr.consts)), _is_straight(jaxpr.jaxpr)
+
+
+def _is_straight(jaxpr: Jaxpr) -> bool:
+    """Whether no small matrix goes through a branch or a loop."""
+
+    def is_matrix(v: Any) -> bool:
+        return v.aval.ndim > 1 and _is_small(v.aval.shape, matrices=True)
+
+    return all(
+        _is_straight(eqn.params["jaxpr"].jaxpr)
+        if eqn.primitive.name in _CALLS
+        else eqn.primitive.name not in _BRANCHES or not any(map(is_matrix, eqn.invars))
+        for eqn in jaxpr.eqns
+    )
+
+
+class _Rules(NamedTuple):
+    """What is taken apart besides vectors, and whether fixed divisors become reciprocals."""
+
+    matrices: bool
+    reciprocals: bool
 
 
 def _evaluate(
-    jaxpr: Jaxpr, values: Sequence[Any], fixed: Sequence[bool]
+    jaxpr: Jaxpr, values: Sequence[Any], fixed: Sequence[bool], rules: _Rules
 ) -> tuple[list[Any], list[bool]]:
     """What a program makes of values for its constants and arguments, some of which are fixed.
 
@@ -117,7 +186,7 @@ def _evaluate(
         if not isinstance(value, Components):
             # What is known before the program runs may still be NumPy's.
             value = jnp.asarray(value)
-        env[variable] = _entries(value) if is_short(value) else value
+        env[variable] = _components(value) if _is_small(value.shape, rules.matrices) else value
         if not is_one:
             loose.add(variable)
     for eqn in jaxpr.eqns:
@@ -125,53 +194,57 @@ def _evaluate(
         fixed = [is_fixed(v) for v in eqn.invars]
         outs_fixed = [all(fixed)] * len(eqn.outvars)
         name = eqn.primitive.name
-        if name in ("jit", "pjit"):
+        if name in _CALLS:
             inner = eqn.params["jaxpr"]
             constants = [True] * len(inner.consts)
             outs, outs_fixed = _evaluate(
-                inner.jaxpr, (*inner.consts, *values), (*constants, *fixed)
+                inner.jaxpr, (*inner.consts, *values), (*constants, *fixed), rules
             )
         elif eqn.primitive is unpack_p and isinstance(values[0], Components):
-            outs = values[0]
+            outs = [values[0].at(p) for p in np.moveaxis(_places(values[0]), eqn.params["axis"], 0)]
+        elif eqn.primitive is held_p:
+            # What is whole is in memory anyway.
+            (x,) = values
+            outs = [Components(held(x.entries), x.shape) if _is_components(x) else x]
         else:
-            out = _in_components(eqn, name, values, fixed)
+            out = _in_components(eqn, name, values, fixed, rules)
             outs = [out] if out is not None else _on_whole_arrays(jaxpr, eqn, values)
         env.update(zip(eqn.outvars, outs, strict=True))
         loose.update(v for v, is_one in zip(eqn.outvars, outs_fixed, strict=True) if not is_one)
     return [read(v) for v in jaxpr.outvars], [is_fixed(v) for v in jaxpr.outvars]
 
 
-def _in_components(eqn: JaxprEqn, name: str, values: list[Any], fixed: Sequence[bool]) -> Any:
+def _in_components(
+    eqn: JaxprEqn, name: str, values: list[Any], fixed: Sequence[bool], rules: _Rules
+) -> Any:
     """The result of one operation, if there is a rule for it, else None."""
-    aval: Any = eqn.outvars[0].aval if not eqn.primitive.multiple_results else None
+    if eqn.primitive.multiple_results:
+        return None
+    aval: Any = eqn.outvars[0].aval
     shape = getattr(aval, "shape", None)
-    if name == "div" and fixed == [False, True] and _is_small_and_real(aval):
-        return _by_reciprocal(values[0], values[1], aval.size)
-    if shape is not None and len(shape) == 1 and 1 <= shape[0] <= _MAX_LENGTH:
+    if shape is None or not (shape == () or _is_small(shape, rules.matrices)):
+        return None
+    if name == "div" and fixed == [False, True] and jnp.issubdtype(aval.dtype, jnp.floating):
+        if rules.reciprocals:
+            return _by_reciprocal(values[0], values[1], shape)
+    if shape != ():
         if name in _CHEAP or name in _EXPENSIVE:
-            rows = list(zip(*(_entries(v, shape[0]) for v in values), strict=True))
+            rows = list(zip(*(_components(v, shape).entries for v in values), strict=True))
             if name in _CHEAP:
-                return Components(eqn.primitive.bind(*row, **eqn.params) for row in rows)
-            return _expensive(eqn, rows)
-        if name == "broadcast_in_dim" and _ndim(values[0]) == 0:
-            return Components(values * shape[0])
-        if name == "slice" and isinstance(values[0], Components):
-            (start,), (stop,) = eqn.params["start_indices"], eqn.params["limit_indices"]
-            (stride,) = eqn.params["strides"] or (1,)
-            return Components(values[0][start:stop:stride])
+                return Components((eqn.primitive.bind(*row, **eqn.params) for row in rows), shape)
+            return _expensive(eqn, rows, shape)
         if eqn.primitive is pack_p:
-            return Components(values)
+            return _moved(values, lambda *places: np.stack(places, eqn.params["axis"]))
         if name == "concatenate":
-            return Components(entry for v in values for entry in _entries(v))
-        if name == "dot_general" and _is_plain_product(eqn, values):
-            return _product(eqn, *values)
-    elif shape == () and values and isinstance(values[0], Components):
-        if name in ("squeeze", "reshape"):
-            return values[0][0]
+            axis = eqn.params["dimension"]
+            return _moved(values, lambda *places: np.concatenate(places, axis))
+    if values and (isinstance(values[0], Components) or name == "broadcast_in_dim"):
+        if name in _MOVES:
+            return _moved(values[:1], lambda places: _MOVES[name](places, shape, eqn.params))
         if name == "reduce_sum":
-            return sum(values[0][1:], start=values[0][0])
-        if name == "dot_general" and _is_plain_product(eqn, values):
-            return _dot(values[0], _entries(values[1]))
+            return _summed(values[0], eqn.params["axes"], shape)
+    if name == "dot_general" and _is_plain_product(eqn, values, fixed):
+        return _product(values[0], values[1], eqn.params["dimension_numbers"][0], shape)
     return None
 
 
@@ -189,20 +262,54 @@ def _on_whole_arrays(jaxpr: Jaxpr, eqn: JaxprEqn, values: Sequence[Any]) -> Sequ
     return [None if isinstance(v, DropVar) else next(outs) for v in eqn.outvars]
 
 
-def _is_small_and_real(aval: Any) -> bool:
-    return aval.ndim <= 1 and aval.size <= _MAX_LENGTH and jnp.issubdtype(aval.dtype, jnp.floating)
+def _broadcast(places: np.ndarray, shape: tuple[int, ...], params: dict[str, Any]) -> np.ndarray:
+    sides = [1] * len(shape)
+    for k, n in zip(params["broadcast_dimensions"], places.shape, strict=True):
+        sides[k] = n
+    return np.broadcast_to(places.reshape(sides), shape)
 
 
-def _by_reciprocal(x: Any, divisor: Any, length: int) -> Any:
-    if _ndim(x) == 0 and _ndim(divisor) == 0:
-        return x * lax.integer_pow(divisor, -1)
+def _slice(places: np.ndarray, shape: tuple[int, ...], params: dict[str, Any]) -> np.ndarray:
+    starts, limits = params["start_indices"], params["limit_indices"]
+    strides = params["strides"] or [1] * len(shape)
+    return places[tuple(slice(*ends) for ends in zip(starts, limits, strides, strict=True))]
+
+
+# Operations that only move entries: what they do to an array of places.
+_MOVES: dict[str, Callable[[np.ndarray, tuple[int, ...], dict[str, Any]], np.ndarray]] = {
+    "broadcast_in_dim": _broadcast,
+    "reshape": lambda places, shape, params: places.reshape(shape),
+    "squeeze": lambda places, shape, params: places.reshape(shape),
+    "slice": _slice,
+    "transpose": lambda places, shape, params: places.transpose(params["permutation"]),
+    "rev": lambda places, shape, params: np.flip(places, params["dimensions"]),
+}
+
+
+def _moved(values: Sequence[Any], move: Callable[..., np.ndarray]) -> Any:
+    arrays = list(map(_components, values))
+    entries = [entry for x in arrays for entry in x.entries]
+    firsts = np.cumsum([0, *(len(x.entries) for x in arrays)])
+    places = move(*(np.asarray(n + _places(x)) for n, x in zip(firsts, arrays, strict=False)))
+    return Components(entries, (len(entries),)).at(places)
+
+
+def _summed(x: Components, axes: Sequence[SupportsIndex], shape: tuple[int, ...]) -> Any:
+    kept = [k for k in range(len(x.shape)) if k not in axes]
+    rows = _places(x).transpose(*kept, *axes).reshape(math.prod(shape), -1)
+    return _shaped([functools.reduce(operator.add, x.at(row).entries) for row in rows], shape)
+
+
+def _by_reciprocal(x: Any, divisor: Any, shape: tuple[int, ...]) -> Any:
     # Each reciprocal once, also if there is one divisor for all entries.
-    reciprocals = [lax.integer_pow(entry, -1) for entry in _entries(divisor)]
-    entries = zip(_entries(x, length), _entries(Components(reciprocals), length), strict=True)
-    return Components(a * b for a, b in entries)
+    divisor = jtu.tree_map(lambda entry: lax.integer_pow(entry, -1), divisor)
+    if shape == ():
+        return x * divisor
+    pairs = zip(_components(x, shape).entries, _components(divisor, shape).entries, strict=True)
+    return Components((a * b for a, b in pairs), shape)
 
 
-def _expensive(eqn: JaxprEqn, rows: Sequence[tuple]) -> Components:
+def _expensive(eqn: JaxprEqn, rows: Sequence[tuple], shape: tuple[int, ...]) -> Components:
     """An operation that XLA never repeats, but writes to memory as often as it occurs.
 
     For a single system one vector goes through memory faster than several scalars. In a batch
@@ -219,7 +326,7 @@ def _expensive(eqn: JaxprEqn, rows: Sequence[tuple]) -> Components:
     rows = jtu.tree_map(jnp.asarray, tuple(rows))
     # A constant by the time XLA sees it, so only one of the two is compiled.
     batched = _is_batched(jtu.tree_map(lambda x: x != x, rows))
-    return Components(lax.cond(batched, by_component, whole, rows))
+    return Components(lax.cond(batched, by_component, whole, rows), shape)
 
 
 @custom_vmap
@@ -233,29 +340,37 @@ def _(axis_size: int, in_batched: PyTree, values: PyTree) -> tuple[Array, bool]:
     return jnp.asarray(True), False
 
 
-def _is_plain_product(eqn: JaxprEqn, values: Sequence[Any]) -> bool:
-    """A vector times a vector or a small matrix, all of one dtype."""
+def _is_plain_product(eqn: JaxprEqn, values: Sequence[Any], fixed: Sequence[bool]) -> bool:
+    """A small product of vectors or matrices, of one dtype.
+
+    Not with a part of the state that is whole: taking that apart is slower, above all backwards.
+    """
     contracted, batched = eqn.params["dimension_numbers"]
     avals: list[Any] = [v.aval for v in (*eqn.invars, *eqn.outvars)]
+    terms = math.prod(avals[0].shape[k] for k in contracted[0])
     return (
-        any(isinstance(v, Components) for v in values)
-        and all(aval.size <= _MAX_PRODUCT for aval in avals)
+        any(map(_is_components, values))
+        and all(is_one or _is_components(v) for v, is_one in zip(values, fixed, strict=True))
+        and batched == ((), ())
         and len({aval.dtype for aval in avals}) == 1
-        and tuple(map(len, (*contracted, *batched))) == (1, 1, 0, 0)
+        and 1 <= avals[2].size * terms <= _MAX_PRODUCT
     )
 
 
-def _product(eqn: JaxprEqn, left: Any, right: Any) -> Components:
-    (left_axes, right_axes), _ = eqn.params["dimension_numbers"]
-    if isinstance(left, Components):
-        left, right, left_axes = right, left, right_axes
-    rows = left if left_axes == (1,) else left.T
-    return Components(_dot(_entries(row), right) for row in rows)
+def _product(left: Any, right: Any, contracted: Any, shape: tuple[int, ...]) -> Any:
+    rows, columns = (
+        np.moveaxis(_places(x), axes, range(len(axes)))
+        .reshape(math.prod(x.shape[k] for k in axes), -1)
+        .T
+        for x, axes in zip(map(_components, (left, right)), contracted, strict=True)
+    )
+    left, right = _components(left), _components(right)
+    dots = [_dot(left.at(a).entries, right.at(b).entries) for a in rows for b in columns]
+    return _shaped(dots, shape)
 
 
 def _dot(a: Sequence[Any], b: Sequence[Any]) -> Any:
-    total, *rest = (x * y for x, y in zip(a, b, strict=True))
-    return sum(rest, start=total)
+    return functools.reduce(operator.add, (x * y for x, y in zip(a, b, strict=True)))
 
 
 def _has_components(tree: PyTree) -> bool:
@@ -266,21 +381,26 @@ def _is_components(x: Any) -> bool:
     return isinstance(x, Components)
 
 
-def is_short(x: Any) -> bool:
-    return _ndim(x) == 1 and 1 <= len(x) <= _MAX_LENGTH
+def _is_small(shape: tuple[int, ...], matrices: bool) -> bool:
+    if matrices:
+        return len(shape) > 0 and 1 <= math.prod(shape) <= _MAX_SIZE
+    return len(shape) == 1 and 1 <= shape[0] <= _MAX_LENGTH
 
 
-def _ndim(x: Any) -> int:
-    return 1 if isinstance(x, Components) else jnp.ndim(x)
+def _shaped(entries: Sequence[Any], shape: tuple[int, ...]) -> Any:
+    return Components(entries, shape) if shape else entries[0]
 
 
-def _entries(x: Any, length: int | None = None) -> Components:
-    """The components of a vector; `length` copies of a scalar or of the only entry."""
-    if _ndim(x) == 0:
-        return Components([x] * (length or 1))
-    entries = x if isinstance(x, Components) else Components(unpack(x))
-    return Components(entries * length) if length and len(entries) == 1 else entries
+def _places(x: Components) -> np.ndarray:
+    return np.arange(len(x.entries)).reshape(x.shape)
+
+
+def _components(x: Any, shape: tuple[int, ...] = ()) -> Components:
+    """An array in components; with a shape, broadcast to it."""
+    if not isinstance(x, Components):
+        x = Components(unpack(jnp.ravel(x)) if jnp.ndim(x) else [x], jnp.shape(x))
+    return x if shape in ((), x.shape) else x.at(np.broadcast_to(_places(x), shape))
 
 
 def _whole(x: Any) -> Any:
-    return pack(x) if isinstance(x, Components) else x
+    return pack(x.entries).reshape(x.shape) if isinstance(x, Components) else x

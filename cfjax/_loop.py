@@ -10,11 +10,14 @@ import jax.tree_util as jtu
 from jax import lax
 from jaxtyping import Array, PyTree
 
-from ._components import join, split, trace
+from ._components import join, num_components, split, trace
 from ._functions.pack import pack, unpack
 
 # Beyond, the derivative gains less than copying them costs.
 _MAX_TRAVELLERS = 16
+# Beyond, matrices stay whole: XLA would compute anew for every component what they share.
+_MOST_FORWARD = 48
+_MOST_BACKWARD = 18
 
 
 def repeat(step: Callable[[PyTree], PyTree], carry: PyTree, num_steps: int) -> PyTree:
@@ -29,51 +32,76 @@ def repeat(step: Callable[[PyTree], PyTree], carry: PyTree, num_steps: int) -> P
     that is, what `step` closes over, travel with them unchanged: in the reversed loop they are the
     sums of the derivatives, which else would be results of their own.
     """
-    leaves, structure = jtu.tree_flatten(split(carry))
-    program, parameters = trace(step, split(carry))
-    values, parameter_structure = jtu.tree_flatten(parameters)
+    program, parameters, is_straight = trace(step, carry)
+    leaves, structure = jtu.tree_flatten(carry)
 
-    def split_step(leaves: list[Any], values: list[Any]) -> list[Any]:
+    def step_of_leaves(leaves: list[Any], values: list[Any], matrices: bool) -> list[Any]:
         carry = jtu.tree_unflatten(structure, leaves)
-        return jtu.tree_leaves(program(carry, jtu.tree_unflatten(parameter_structure, values)))
+        return structure.flatten_up_to(program(carry, values, matrices))
 
-    leaves = _repeat(list(map(jnp.asarray, leaves)), values, step=split_step, num_steps=num_steps)
-    return join(jtu.tree_unflatten(structure, leaves))
+    leaves = list(map(jnp.asarray, leaves))
+    most = (_MOST_FORWARD, _MOST_BACKWARD) if is_straight else (0, 0)
+    leaves = _repeat(leaves, parameters, program=step_of_leaves, num_steps=num_steps, most=most)
+    return jtu.tree_unflatten(structure, leaves)
 
 
 @eqx.filter_custom_jvp
 def _repeat(
-    leaves: list[Array], values: list[Array], *, step: Callable, num_steps: int
+    leaves: list[Array],
+    values: list[Array],
+    *,
+    program: Callable,
+    num_steps: int,
+    most: tuple[int, int],
 ) -> list[Array]:
-    return _scan(step, num_steps, leaves, values, [False] * len(values))
+    matrices = num_components(leaves) <= most[0]
+    return _scan(program, num_steps, leaves, values, matrices, [False] * len(values))
 
 
 @_repeat.def_jvp
-def _(primals, tangents, *, step, num_steps):
+def _(primals, tangents, *, program, num_steps, most):
     leaves, values = primals
-    numbers, _ = _part(leaves, _packed(leaves))
-    travels = [
-        tangent is not None and bool(numbers) and _is_number(value, numbers[0].dtype)
-        for value, tangent in zip(values, tangents[1], strict=True)
-    ]
-    if sum(travels) > _MAX_TRAVELLERS:
-        travels = [False] * len(values)
+    matrices = num_components(leaves) <= most[1]
+    moves = [tangent is not None for tangent in tangents[1]]
+    pieces = [len(jtu.tree_leaves(split(value, matrices))) for value in values]
+    if sum(n for n, is_one in zip(pieces, moves, strict=True) if is_one) > _MAX_TRAVELLERS:
+        moves = [False] * len(moves)
     return eqx.filter_jvp(
-        lambda leaves, values: _scan(step, num_steps, leaves, values, travels), primals, tangents
+        lambda leaves, values: _scan(program, num_steps, leaves, values, matrices, moves),
+        primals,
+        tangents,
     )
 
 
 def _scan(
-    step: Callable[[list[Array], list[Array]], list[Array]],
+    program: Callable[[list[Any], list[Any], bool], list[Any]],
     num_steps: int,
     leaves: list[Array],
     values: list[Array],
-    travels: Sequence[bool],
+    matrices: bool,
+    moves: Sequence[bool],
 ) -> list[Array]:
+    """The loop, where values travel that are in components, if they move."""
+    leaves, structure = jtu.tree_flatten(split(leaves, matrices))
     packed = _packed(leaves)
     numbers, rest = _part(leaves, packed)
+    travels = [
+        is_one and bool(numbers) and _is_number(piece, numbers[0].dtype)
+        for value, is_one in zip(values, moves, strict=True)
+        for piece in jtu.tree_leaves(split(value, matrices))
+    ]
+    values, value_structure = jtu.tree_flatten(split(values, matrices))
     known, others = _part(values, travels)
-    step = jax.checkpoint(step)
+
+    @jax.checkpoint
+    def step(leaves: list[Array], values: list[Array]) -> list[Array]:
+        return jtu.tree_leaves(
+            program(
+                jtu.tree_unflatten(structure, leaves),
+                jtu.tree_unflatten(value_structure, values),
+                matrices,
+            )
+        )
 
     def body(carry: tuple[Array | None, list[Array]], _: None) -> tuple[Any, None]:
         vector, rest = carry
@@ -88,7 +116,7 @@ def _scan(
     vector = pack([*numbers, *known]) if numbers else None
     (vector, rest), _ = lax.scan(body, (vector, rest), length=num_steps)
     numbers = [] if vector is None else unpack(vector)[: sum(packed)]
-    return _join(numbers, rest, packed)
+    return join(jtu.tree_unflatten(structure, _join(numbers, rest, packed)))
 
 
 def _packed(leaves: list[Array]) -> list[bool]:

@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 from jax import lax
 
-from cfjax import _components
+from cfjax._components import by_components
 
 Y = np.array([0.3, -0.7, 1.1])
 W = np.array([1.3, 0.4, -0.8])
@@ -17,10 +17,6 @@ M = np.array([[0.2, -1.0, 0.5], [0.7, 0.3, -0.4], [-0.6, 0.9, 1.2]])
 INTS = np.array([3, -2, 5])
 KEY = jax.random.key(0)
 MLP = eqx.nn.MLP(3, 3, 5, 1, activation=jnp.tanh, key=KEY, dtype=jnp.float64)
-
-
-def by_components(fun, y):
-    return _components.join(_components.by_components(fun, _components.split(y)))
 
 
 # Rules whose derivative is not that of the code: what loses the rule gives other numbers.

@@ -16,9 +16,12 @@ from jax.interpreters import ad, batching, mlir
 from jaxtyping import Array
 
 
-def pack(entries: Sequence[Array], axis: int = 0) -> Array:
-    """`jnp.stack` of arrays of one shape and dtype."""
-    return pack_p.bind(*entries, axis=axis)
+def pack(entries: Sequence[Array], axis: int = 0, sums: bool = False) -> Array:
+    """`jnp.stack` of arrays of one shape and dtype.
+
+    With `sums` the transpose takes the entries out as sums, which XLA computes once for all uses.
+    """
+    return pack_p.bind(*entries, axis=axis, sums=sums)
 
 
 def unpack(x: Array, axis: int = 0) -> list[Array]:
@@ -32,7 +35,7 @@ unpack_p.multiple_results = True
 
 
 @pack_p.def_impl
-def _pack_impl(*entries, axis):
+def _pack_impl(*entries, axis, sums=False):
     shape = (*entries[0].shape[:axis], len(entries), *entries[0].shape[axis:])
     rest = [n for n in range(len(shape)) if n != axis]
     *first, whole = (lax.broadcast_in_dim(entry, shape, rest) for entry in entries)
@@ -48,7 +51,7 @@ def _unpack_impl(x, *, axis):
 
 
 @pack_p.def_abstract_eval
-def _(*entries, axis):
+def _(*entries, axis, sums):
     shape = entries[0].shape
     return jax.core.ShapedArray((*shape[:axis], len(entries), *shape[axis:]), entries[0].dtype)
 
@@ -59,9 +62,9 @@ def _(x, *, axis):
     return [jax.core.ShapedArray(shape, x.dtype)] * x.shape[axis]
 
 
-def _pack_jvp(entries, tangents, *, axis):
+def _pack_jvp(entries, tangents, **params):
     tangents = map(ad.instantiate_zeros, tangents)
-    return pack_p.bind(*entries, axis=axis), pack_p.bind(*tangents, axis=axis)
+    return pack_p.bind(*entries, **params), pack_p.bind(*tangents, **params)
 
 
 def _unpack_jvp(xs, tangents, *, axis):
@@ -69,25 +72,30 @@ def _unpack_jvp(xs, tangents, *, axis):
     return unpack_p.bind(x, axis=axis), unpack_p.bind(tangent, axis=axis)
 
 
-def _pack_transpose(cotangent, *entries, axis):
+def _pack_transpose(cotangent, *entries, axis, sums):
     if type(cotangent) is ad.Zero:
         return [None] * len(entries)
+    if sums:
+        place = lax.broadcasted_iota(np.int32, cotangent.shape, axis)
+        return [
+            jnp.sum(jnp.where(place == n, cotangent, 0), axis=axis) for n in range(len(entries))
+        ]
     return unpack_p.bind(cotangent, axis=axis)
 
 
 def _unpack_transpose(cotangents, x, *, axis):
     if all(type(cotangent) is ad.Zero for cotangent in cotangents):
         return [None]
-    return [pack_p.bind(*map(ad.instantiate_zeros, cotangents), axis=axis)]
+    return [pack_p.bind(*map(ad.instantiate_zeros, cotangents), axis=axis, sums=False)]
 
 
-def _pack_batch(entries, dims, *, axis):
+def _pack_batch(entries, dims, *, axis, sums):
     (size,) = {x.shape[d] for x, d in zip(entries, dims, strict=True) if d is not None}
     entries = [
         lax.broadcast(x, (size,)) if d is None else jnp.moveaxis(x, d, 0)
         for x, d in zip(entries, dims, strict=True)
     ]
-    return pack_p.bind(*entries, axis=axis + 1), 0
+    return pack_p.bind(*entries, axis=axis + 1, sums=sums), 0
 
 
 def _unpack_batch(xs, dims, *, axis):
@@ -104,3 +112,49 @@ batching.primitive_batchers[pack_p] = _pack_batch
 batching.primitive_batchers[unpack_p] = _unpack_batch
 mlir.register_lowering(pack_p, mlir.lower_fun(_pack_impl, multiple_results=False))
 mlir.register_lowering(unpack_p, mlir.lower_fun(_unpack_impl, multiple_results=True))
+
+
+def held(entries: Sequence[Array]) -> list[Array]:
+    """The same arrays, of one shape and dtype, through memory.
+
+    XLA computes them once and on their own, instead of anew for everything that uses them. In a
+    batch nothing changes: there memory is what takes time.
+    """
+    return held_p.bind(*entries)
+
+
+held_p = Primitive("cfjax_held")
+held_p.multiple_results = True
+
+
+@held_p.def_impl
+def _held_impl(*entries):
+    # What XLA never computes twice is a reduction. It drops optimization barriers before it fuses.
+    whole = _pack_impl(*entries, axis=0)
+    whole = jnp.sum(_pack_impl(whole, jnp.zeros_like(whole), axis=0), axis=0)
+    return _unpack_impl(whole, axis=0)
+
+
+@held_p.def_abstract_eval
+def _(*entries):
+    return list(entries)
+
+
+def _held_jvp(entries, tangents):
+    return held(entries), held([ad.instantiate_zeros(tangent) for tangent in tangents])
+
+
+def _held_transpose(cotangents, *entries):
+    if all(type(cotangent) is ad.Zero for cotangent in cotangents):
+        return [None] * len(entries)
+    return held([ad.instantiate_zeros(cotangent) for cotangent in cotangents])
+
+
+def _held_batch(entries, dims):
+    return entries, dims
+
+
+ad.primitive_jvps[held_p] = _held_jvp
+ad.primitive_transposes[held_p] = _held_transpose
+batching.primitive_batchers[held_p] = _held_batch
+mlir.register_lowering(held_p, mlir.lower_fun(_held_impl, multiple_results=True))

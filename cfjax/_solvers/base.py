@@ -1,6 +1,7 @@
 """What all Lie group methods are to diffrax: one-step maps made of flows."""
 
 import abc
+import dataclasses
 from collections.abc import Callable
 from typing import Any, ClassVar
 
@@ -11,9 +12,10 @@ import jax.tree_util as jtu
 from jax import lax
 from jaxtyping import Array, Inexact, PyTree, Real
 
-from .._components import by_components, is_short, join, split
+from .._components import by_components, is_short, is_small
 from .._dense import NodeInterpolation
 from .._frozen_field import Displaced, flow, is_displaced, value
+from .._functions.pack import held
 
 
 class AbstractLieSolver(diffrax.AbstractSolver):
@@ -99,9 +101,17 @@ class AbstractLieSolver(diffrax.AbstractSolver):
                 lambda lost, y: y if lost is None else _at_rest(y), lost, y0, is_leaf=_is_leaf
             )
             made = self.move(field, start)
+            # A compensated sum uses the displacement several times.
+            end = jtu.tree_map(
+                lambda lost, p: p if lost is None or lost.lost is None else held_small(p),
+                lost,
+                made.end,
+                is_leaf=_is_leaf,
+            )
+            made = dataclasses.replace(made, end=end)
             return made, None if first is None else values[-1]
 
-        made, last = join(by_components(move, split(y0)))
+        made, last = by_components(move, y0)
         sums = jtu.tree_map(
             lambda lost, p: (p, None) if lost is None else lost.up_to(p),
             lost,
@@ -148,6 +158,13 @@ class _Sum(eqx.Module):
         total = a + b
         rounded = total - a
         return total, _Sum(lax.stop_gradient((a - (total - rounded)) + (b - rounded)))
+
+
+def held_small(point: Any) -> Any:
+    """The same point, computed once for all that uses it (`cfjax._functions.pack.held`)."""
+    if is_displaced(point):
+        return Displaced(point.start, held_small(point.displacement))
+    return held([point])[0] if is_small(point) else point
 
 
 def _is_leaf(x: Any) -> bool:

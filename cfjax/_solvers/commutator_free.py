@@ -23,7 +23,7 @@ from .._frozen_field import (
 )
 from .._order_conditions import order
 from .._tableau import Product, Row, Tableau
-from .base import AbstractLieSolver, Move
+from .base import AbstractLieSolver, Move, held_small
 
 
 class AbstractCommutatorFree(AbstractLieSolver):
@@ -95,6 +95,9 @@ class AbstractCommutatorFree(AbstractLieSolver):
         stages = [trimmed(rows) for rows in (*tableau.alpha, tableau.beta)]
         for c, rows in zip(tableau.c, stages[:-1], strict=True):
             evaluate(float(c), rows)
+        if self.first_same_as_last:
+            # Two results of the step, the state and the last field, need its end.
+            points[stages[-1]] = jtu.tree_map(held_small, point(stages[-1]), is_leaf=is_displaced)
         end = leave(fields[0], point(stages[-1]))
         # All that follows is for error control and output within the step. It is dead code, left
         # out by the compiler, where nobody asks for them.
