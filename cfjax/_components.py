@@ -78,7 +78,7 @@ def join(tree: PyTree) -> PyTree:
 
 
 def is_small(x: Any) -> bool:
-    """Whether an array has at most nine entries."""
+    """Whether this is an array of at most nine entries."""
     return _is_small(np.shape(x), matrices=True)
 
 
@@ -202,10 +202,9 @@ def _evaluate(
             )
         elif eqn.primitive is unpack_p and isinstance(values[0], Components):
             outs = [values[0].at(p) for p in np.moveaxis(_places(values[0]), eqn.params["axis"], 0)]
-        elif eqn.primitive is held_p:
+        elif eqn.primitive is held_p and np.shape(values[0]) != ():
             # What is whole is in memory anyway.
-            (x,) = values
-            outs = [Components(held(x.entries), x.shape) if _is_components(x) else x]
+            outs = [_components(held([_whole(x)])[0]) if _is_components(x) else x for x in values]
         else:
             out = _in_components(eqn, name, values, fixed, rules)
             outs = [out] if out is not None else _on_whole_arrays(jaxpr, eqn, values)

@@ -15,7 +15,7 @@ from jaxtyping import Array, Inexact, PyTree, Real
 from .._components import by_components, is_short, is_small
 from .._dense import NodeInterpolation
 from .._frozen_field import Displaced, flow, is_displaced, value
-from .._functions.pack import held
+from .._functions.pack import held, pack, unpack
 
 
 class AbstractLieSolver(diffrax.AbstractSolver):
@@ -101,13 +101,7 @@ class AbstractLieSolver(diffrax.AbstractSolver):
                 lambda lost, y: y if lost is None else _at_rest(y), lost, y0, is_leaf=_is_leaf
             )
             made = self.move(field, start)
-            # A compensated sum uses the displacement several times.
-            end = jtu.tree_map(
-                lambda lost, p: p if lost is None or lost.lost is None else held_small(p),
-                lost,
-                made.end,
-                is_leaf=_is_leaf,
-            )
+            end = jtu.tree_map(_held_displacement, lost, made.end, is_leaf=_is_leaf)
             made = dataclasses.replace(made, end=end)
             return made, None if first is None else values[-1]
 
@@ -160,11 +154,18 @@ class _Sum(eqx.Module):
         return total, _Sum(lax.stop_gradient((a - (total - rounded)) + (b - rounded)))
 
 
-def held_small(point: Any) -> Any:
-    """The same point, computed once for all that uses it (`cfjax._functions.pack.held`)."""
+def held_entries(point: Any) -> Any:
+    """The same point; the entries of a short vector are computed once for all that uses them."""
     if is_displaced(point):
-        return Displaced(point.start, held_small(point.displacement))
-    return held([point])[0] if is_small(point) else point
+        return Displaced(point.start, held_entries(point.displacement))
+    return pack(held(unpack(point))) if is_short(point) else point
+
+
+def _held_displacement(lost: Any, end: Any) -> Any:
+    """The end of a step. A compensated sum uses the displacement several times."""
+    if isinstance(lost, _Sum) and is_small(lost.lost):
+        return Displaced(end.start, held([end.displacement])[0])
+    return end
 
 
 def _is_leaf(x: Any) -> bool:

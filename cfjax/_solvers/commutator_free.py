@@ -23,7 +23,7 @@ from .._frozen_field import (
 )
 from .._order_conditions import order
 from .._tableau import Product, Row, Tableau
-from .base import AbstractLieSolver, Move, held_small
+from .base import AbstractLieSolver, Move, held_entries
 
 
 class AbstractCommutatorFree(AbstractLieSolver):
@@ -97,7 +97,7 @@ class AbstractCommutatorFree(AbstractLieSolver):
             evaluate(float(c), rows)
         if self.first_same_as_last:
             # Two results of the step, the state and the last field, need its end.
-            points[stages[-1]] = jtu.tree_map(held_small, point(stages[-1]), is_leaf=is_displaced)
+            points[stages[-1]] = jtu.tree_map(held_entries, point(stages[-1]), is_leaf=is_displaced)
         end = leave(fields[0], point(stages[-1]))
         # All that follows is for error control and output within the step. It is dead code, left
         # out by the compiler, where nobody asks for them.
