@@ -29,7 +29,7 @@ STEP = 0.1
 STEPS = 20_000
 BATCH = 10_000
 BATCH_STEPS = 50
-# With its estimate CF4 carries a field from step to step, which XLA computes apart from the state.
+# With its estimate CF4 carries a field from step to step, which costs time in a batch.
 FIXED = cfjax.CF4(estimate=None)
 
 

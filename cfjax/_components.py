@@ -23,7 +23,8 @@ from jaxtyping import Array, PyTree
 
 from ._functions.pack import held, held_p, pack, pack_p, unpack, unpack_p
 
-# Larger arrays fuse well as they are, and the program grows with the number of components.
+# Larger arrays fuse well as they are, and the program grows with the number of components. With
+# matrices come the vectors of all their entries.
 _MAX_LENGTH = 6
 _MAX_SIZE = 9
 _MAX_PRODUCT = 36
@@ -87,27 +88,29 @@ def is_short(x: Any) -> bool:
     return _is_small(np.shape(x), matrices=False)
 
 
-def num_components(tree: PyTree) -> int:
-    """The number of components of all arrays that can be split."""
-    return sum(np.size(x) for x in jtu.tree_leaves(tree) if is_small(x))
+def has_few(tree: PyTree, most: int) -> bool:
+    """Whether there are small matrices, and with all small arrays no more than `most` entries."""
+    small = [x for x in jtu.tree_leaves(tree) if is_small(x)]
+    return any(np.ndim(x) > 1 for x in small) and sum(map(np.size, small)) <= most
 
 
 def by_components(fun: Callable[[PyTree], PyTree], y: PyTree) -> PyTree:
-    """`fun(y)`, computed with every small array in components.
+    """`fun(y)`, computed with every vector of at most six entries in components.
 
-    The result agrees with that of `fun` to rounding. `fun` may close over traced values. Operations
-    that have no rule here get the array whole, so every function works. Where nothing in `y` is
-    split, and inside of `trace`, this is `fun(y)`.
+    Small matrices too, where they are few: XLA would compute anew for every component what many
+    share, above all backwards. The result agrees with that of `fun` to rounding. `fun` may close
+    over traced values. Operations that have no rule here get the array whole, so every function
+    works. Where nothing in `y` is small, and inside of `trace`, this is `fun(y)`.
 
     Divisions by what no `y` changes become products with the reciprocal, as XLA does for literals:
     a loop then computes the reciprocal once, and a division would be a barrier to fusion. Not so
     where a part of `y` stays whole: there the barrier saves XLA from computing the components anew
     for every entry of that part.
     """
-    if _is_inside.get() or num_components(y) == 0:
+    if _is_inside.get() or not any(map(is_small, jtu.tree_leaves(y))):
         return fun(y)
     program, parameters, is_straight = trace(fun, y)
-    matrices = is_straight and num_components(y) <= _MAX_SIZE
+    matrices = is_straight and has_few(y, _MAX_SIZE)
     return join(program(split(y, matrices), split(parameters, matrices), matrices))
 
 

@@ -10,12 +10,13 @@ import jax.tree_util as jtu
 from jax import lax
 from jaxtyping import Array, PyTree
 
-from ._components import join, num_components, split, trace
+from ._components import has_few, join, split, trace
 from ._functions.pack import pack, unpack
 
 # Beyond, the derivative gains less than copying them costs.
 _MAX_TRAVELLERS = 16
-# Beyond, matrices stay whole: XLA would compute anew for every component what they share.
+# With more components matrices stay whole, as in `by_components`. They count twice where their sums
+# are compensated: so an attitude in SO(3) is the largest state taken apart in a derivative.
 _MOST_FORWARD = 48
 _MOST_BACKWARD = 18
 
@@ -27,8 +28,8 @@ def repeat(step: Callable[[PyTree], PyTree], carry: PyTree, num_steps: int) -> P
     again.
 
     On CPU a loop of small steps is fast if XLA has few operations left after fusion, and it fuses
-    towards each result all that leads to it. So there is one result: the components of all short
-    vectors of the carry travel as one vector. In a derivative the components of the parameters,
+    towards each result all that leads to it. So there is one result: the components of all small
+    arrays of the carry travel as one vector. In a derivative the components of the parameters,
     that is, what `step` closes over, travel with them unchanged: in the reversed loop they are the
     sums of the derivatives, which else would be results of their own.
     """
@@ -54,14 +55,14 @@ def _repeat(
     num_steps: int,
     most: tuple[int, int],
 ) -> list[Array]:
-    matrices = num_components(leaves) <= most[0]
+    matrices = has_few(leaves, most[0])
     return _scan(program, num_steps, leaves, values, matrices, [False] * len(values))
 
 
 @_repeat.def_jvp
 def _(primals, tangents, *, program, num_steps, most):
     leaves, values = primals
-    matrices = num_components(leaves) <= most[1]
+    matrices = has_few(leaves, most[1])
     moves = [tangent is not None for tangent in tangents[1]]
     pieces = [len(jtu.tree_leaves(split(value, matrices))) for value in values]
     if sum(n for n, is_one in zip(pieces, moves, strict=True) if is_one) > _MAX_TRAVELLERS:

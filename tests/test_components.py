@@ -10,6 +10,7 @@ import pytest
 from jax import lax
 
 from cfjax._components import by_components
+from cfjax._functions.pack import held
 
 Y = np.array([0.3, -0.7, 1.1])
 W = np.array([1.3, 0.4, -0.8])
@@ -190,9 +191,39 @@ TREE = {
     ),
 }  # fmt: skip
 
+U = np.array([[0.6 + 0.2j, -0.3j], [0.4 + 0.1j, 0.5 - 0.7j]])
+MATRIX = {
+    "moved entries": (
+        lambda m: (m.T @ m[::-1], m[0], m[:, 1:], jnp.stack([m[0], m[:, 1]]), m.reshape(9)[2:5],
+                   jnp.concatenate([m[1:], m[:1]]), jnp.concatenate([m, m], 1), m[1, 2], m[None]),
+        M,
+    ),
+    "matrix arithmetic": (
+        lambda m: (m * m[0] - 2.0 / (3.0 + m), jnp.sin(m) * m[:, :1], jnp.sum(m, 0), jnp.trace(m),
+                   jnp.linalg.norm(m), m[:1, :1] * m, jnp.where(m > 0, m, W), jnp.sum(m * m)),
+        M,
+    ),
+    "products of matrices": (
+        lambda m: (m @ m @ W, M @ m - m @ M, jnp.outer(m[0], m[:, 1]),
+                   jnp.kron(m[:2, :2], m[1:, 1:]),
+                   jnp.einsum("ij,kj->ki", m, m), jnp.einsum("ij,ij->i", m, m),
+                   jnp.tensordot(m, m), jnp.sum(m[:, :, None] * m, axis=1)),
+        M,
+    ),
+    "matrix and vector": (
+        lambda y: (y["v"] * y["m"][0] @ y["m"].T, {"v": y["m"] @ jnp.cross(y["v"], W)}),
+        {"m": M[:2], "v": Y},
+    ),
+    "complex matrix": (lambda u: (u @ u.conj().T, u.real * 2, jnp.exp(u) @ (u[0] * 1j)), U),
+    "through a branch": (lambda m: lax.cond(m[0, 0] > 0, lambda m: m @ m, jnp.sin, m + 1.0), M),
+    "too many": (lambda y: [jnp.cross(y[0] @ y[1], y[1]), y[1] @ y[2]], [M, M + 1, M * 2]),
+    "held": (lambda m: (held([m, m * m])[1] @ m, *held([m[0, 0], m[0, 1] * m[2, 2]])), M),
+}  # fmt: skip
+
 ZOO = {
     **{name: (fun, Y) for name, fun in VECTOR.items()},
     **TREE,
+    **MATRIX,
     "custom vjp": (lambda y: odd_vjp(y * y) + jax.jit(odd_vjp)(y), Y),
 }
 ALL = pytest.mark.parametrize("name", ZOO)
@@ -486,10 +517,17 @@ def test_errors_of_the_function_come_through():
         by_components(lambda y: y @ jnp.ones(4), jnp.asarray(Y))
 
 
-def test_no_short_vector_is_built_inside():
-    """The reason for the file: arithmetic on vectors of three leaves scalars only."""
-    fun = lambda y: jnp.cross(W, y * y) + (y @ M) * (y @ y) - jnp.stack([y[1], y[2], y[0]])  # noqa: E731
-    inside = jax.make_jaxpr(whole(fun))(jnp.asarray(Y)).jaxpr
+@pytest.mark.parametrize(
+    "fun, y",
+    [
+        (lambda y: jnp.cross(W, y * y) + (y @ M) * (y @ y) - jnp.stack([y[1], y[2], y[0]]), Y),
+        (lambda m: m @ m.T + jnp.outer(m[0], M @ m[:, 1]) * jnp.sum(m, 1) - jnp.flip(m), M),
+    ],
+    ids=["vector", "matrix"],
+)
+def test_no_small_array_is_built_inside(fun, y):
+    """The reason for the file: arithmetic on small arrays leaves scalars only."""
+    inside = jax.make_jaxpr(whole(fun))(jnp.asarray(y)).jaxpr
     (out,) = inside.outvars
     arithmetic = {"mul", "add", "sub", "neg", "dot_general", "concatenate", "reduce_sum"}
     built = [
@@ -498,7 +536,7 @@ def test_no_short_vector_is_built_inside():
         if e.primitive.name in arithmetic and e.outvars[0].aval.shape != ()
     ]
     assert built == []
-    assert out.aval.shape == (3,)
+    assert out.aval.shape == y.shape
 
 
 # Random programs. Each step appends to a list of values one that earlier ones determine.

@@ -14,6 +14,7 @@ from cfjax._loop import repeat
 
 VECTOR = jnp.asarray([0.3, -0.7, 1.1])
 MATRIX = jnp.asarray(np.random.default_rng(0).normal(size=(2, 3)))
+ATTITUDE = jnp.asarray(np.random.default_rng(1).normal(size=(3, 3)))
 COMPLEX = jnp.asarray([0.4 + 0.2j, -0.3j])
 LONG = jnp.linspace(-1.0, 1.0, 9)
 NUM_STEPS = 5
@@ -37,6 +38,8 @@ CASES = {
     "vector": (VECTOR, ()),
     "vector and parameters": (VECTOR, {"a": VECTOR * 2, "b": jnp.asarray(0.4)}),
     "parts": ((VECTOR, {"x": jnp.asarray(0.5), "m": MATRIX, "n": jnp.asarray(3)}), (LONG, VECTOR)),
+    "matrix": (ATTITUDE, (VECTOR, MATRIX)),
+    "matrix in components forward only": ((ATTITUDE, MATRIX, VECTOR), VECTOR),
     "no short vector": ((MATRIX, LONG), VECTOR),
     "two precisions": ((VECTOR, VECTOR.astype(np.float32)), (VECTOR.astype(np.float32), VECTOR)),
     "more parameters than travel": (VECTOR, [VECTOR * k for k in range(1, 9)]),
