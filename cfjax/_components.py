@@ -204,7 +204,8 @@ def _evaluate(
                 inner.jaxpr, (*inner.consts, *values), (*constants, *fixed), rules
             )
         elif eqn.primitive is unpack_p and isinstance(values[0], Components):
-            outs = [values[0].at(p) for p in np.moveaxis(_places(values[0]), eqn.params["axis"], 0)]
+            places = np.moveaxis(_places(values[0]), eqn.params["axis"], 0)
+            outs = [values[0].at(np.asarray(part)) for part in places]
         elif eqn.primitive is held_p and np.shape(values[0]) != ():
             # What is whole is in memory anyway.
             outs = [_components(held([_whole(x)])[0]) if _is_components(x) else x for x in values]
