@@ -7,6 +7,13 @@ jax.config.update("jax_numpy_dtype_promotion", "strict")
 jax.config.update("jax_numpy_rank_promotion", "raise")
 
 
+@pytest.fixture(autouse=True, scope="module")
+def forget_compiled_programs():
+    """A program keeps memory maps, and Linux gives a process 65 530; then compiling ends in a crash."""
+    yield
+    jax.clear_caches()
+
+
 @pytest.fixture
 def no_shape_hook():
     """Wrong input meets our own checks, as it does for users, and not jaxtyping's import hook."""
