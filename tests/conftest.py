@@ -9,7 +9,7 @@ jax.config.update("jax_numpy_rank_promotion", "raise")
 
 @pytest.fixture(autouse=True, scope="module")
 def forget_compiled_programs():
-    """A program keeps memory maps, and Linux gives a process 65 530; then compiling ends in a crash."""
+    """A program keeps memory maps; past the 65 530 of a process on Linux, compiling crashes."""
     yield
     jax.clear_caches()
 
