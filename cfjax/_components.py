@@ -17,17 +17,26 @@ import jax.numpy as jnp
 import jax.tree_util as jtu
 import numpy as np
 from jax import lax
+from jax.core import Tracer
 from jax.custom_batching import custom_vmap
 from jax.extend.core import ClosedJaxpr, DropVar, Jaxpr, JaxprEqn, Literal, jaxpr_as_fun
 from jaxtyping import Array, PyTree
 
-from ._functions.pack import held, held_p, pack, pack_p, unpack, unpack_p
+from ._functions.held import held, held_p
+from ._functions.pack import pack, pack_p, unpack, unpack_p
 
 # Larger arrays fuse well as they are, and the program grows with the number of components. With
 # matrices come the vectors of all their entries.
 _MAX_LENGTH = 6
 _MAX_SIZE = 9
 _MAX_PRODUCT = 36
+
+# Operations between two cuts of a program of vectors, and of matrices, where more are linear. Into
+# one function XLA on CPU puts at most 2000 operations. Beyond, and wherever entries of one array
+# are used apart, it computes anew what two later results share: in long programs exponentially
+# often. Its operations are some 1.7 times ours, and a derivative has three or four times as many.
+_MAX_OPERATIONS = 500, 850
+_CUTS_OF_VALUES = 2
 
 _CHEAP = frozenset(
     "abs add add_any and ceil clamp complex conj convert_element_type copy eq floor ge gt imag "
@@ -111,7 +120,12 @@ def by_components(fun: Callable[[PyTree], PyTree], y: PyTree) -> PyTree:
         return fun(y)
     program, parameters, is_straight = trace(fun, y)
     matrices = is_straight and has_few(y, _MAX_SIZE)
-    return join(program(split(y, matrices), split(parameters, matrices), matrices))
+    # What is around may use single entries, so that XLA computes anew what these share. It does
+    # little harm to a step, but much to a derivative.
+    y, parameters = _held(split((y, parameters), matrices), now=False)
+    out = program(y, parameters, matrices, True)
+    # One by one: what nobody uses is not computed.
+    return jtu.tree_map(lambda x: _whole(_held(x, now=False)), out, is_leaf=_is_components)
 
 
 _is_inside: ContextVar[bool] = ContextVar("is_inside", default=False)
@@ -119,12 +133,15 @@ _is_inside: ContextVar[bool] = ContextVar("is_inside", default=False)
 
 def trace(
     fun: Callable[[PyTree], PyTree], y: PyTree
-) -> tuple[Callable[[PyTree, PyTree, bool], PyTree], list[Array], bool]:
+) -> tuple[Callable[[PyTree, PyTree, bool, bool], PyTree], list[Array], bool]:
     """A program for `by_components`, what `fun` closes over, and whether to split matrices.
 
-    `program(y, parameters, matrices)` takes both split, with the same `matrices`, and returns what
-    is split. It closes over nothing that is traced. Matrices that go through branches or loops, as
-    in `expm`, are better left whole: XLA fuses nothing across these.
+    `program(y, parameters, matrices, cuts)` takes both split, with the same `matrices`, and returns
+    what is split. It closes over nothing that is traced. Where it is long, its values go through
+    memory at some places: in a batch, and with `cuts` also alone.
+
+    Matrices that go through branches or loops, as in `expm`, are better left whole: XLA fuses
+    nothing across these.
     """
     token = _is_inside.set(True)
     try:
@@ -132,12 +149,12 @@ def trace(
     finally:
         _is_inside.reset(token)
 
-    def program(y: PyTree, parameters: PyTree, matrices: bool) -> PyTree:
+    def program(y: PyTree, parameters: PyTree, matrices: bool, cuts: bool) -> PyTree:
         values = jtu.tree_leaves(y, is_leaf=_is_components)
         if _has_components(y):
             is_all = all(_is_components(value) or jnp.ndim(value) == 0 for value in values)
             fixed = [True] * len(parameters) + [False] * len(values)
-            rules = _Rules(matrices, reciprocals=is_all)
+            rules = _Rules(matrices, is_all, cuts)
             outs, _ = _evaluate(jaxpr.jaxpr, (*parameters, *values), fixed, rules)
         else:
             outs = jaxpr_as_fun(ClosedJaxpr(jaxpr.jaxpr, join(parameters)))(*values)
@@ -161,10 +178,13 @@ def _is_straight(jaxpr: Jaxpr) -> bool:
 
 
 class _Rules(NamedTuple):
-    """What is taken apart besides vectors, and whether fixed divisors become reciprocals."""
+    """What is taken apart besides vectors, if fixed divisors become reciprocals, and if there are
+    cuts outside of batches.
+    """
 
     matrices: bool
     reciprocals: bool
+    cuts: bool
 
 
 def _evaluate(
@@ -192,7 +212,12 @@ def _evaluate(
         env[variable] = _components(value) if _is_small(value.shape, rules.matrices) else value
         if not is_one:
             loose.add(variable)
-    for eqn in jaxpr.eqns:
+    cuts = _cuts(jaxpr, rules)
+    for k, eqn in enumerate(jaxpr.eqns):
+        if k in cuts:
+            live = [v for v in _used(jaxpr, k) if v in env]
+            values = _held([env[v] for v in live], now=cuts[k], alone=rules.cuts)
+            env.update(zip(live, values, strict=True))
         values = [read(v) for v in eqn.invars]
         fixed = [is_fixed(v) for v in eqn.invars]
         outs_fixed = [all(fixed)] * len(eqn.outvars)
@@ -208,13 +233,73 @@ def _evaluate(
             outs = [values[0].at(np.asarray(part)) for part in places]
         elif eqn.primitive is held_p and np.shape(values[0]) != ():
             # What is whole is in memory anyway.
-            outs = [_components(held([_whole(x)])[0]) if _is_components(x) else x for x in values]
+            outs = [
+                _components(held([_whole(x)], **eqn.params)[0]) if _is_components(x) else x
+                for x in values
+            ]
         else:
             out = _in_components(eqn, name, values, fixed, rules)
             outs = [out] if out is not None else _on_whole_arrays(jaxpr, eqn, values)
         env.update(zip(eqn.outvars, outs, strict=True))
         loose.update(v for v, is_one in zip(eqn.outvars, outs_fixed, strict=True) if not is_one)
     return [read(v) for v in jaxpr.outvars], [is_fixed(v) for v in jaxpr.outvars]
+
+
+def _held(tree: Any, now: bool, alone: bool = True) -> Any:
+    """The same, with all single numbers through memory, but constants."""
+    leaves, structure = jtu.tree_flatten(tree, is_leaf=_is_components)
+    groups = [x.entries if _is_components(x) else (x,) for x in leaves]
+    numbers = [x for group in groups for x in group if _is_number(x)]
+    if not numbers:
+        return tree
+    new = iter(held(numbers, in_batches=True, alone=alone, now=now))
+    groups = [[next(new) if _is_number(x) else x for x in group] for group in groups]
+    leaves = [
+        Components(group, x.shape) if _is_components(x) else group[0]
+        for x, group in zip(leaves, groups, strict=True)
+    ]
+    return jtu.tree_unflatten(structure, leaves)
+
+
+def _is_number(x: Any) -> bool:
+    return isinstance(x, Tracer) and x.ndim == 0 and jnp.issubdtype(x.dtype, jnp.inexact)
+
+
+def _cuts(jaxpr: Jaxpr, rules: _Rules) -> dict[int, bool]:
+    """Before which operations a long program is cut, and whether not only in derivatives.
+
+    What is used after a cut goes through memory, also what has been held before: the derivative in
+    it is then a sum over what comes after the cut, and is held too.
+    """
+    most = _MAX_OPERATIONS[rules.matrices]
+    counts = [_operations(eqn, rules.matrices) for eqn in jaxpr.eqns]
+    # These have cuts of their own.
+    counts = [n if n <= most else 0 for n in counts]
+    segments = math.ceil(sum(counts) / most)
+    ends = sum(counts) * np.arange(1, segments) / segments
+    places = np.searchsorted(np.cumsum([0, *counts]), ends)
+    return {int(place): n % _CUTS_OF_VALUES == 0 for n, place in enumerate(places, 1)}
+
+
+def _used(jaxpr: Jaxpr, place: int) -> list[Any]:
+    """What is used by an operation or those after it."""
+    uses = [v for eqn in jaxpr.eqns[place:] for v in eqn.invars]
+    return list(dict.fromkeys(v for v in (*uses, *jaxpr.outvars) if not isinstance(v, Literal)))
+
+
+def _operations(eqn: JaxprEqn, matrices: bool) -> int:
+    """About how many operations on single numbers or whole arrays there will be."""
+    if eqn.primitive.name in _CALLS:
+        return sum(_operations(inner, matrices) for inner in eqn.params["jaxpr"].jaxpr.eqns)
+    if eqn.primitive.name in _MOVES or eqn.primitive in (pack_p, unpack_p):
+        return 0
+    terms = 1
+    if eqn.primitive.name == "dot_general":
+        left: Any = eqn.invars[0].aval
+        (axes, _), _ = eqn.params["dimension_numbers"]
+        terms = 2 * math.prod(left.shape[k] for k in axes)
+    shapes: list[tuple[int, ...]] = [getattr(v.aval, "shape", ()) for v in eqn.outvars]
+    return sum(terms * math.prod(x) if x == () or _is_small(x, matrices) else 1 for x in shapes)
 
 
 def _in_components(

@@ -38,7 +38,7 @@ def repeat(step: Callable[[PyTree], PyTree], carry: PyTree, num_steps: int) -> P
 
     def step_of_leaves(leaves: list[Any], values: list[Any], matrices: bool) -> list[Any]:
         carry = jtu.tree_unflatten(structure, leaves)
-        return structure.flatten_up_to(program(carry, values, matrices))
+        return structure.flatten_up_to(program(carry, values, matrices, matrices))
 
     leaves = list(map(jnp.asarray, leaves))
     most = (_MOST_FORWARD, _MOST_BACKWARD) if is_straight else (0, 0)

@@ -9,8 +9,9 @@ import numpy as np
 import pytest
 from jax import lax
 
+from cfjax import _components
 from cfjax._components import by_components
-from cfjax._functions.pack import held
+from cfjax._functions.held import held
 
 Y = np.array([0.3, -0.7, 1.1])
 W = np.array([1.3, 0.4, -0.8])
@@ -503,6 +504,41 @@ def test_random_keys_as_state():
 def test_constants_overflow_as_in_jax(fun):
     # Without the warnings that numpy's own scalars give.
     np.testing.assert_array_equal(by_components(fun, jnp.asarray(Y)), fun(jnp.asarray(Y)))
+
+
+@pytest.mark.parametrize(
+    "name", ["arithmetic", "loops", "complex", "matrix and vector", "products of matrices"]
+)
+def test_cuts_change_nothing(name, monkeypatch):
+    """Programs are cut where they are long; here everywhere."""
+    monkeypatch.setattr(_components, "_MAX_OPERATIONS", (4, 4))
+    test_values(name)
+    test_derivatives(name)
+    test_batches(name)
+
+
+def turn(y, n):
+    for k in range(n):
+        y = jnp.cross(W, y * y) * 0.1 + y * (1 - 1 / (k + 2))
+    return y
+
+
+@pytest.mark.parametrize("most", [500, 10**6], ids=["cut", "whole"])
+@pytest.mark.parametrize("batch", [False, True], ids=["alone", "batch"])
+def test_long_programs_are_cut(batch, most, monkeypatch):
+    """Into functions of the 2000 operations that XLA on CPU does not split.
+
+    What it splits takes exponentially long to run, so nothing is run here.
+    """
+    monkeypatch.setattr(_components, "_MAX_OPERATIONS", (most, most))
+    fun = lambda y: by_components(lambda y: turn(y, 100), y)  # noqa: E731
+    slope = jax.grad(lambda y: jnp.sum(jnp.cos(fun(y))))
+    y = jnp.asarray(Y)
+    for f in (fun, slope):
+        f, start = (jax.vmap(f), jnp.stack([y] * 4)) if batch else (f, y)
+        program = jax.jit(f).lower(start).compile().as_text()
+        sizes = [part.count("\n") for part in program.split("\n\n")]
+        assert (max(sizes) > 2000) == (most > 500)
 
 
 def test_python_numbers_as_state():

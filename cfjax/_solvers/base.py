@@ -15,7 +15,8 @@ from jaxtyping import Array, Inexact, PyTree, Real
 from .._components import by_components, is_short, is_small
 from .._dense import NodeInterpolation
 from .._frozen_field import Displaced, flow, is_displaced, value
-from .._functions.pack import held, pack, unpack
+from .._functions.held import held
+from .._functions.pack import pack, unpack
 
 
 class AbstractLieSolver(diffrax.AbstractSolver):

@@ -5,7 +5,8 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from cfjax._functions.pack import held, pack, unpack
+from cfjax._functions.held import held
+from cfjax._functions.pack import pack, unpack
 
 RNG = np.random.default_rng(0)
 
@@ -61,8 +62,14 @@ def weighted(stack):
 )
 @pytest.mark.parametrize(
     "stack",
-    [pack, lambda entries: pack(entries, sums=True), lambda entries: pack(held(entries))],
-    ids=["pack", "pack with sums", "held"],
+    [
+        pack,
+        lambda entries: pack(entries, sums=True),
+        lambda entries: pack(held(entries)),
+        lambda entries: pack(held(entries, in_batches=True)),
+        lambda entries: pack(held(entries, in_batches=True, alone=False, now=False)),
+    ],
+    ids=["pack", "pack with sums", "held", "held in batches", "held in derivatives"],
 )
 def test_transformations(transform, stack):
     x, y = jnp.asarray(0.7), jnp.asarray(RNG.normal(size=3))
@@ -72,20 +79,3 @@ def test_transformations(transform, stack):
         jax.tree.map(
             lambda a, b: np.testing.assert_allclose(a, b, rtol=0, atol=1e-13), run(x, y), want
         )
-
-
-def test_what_is_held_is_computed_once():
-    """Without it XLA computes the entries anew for each of two results."""
-
-    def program(keep):
-        def fun(x):
-            entries = unpack(x)
-            for _ in range(4):
-                a, b, c = entries
-                entries = [a * b + c, b * c - a, a + b * b]
-            entries = keep(entries)
-            return pack(entries), pack([a * a for a in entries])
-
-        return jax.jit(fun).lower(jnp.ones(3)).compile().cost_analysis()["flops"]
-
-    assert program(held) < program(list)

@@ -1,0 +1,101 @@
+"""Values sent through memory, so that XLA computes them once and on their own."""
+
+from collections.abc import Sequence
+
+import jax
+import jax.core
+import jax.numpy as jnp
+from jax.experimental.xla_metadata import set_xla_metadata
+from jax.extend.core import Primitive
+from jax.interpreters import ad, batching, mlir
+from jaxtyping import Array
+
+from .pack import pack, unpack
+
+
+def held(
+    entries: Sequence[Array], *, in_batches: bool = False, alone: bool = True, now: bool = True
+) -> list[Array]:
+    """The same arrays, through memory.
+
+    Else XLA may compute them anew for everything that uses them. In a batch, where memory is what
+    takes time, only if asked for; and if not `now`, only where this is differentiated.
+    """
+    return held_p.bind(*entries, in_batches=in_batches, alone=alone, now=now)
+
+
+held_p = Primitive("cfjax_held")
+held_p.multiple_results = True
+
+
+@held_p.def_impl
+def _held_impl(*entries, in_batches, alone, now):
+    outs = list(entries)
+    if not now:
+        return outs
+    groups: dict = {}
+    for k, x in enumerate(entries):
+        if jnp.issubdtype(x.dtype, jnp.inexact):
+            groups.setdefault((x.shape, x.dtype), []).append(k)
+    for (shape, _), places in groups.items():
+        # Who asks for batches has scalars.
+        is_batch = in_batches and shape != ()
+        if is_batch or alone:
+            through = _by_call if is_batch else _by_reduction
+            for k, x in zip(places, through([entries[k] for k in places]), strict=True):
+                outs[k] = x
+    return outs
+
+
+def _by_reduction(entries: Sequence[Array]) -> list[Array]:
+    # XLA fuses nothing with a reduction over the first axis, and it drops optimization barriers
+    # before it fuses. The loop around stays small.
+    whole = pack(entries)
+    return unpack(jnp.sum(pack([whole, jnp.zeros_like(whole)]), axis=0))
+
+
+def _by_call(entries: Sequence[Array]) -> list[Array]:
+    # In a batch a reduction would compute everything twice.
+    whole = pack(entries, axis=entries[0].ndim)
+    with set_xla_metadata(inlineable="false"):
+        whole = _identity(whole)
+    return unpack(whole, axis=entries[0].ndim)
+
+
+@jax.jit
+def _identity(x: Array) -> Array:
+    return x
+
+
+@held_p.def_abstract_eval
+def _(*entries, **params):
+    return list(entries)
+
+
+def _held_jvp(entries, tangents, *, now, **params):
+    moving = [k for k, tangent in enumerate(tangents) if type(tangent) is not ad.Zero]
+    outs = list(tangents)
+    if moving:
+        new = held([tangents[k] for k in moving], **params)
+        for k, tangent in zip(moving, new, strict=True):
+            outs[k] = tangent
+    return held(entries, **params), outs
+
+
+def _held_transpose(cotangents, *entries, **params):
+    if all(type(cotangent) is ad.Zero for cotangent in cotangents):
+        return [None] * len(entries)
+    return held([ad.instantiate_zeros(cotangent) for cotangent in cotangents], **params)
+
+
+def _held_batch(entries, dims, **params):
+    if not params["in_batches"]:
+        return entries, dims
+    moved = [x if d is None else jnp.moveaxis(x, d, 0) for x, d in zip(entries, dims, strict=True)]
+    return held(moved, **params), [None if d is None else 0 for d in dims]
+
+
+ad.primitive_jvps[held_p] = _held_jvp
+ad.primitive_transposes[held_p] = _held_transpose
+batching.primitive_batchers[held_p] = _held_batch
+mlir.register_lowering(held_p, mlir.lower_fun(_held_impl, multiple_results=True))
