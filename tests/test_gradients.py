@@ -363,7 +363,7 @@ def test_at_large_angles_of_a_constant_field(solver):
 
 @pytest.mark.parametrize(
     "solver, problem, num_steps",
-    [("RKMK4", BODY, 4), ("CF4", MATRIX, 2)],
+    [("RKMK4", BODY, 4), pytest.param("CF4", MATRIX, 2, marks=pytest.mark.slow)],
     ids=["RKMK4-body", "CF4-matrix"],
 )
 def test_hessian_vector_products(solver, problem, num_steps):

@@ -1,6 +1,8 @@
 """Values sent through memory, so that XLA computes them once and on their own."""
 
+import functools
 from collections.abc import Sequence
+from typing import Any
 
 import jax
 import jax.core
@@ -19,7 +21,8 @@ def held(
     """The same arrays, through memory.
 
     Else XLA may compute them anew for everything that uses them. In a batch, where memory is what
-    takes time, only if asked for; and if not `now`, only where this is differentiated.
+    takes time, only if asked for, on CPU; outside of batches only if `alone`; and if not `now`,
+    only where this is differentiated.
     """
     return held_p.bind(*entries, in_batches=in_batches, alone=alone, now=now)
 
@@ -29,18 +32,18 @@ held_p.multiple_results = True
 
 
 @held_p.def_impl
-def _held_impl(*entries, in_batches, alone, now):
+def _held_impl(*entries, in_batches, alone, now, has_calls=False):
     outs = list(entries)
     if not now:
         return outs
-    groups: dict = {}
+    groups: dict[Any, list[int]] = {}
     for k, x in enumerate(entries):
         if jnp.issubdtype(x.dtype, jnp.inexact):
             groups.setdefault((x.shape, x.dtype), []).append(k)
     for (shape, _), places in groups.items():
         # Who asks for batches has scalars.
         is_batch = in_batches and shape != ()
-        if is_batch or alone:
+        if has_calls if is_batch else alone:
             through = _by_call if is_batch else _by_reduction
             for k, x in zip(places, through([entries[k] for k in places]), strict=True):
                 outs[k] = x
@@ -76,26 +79,32 @@ def _held_jvp(entries, tangents, *, now, **params):
     moving = [k for k, tangent in enumerate(tangents) if type(tangent) is not ad.Zero]
     outs = list(tangents)
     if moving:
-        new = held([tangents[k] for k in moving], **params)
+        new = held_p.bind(*(tangents[k] for k in moving), now=True, **params)
         for k, tangent in zip(moving, new, strict=True):
             outs[k] = tangent
-    return held(entries, **params), outs
+    return held_p.bind(*entries, now=True, **params), outs
 
 
 def _held_transpose(cotangents, *entries, **params):
     if all(type(cotangent) is ad.Zero for cotangent in cotangents):
         return [None] * len(entries)
-    return held([ad.instantiate_zeros(cotangent) for cotangent in cotangents], **params)
+    return held_p.bind(*map(ad.instantiate_zeros, cotangents), **params)
 
 
 def _held_batch(entries, dims, **params):
     if not params["in_batches"]:
         return entries, dims
     moved = [x if d is None else jnp.moveaxis(x, d, 0) for x, d in zip(entries, dims, strict=True)]
-    return held(moved, **params), [None if d is None else 0 for d in dims]
+    return held_p.bind(*moved, **params), [None if d is None else 0 for d in dims]
 
 
 ad.primitive_jvps[held_p] = _held_jvp
 ad.primitive_transposes[held_p] = _held_transpose
 batching.primitive_batchers[held_p] = _held_batch
 mlir.register_lowering(held_p, mlir.lower_fun(_held_impl, multiple_results=True))
+# Only there the calls are known to work.
+mlir.register_lowering(
+    held_p,
+    mlir.lower_fun(functools.partial(_held_impl, has_calls=True), multiple_results=True),
+    platform="cpu",
+)

@@ -146,7 +146,7 @@ def test_the_error_between_the_steps_falls_with_the_order_of_the_solution(solver
     assert abs(slope - (order + 1)) < 0.15
 
 
-@pytest.mark.parametrize("name", ["CF4", "CF54"])
+@pytest.mark.parametrize("name", ["CF4", pytest.param("CF54", marks=pytest.mark.slow)])
 def test_random_times_are_on_the_manifold_and_nodes_are_the_steps(name):
     solver, _ = EXTENDED[name]
     field, y0, args = BODY
@@ -185,7 +185,9 @@ def test_random_times_are_on_the_manifold_and_nodes_are_the_steps(name):
     np.testing.assert_allclose(saved.ys, ys[np.argsort(times)], rtol=0, atol=1e-14)
 
 
-@pytest.mark.parametrize("name, direction", [("CF3", 1), ("CF4", -1)])
+@pytest.mark.parametrize(
+    "name, direction", [pytest.param("CF3", 1, marks=pytest.mark.slow), ("CF4", -1)]
+)
 def test_derivatives_in_time(name, direction):
     solver, order = EXTENDED[name]
     field, y0, args = BODY
