@@ -36,6 +36,7 @@ _MAX_PRODUCT = 36
 # are used apart, it computes anew what two later results share: in long programs exponentially
 # often. Its operations are some 1.7 times ours, and a derivative has three or four times as many.
 _MAX_OPERATIONS = 500, 850
+# Every so many cuts there is one for values too; the others are for derivatives alone.
 _CUTS_OF_VALUES = 2
 
 _CHEAP = frozenset(
