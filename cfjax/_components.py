@@ -117,19 +117,34 @@ def by_components(fun: Callable[[PyTree], PyTree], y: PyTree) -> PyTree:
     where a part of `y` stays whole: there the barrier saves XLA from computing the components anew
     for every entry of that part.
     """
-    if _is_inside.get() or not any(map(is_small, jtu.tree_leaves(y))):
+    if is_inside() or not any(map(is_small, jtu.tree_leaves(y))):
         return fun(y)
     program, parameters, is_straight = trace(fun, y)
     matrices = is_straight and has_few(y, _MAX_SIZE)
     # What is around may use single entries, so that XLA computes anew what these share. It does
     # little harm to a step, but much to a derivative.
     y, parameters = _held(split((y, parameters), matrices), now=False)
-    out = program(y, parameters, matrices, True)
+
+    def step(y: PyTree, parameters: PyTree) -> PyTree:
+        return program(y, parameters, matrices, True)
+
+    if _is_split(y):
+        # The derivative of an adaptive loop computes a step at one place and uses its derivative at
+        # another. What that needs of the step is many scalars: to compute them again is cheaper
+        # than to send them there through memory.
+        step = jax.checkpoint(step)
+    # What is known before the program runs may come out as NumPy's.
+    out = jtu.tree_map(jnp.asarray, step(y, parameters))
     # One by one: what nobody uses is not computed.
     return jtu.tree_map(lambda x: _whole(_held(x, now=False)), out, is_leaf=_is_components)
 
 
 _is_inside: ContextVar[bool] = ContextVar("is_inside", default=False)
+
+
+def is_inside() -> bool:
+    """Whether this is part of a program that is taken apart as a whole."""
+    return _is_inside.get()
 
 
 def trace(
@@ -153,9 +168,8 @@ def trace(
     def program(y: PyTree, parameters: PyTree, matrices: bool, cuts: bool) -> PyTree:
         values = jtu.tree_leaves(y, is_leaf=_is_components)
         if _has_components(y):
-            is_all = all(_is_components(value) or jnp.ndim(value) == 0 for value in values)
             fixed = [True] * len(parameters) + [False] * len(values)
-            rules = _Rules(matrices, is_all, cuts)
+            rules = _Rules(matrices, _is_split(y), cuts)
             outs, _ = _evaluate(jaxpr.jaxpr, (*parameters, *values), fixed, rules)
         else:
             outs = jaxpr_as_fun(ClosedJaxpr(jaxpr.jaxpr, join(parameters)))(*values)
@@ -460,6 +474,12 @@ def _product(left: Any, right: Any, contracted: Any, shape: tuple[int, ...]) -> 
 
 def _dot(a: Sequence[Any], b: Sequence[Any]) -> Any:
     return functools.reduce(operator.add, (x * y for x, y in zip(a, b, strict=True)))
+
+
+def _is_split(tree: PyTree) -> bool:
+    """Whether all of it is in components or a single number."""
+    leaves = jtu.tree_leaves(tree, is_leaf=_is_components)
+    return all(_is_components(x) or jnp.ndim(x) == 0 for x in leaves)
 
 
 def _has_components(tree: PyTree) -> bool:

@@ -541,6 +541,12 @@ def test_long_programs_are_cut(batch, most, monkeypatch):
         assert (max(sizes) > 2000) == (most > 500)
 
 
+def test_derivatives_keep_the_inputs_alone():
+    """Not the scalars in between, which the loops of diffrax would send through memory."""
+    _, slope = jax.vjp(lambda y: by_components(lambda y: turn(y, 10), y), jnp.asarray(Y))
+    assert sum(x.size for x in jax.tree.leaves(slope)) <= 2 * Y.size
+
+
 def test_python_numbers_as_state():
     got = by_components(lambda y: (y[0] * y[1], y[0]), (1.5, jnp.asarray(Y)))
     np.testing.assert_array_equal(got[0], 1.5 * Y)

@@ -12,7 +12,7 @@ import jax.tree_util as jtu
 from jax import lax
 from jaxtyping import Array, Inexact, PyTree, Real
 
-from .._components import by_components, is_short, is_small
+from .._components import by_components, is_inside, is_short, is_small
 from .._dense import NodeInterpolation
 from .._frozen_field import Displaced, flow, is_displaced, value
 from .._functions.held import held
@@ -81,6 +81,9 @@ class AbstractLieSolver(diffrax.AbstractSolver):
         if first is not None and made_jump is not False:
             first = _select(made_jump, lambda: terms.vf(t0, y0, args), first)
 
+        # In a loop of diffrax each of the sums below would compute the step of a batch anew.
+        in_batches = not is_inside()
+
         def move(y0):
             control = terms.contr(t0, t1)
             values = []
@@ -102,7 +105,12 @@ class AbstractLieSolver(diffrax.AbstractSolver):
                 lambda lost, y: y if lost is None else _at_rest(y), lost, y0, is_leaf=_is_leaf
             )
             made = self.move(field, start)
-            end = jtu.tree_map(_held_displacement, lost, made.end, is_leaf=_is_leaf)
+            end = jtu.tree_map(
+                lambda lost, end: _held_displacement(lost, end, in_batches),
+                lost,
+                made.end,
+                is_leaf=_is_leaf,
+            )
             made = dataclasses.replace(made, end=end)
             return made, None if first is None else values[-1]
 
@@ -162,10 +170,10 @@ def held_entries(point: Any) -> Any:
     return pack(held(unpack(point))) if is_short(point) else point
 
 
-def _held_displacement(lost: Any, end: Any) -> Any:
+def _held_displacement(lost: Any, end: Any, in_batches: bool) -> Any:
     """The end of a step. A compensated sum uses the displacement several times."""
     if isinstance(lost, _Sum) and is_small(lost.lost):
-        return Displaced(end.start, held([end.displacement])[0])
+        return Displaced(end.start, held([end.displacement], in_batches=in_batches)[0])
     return end
 
 
