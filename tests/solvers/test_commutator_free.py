@@ -58,8 +58,14 @@ def observed_order(problem, solver, steps=STEPS, **kwargs) -> float:
 # Order
 
 
-@methods
-@pytest.mark.parametrize("side", ["left", "right"])
+@pytest.mark.parametrize(
+    "side, solver",
+    [
+        pytest.param(side, solver, id=f"{side}-{name}", marks=[pytest.mark.slow] * is_slow)
+        for name, solver in METHODS.items()
+        for side, is_slow in (("left", False), ("right", name in ("CG4", "CG5")))
+    ],
+)
 def test_order_on_matrices(matrix_problems, side, solver):
     # The smallest step of CF54 meets the error of the reference.
     steps = STEPS[:-1] if isinstance(solver, cfjax.CF54) else STEPS
