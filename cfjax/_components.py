@@ -119,7 +119,7 @@ def by_components(fun: Callable[[PyTree], PyTree], y: PyTree) -> PyTree:
     """
     if is_inside() or not any(map(is_small, jtu.tree_leaves(y))):
         return fun(y)
-    program, parameters, is_straight = trace(fun, y)
+    program, parameters, is_straight, has_effects = trace(fun, y)
     matrices = is_straight and has_few(y, _MAX_SIZE)
     # What is around may use single entries, so that XLA computes anew what these share. It does
     # little harm to a step, but much to a derivative.
@@ -128,10 +128,10 @@ def by_components(fun: Callable[[PyTree], PyTree], y: PyTree) -> PyTree:
     def step(y: PyTree, parameters: PyTree) -> PyTree:
         return program(y, parameters, matrices, True)
 
-    if _is_split(y):
+    if _is_split(y) and not has_effects:
         # The derivative of an adaptive loop computes a step at one place and uses its derivative at
         # another. What that needs of the step is many scalars: to compute them again is cheaper
-        # than to send them there through memory.
+        # than to send them there through memory. Effects would happen once more, or not be allowed.
         step = jax.checkpoint(step)
     # What is known before the program runs may come out as NumPy's.
     out = jtu.tree_map(jnp.asarray, step(y, parameters))
@@ -149,8 +149,9 @@ def is_inside() -> bool:
 
 def trace(
     fun: Callable[[PyTree], PyTree], y: PyTree
-) -> tuple[Callable[[PyTree, PyTree, bool, bool], PyTree], list[Array], bool]:
-    """A program for `by_components`, what `fun` closes over, and whether to split matrices.
+) -> tuple[Callable[[PyTree, PyTree, bool, bool], PyTree], list[Array], bool, bool]:
+    """A program for `by_components`, what `fun` closes over, whether to split matrices, and whether
+    it has effects, such as prints.
 
     `program(y, parameters, matrices, cuts)` takes both split, with the same `matrices`, and returns
     what is split. It closes over nothing that is traced. Where it is long, its values go through
@@ -175,7 +176,8 @@ def trace(
             outs = jaxpr_as_fun(ClosedJaxpr(jaxpr.jaxpr, join(parameters)))(*values)
         return split(jtu.tree_unflatten(jtu.tree_structure(out), outs), matrices)
 
-    return program, list(map(jnp.asarray, jaxpr.consts)), _is_straight(jaxpr.jaxpr)
+    parameters = list(map(jnp.asarray, jaxpr.consts))
+    return program, parameters, _is_straight(jaxpr.jaxpr), bool(jaxpr.effects)
 
 
 def _is_straight(jaxpr: Jaxpr) -> bool:

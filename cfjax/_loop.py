@@ -33,7 +33,7 @@ def repeat(step: Callable[[PyTree], PyTree], carry: PyTree, num_steps: int) -> P
     that is, what `step` closes over, travel with them unchanged: in the reversed loop they are the
     sums of the derivatives, which else would be results of their own.
     """
-    program, parameters, is_straight = trace(step, carry)
+    program, parameters, is_straight, _ = trace(step, carry)
     leaves, structure = jtu.tree_flatten(carry)
 
     def step_of_leaves(leaves: list[Any], values: list[Any], matrices: bool) -> list[Any]:

@@ -8,6 +8,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 from jax import lax
+from jax.experimental import io_callback
 
 from cfjax import _components
 from cfjax._components import by_components
@@ -455,6 +456,19 @@ def test_effects_happen_once_and_in_order(capsys):
         jax.block_until_ready(jax.jit(whole(fun))(jnp.asarray(Y)))
         jax.effects_barrier()
     assert capsys.readouterr().out.splitlines() == ["start", "-0.7 [ 0.3 -0.7  1.1]"]
+
+
+def test_effects_happen_once_in_a_derivative_too():
+    seen = []
+
+    def fun(y):
+        io_callback(lambda: seen.append(1), None)
+        return y * jnp.sum(y)
+
+    slope = jax.jit(jax.grad(lambda y: jnp.sum(by_components(fun, y))))(jnp.asarray(Y))
+    jax.effects_barrier()
+    np.testing.assert_allclose(slope, 2 * Y.sum(), rtol=1e-15)
+    assert seen == [1]
 
 
 def test_callback_without_arguments():
