@@ -175,7 +175,12 @@ def stiefel_problem():
 
 
 @pytest.mark.parametrize(
-    "problem, estimate", [(rigid_body_problem, "group"), (stiefel_problem, "algebra")]
+    "problem, estimate",
+    [
+        (rigid_body_problem, "group"),
+        (rigid_body_problem, "algebra"),
+        (stiefel_problem, "algebra"),
+    ],
 )
 def test_a_pair_needs_less_than_half_of_the_flows_of_step_doubling(problem, estimate):
     """Flows at equal error, read off on logarithmic scales, and the error for each tolerance.
