@@ -104,13 +104,14 @@ def has_few(tree: PyTree, most: int) -> bool:
     return any(np.ndim(x) > 1 for x in small) and sum(map(np.size, small)) <= most
 
 
-def by_components(fun: Callable[[PyTree], PyTree], y: PyTree) -> PyTree:
+def by_components(fun: Callable[[PyTree], PyTree], y: PyTree, *, has_extra: bool = False) -> PyTree:
     """`fun(y)`, computed with every vector of at most six entries in components.
 
     Small matrices too, where they are few: XLA would compute anew for every component what many
     share, above all backwards. The result agrees with that of `fun` to rounding. `fun` may close
     over traced values. Operations that have no rule here get the array whole, so every function
-    works. Where nothing in `y` is small, and inside of `trace`, this is `fun(y)`.
+    works. Where nothing in `y` is small, and inside of `trace`, this is `fun(y)`. With `has_extra`
+    its result is a pair of what is needed and what perhaps is not.
 
     Divisions by what no `y` changes become products with the reciprocal, as XLA does for literals:
     a loop then computes the reciprocal once, and a division would be a barrier to fusion. Not so
@@ -119,7 +120,7 @@ def by_components(fun: Callable[[PyTree], PyTree], y: PyTree) -> PyTree:
     """
     if is_inside() or not any(map(is_small, jtu.tree_leaves(y))):
         return fun(y)
-    program, parameters, is_straight, has_effects = trace(fun, y)
+    program, parameters, is_straight, has_effects = trace(fun, y, has_extra)
     matrices = is_straight and has_few(y, _MAX_SIZE)
     # What is around may use single entries, so that XLA computes anew what these share. It does
     # little harm to a step, but much to a derivative.
@@ -148,7 +149,7 @@ def is_inside() -> bool:
 
 
 def trace(
-    fun: Callable[[PyTree], PyTree], y: PyTree
+    fun: Callable[[PyTree], PyTree], y: PyTree, has_extra: bool = False
 ) -> tuple[Callable[[PyTree, PyTree, bool, bool], PyTree], list[Array], bool, bool]:
     """A program for `by_components`, what `fun` closes over, whether to split matrices, and whether
     it has effects, such as prints.
@@ -165,19 +166,36 @@ def trace(
         jaxpr, out = jax.make_jaxpr(fun, return_shape=True)(y)
     finally:
         _is_inside.reset(token)
+    code = _without_dead_code(jaxpr.jaxpr)
+    needed = code.outvars[: len(jtu.tree_leaves(out[0]))] if has_extra else code.outvars
 
     def program(y: PyTree, parameters: PyTree, matrices: bool, cuts: bool) -> PyTree:
         values = jtu.tree_leaves(y, is_leaf=_is_components)
         if _has_components(y):
             fixed = [True] * len(parameters) + [False] * len(values)
             rules = _Rules(matrices, _is_split(y), cuts)
-            outs, _ = _evaluate(jaxpr.jaxpr, (*parameters, *values), fixed, rules)
+            outs, _ = _evaluate(code, (*parameters, *values), fixed, rules, needed)
         else:
-            outs = jaxpr_as_fun(ClosedJaxpr(jaxpr.jaxpr, join(parameters)))(*values)
+            outs = jaxpr_as_fun(ClosedJaxpr(code, join(parameters)))(*values)
         return split(jtu.tree_unflatten(jtu.tree_structure(out), outs), matrices)
 
     parameters = list(map(jnp.asarray, jaxpr.consts))
-    return program, parameters, _is_straight(jaxpr.jaxpr), bool(jaxpr.effects)
+    return program, parameters, _is_straight(code), bool(jaxpr.effects)
+
+
+def _without_dead_code(jaxpr: Jaxpr) -> Jaxpr:
+    """A step computes more than everybody wants, and values for that would be held too."""
+    wanted = set(_variables(jaxpr.outvars))
+    kept = []
+    for eqn in reversed(jaxpr.eqns):
+        if eqn.effects or not wanted.isdisjoint(eqn.outvars):
+            kept.append(eqn)
+            wanted.update(_variables(eqn.invars))
+    return jaxpr.replace(eqns=kept[::-1])
+
+
+def _variables(atoms: Iterable[Any]) -> list[Any]:
+    return [v for v in atoms if not isinstance(v, Literal)]
 
 
 def _is_straight(jaxpr: Jaxpr) -> bool:
@@ -205,11 +223,15 @@ class _Rules(NamedTuple):
 
 
 def _evaluate(
-    jaxpr: Jaxpr, values: Sequence[Any], fixed: Sequence[bool], rules: _Rules
+    jaxpr: Jaxpr,
+    values: Sequence[Any],
+    fixed: Sequence[bool],
+    rules: _Rules,
+    needed: Sequence[Any],
 ) -> tuple[list[Any], list[bool]]:
     """What a program makes of values for its constants and arguments, some of which are fixed.
 
-    Fixed results are those that depend on nothing else.
+    Fixed results are those that depend on nothing else. Those in `needed` are not dead code.
     """
     env: dict[Any, Any] = {}
     loose: set[Any] = set()
@@ -232,9 +254,10 @@ def _evaluate(
     cuts = _cuts(jaxpr, rules)
     for k, eqn in enumerate(jaxpr.eqns):
         if k in cuts:
-            live = [v for v in _used(jaxpr, k) if v in env]
-            values = _held([env[v] for v in live], now=cuts[k], alone=rules.cuts)
-            env.update(zip(live, values, strict=True))
+            for used in _used(jaxpr, k, needed):
+                live = [v for v in used if v in env]
+                values = _held([env[v] for v in live], now=cuts[k], alone=rules.cuts)
+                env.update(zip(live, values, strict=True))
         values = [read(v) for v in eqn.invars]
         fixed = [is_fixed(v) for v in eqn.invars]
         outs_fixed = [all(fixed)] * len(eqn.outvars)
@@ -243,7 +266,11 @@ def _evaluate(
             inner = eqn.params["jaxpr"]
             constants = [True] * len(inner.consts)
             outs, outs_fixed = _evaluate(
-                inner.jaxpr, (*inner.consts, *values), (*constants, *fixed), rules
+                inner.jaxpr,
+                (*inner.consts, *values),
+                (*constants, *fixed),
+                rules,
+                inner.jaxpr.outvars,
             )
         elif eqn.primitive is unpack_p and isinstance(values[0], Components):
             places = np.moveaxis(_places(values[0]), eqn.params["axis"], 0)
@@ -298,10 +325,14 @@ def _cuts(jaxpr: Jaxpr, rules: _Rules) -> dict[int, bool]:
     return {int(place): n % _CUTS_OF_VALUES == 0 for n, place in enumerate(places, 1)}
 
 
-def _used(jaxpr: Jaxpr, place: int) -> list[Any]:
-    """What is used by an operation or those after it."""
-    uses = [v for eqn in jaxpr.eqns[place:] for v in eqn.invars]
-    return list(dict.fromkeys(v for v in (*uses, *jaxpr.outvars) if not isinstance(v, Literal)))
+def _used(jaxpr: Jaxpr, place: int, needed: Sequence[Any]) -> tuple[list[Any], list[Any]]:
+    """What an operation and those after it use for results that are needed, and else."""
+    wanted = dict.fromkeys(_variables(needed))
+    others = dict.fromkeys(_variables(jaxpr.outvars))
+    for eqn in reversed(jaxpr.eqns[place:]):
+        is_needed = eqn.effects or not wanted.keys().isdisjoint(eqn.outvars)
+        (wanted if is_needed else others).update(dict.fromkeys(_variables(eqn.invars)))
+    return list(wanted), [v for v in others if v not in wanted]
 
 
 def _operations(eqn: JaxprEqn, matrices: bool) -> int:

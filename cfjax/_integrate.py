@@ -12,6 +12,7 @@ from jax import lax
 from jaxtyping import Array, Bool, PyTree, Real
 
 from ._loop import repeat
+from ._solvers.base import AbstractLieSolver
 
 
 def integrate(
@@ -97,12 +98,14 @@ def _integrate(
         y, _, _, solver_state, step_result = solver.step(
             term, time(n), time(n + 1), y, args, solver_state, made_jump=False
         )
-        # Left out where no step can fail: a loop of small steps feels every operation.
-        if step_result is not diffrax.RESULTS.successful:
+        # Our own fail where the state is not finite, which the last one shows as well. A loop of
+        # small steps feels every operation.
+        if not is_ours and step_result is not diffrax.RESULTS.successful:
             is_first = result == diffrax.RESULTS.successful
             result = diffrax.RESULTS.where(is_first, step_result, result)
         return (n + 1, y, solver_state, result)
 
+    is_ours = isinstance(solver, AbstractLieSolver)
     solver_state = solver.init(term, t0, time(jnp.asarray(1)), y0, args)
     n = jnp.asarray(0, jnp.int32 if num_steps < 2**31 else int)
     carry = (n, y0, solver_state, diffrax.RESULTS.successful)

@@ -50,7 +50,8 @@ class _Rounded:
 
 # Of words again. Written without recursion, which run-time type checkers cannot follow.
 Word: TypeAlias = tuple[Any, ...]
-Number: TypeAlias = Fraction | _Rounded
+# A Fraction, a _Rounded, or a float where nothing is to be proved.
+Number: TypeAlias = Any
 Weights: TypeAlias = dict[Word, Number]
 # How far each weight of one order is off, and how far it may be.
 Defects: TypeAlias = list[tuple[Fraction, float]]
@@ -63,13 +64,13 @@ def order(tableau: Tableau) -> int:
     Exact tableaus are decided exactly. With floats, it is the order that a method may have of
     which these are the rounded coefficients; see `_defects`.
     """
-    return _largest_order(_defects(_weights(tableau), exact_weight), tableau)
+    return _largest_order(_defects(_end_weights(tableau), exact_weight), tableau)
 
 
 @lru_cache
 def error_constant(tableau: Tableau) -> float:
     """The 2-norm of the defects over the words of order q + 1, for a method of order q."""
-    defects = _defects(_weights(tableau), exact_weight)
+    defects = _defects(_end_weights(tableau), exact_weight)
     for _ in range(order(tableau)):
         next(defects)
     return math.hypot(*(float(defect) for defect, _ in next(defects)))
@@ -160,13 +161,25 @@ def exact_tree_weight(tree: Word) -> Fraction:
     return math.prod(map(exact_tree_weight, tree), start=Fraction(1, 1 + _order_of(tree)))
 
 
-def _weights(tableau: Tableau) -> Iterator[Weights]:
+def _end_weights(tableau: Tableau) -> Iterator[Weights]:
     """The weights of all words at the end point, order by order from 1."""
+    rows = _nonzero([prefix[-1] for prefix in tableau.prefixes])
+    for n, (_, end) in enumerate(word_weights(tableau, rows), 1):
+        yield {word: end[word] for word in words(n)}
+
+
+def word_weights(
+    tableau: Tableau, rows: Iterable[Iterable[tuple[int, Any]]]
+) -> Iterator[tuple[list[Weights], Weights]]:
+    """The weights of all words at each stage and at the end point, up to order 1, 2, and so on.
+
+    `rows` holds the last row of each of the tableau's prefixes, as its nonzero coefficients with
+    their stages, in the arithmetic that is wanted.
+    """
     # At each point on the way, by the flows that lead there. Before the first flow every word but
     # the empty one has weight 0, and zeros are left out.
     points: dict[Product, Weights] = {(): {(): Fraction(1)}}
     flows = []
-    rows = _nonzero([prefix[-1] for prefix in tableau.prefixes])
     for prefix, row in zip(tableau.prefixes, rows, strict=True):
         before, after = points[prefix[:-1]], points.setdefault(prefix, {(): Fraction(1)})
         alone: Weights = {(): Fraction(1)}
@@ -186,7 +199,7 @@ def _weights(tableau: Tableau) -> Iterator[Weights]:
             for word in words(n):
                 splits = ((word[:i], word[i:]) for i in range(len(word) + 1))
                 after[word] = _sum(before[u] * alone[v] for u, v in splits if u in before)
-        yield {word: end[word] for word in words(n)}
+        yield stages, end
 
 
 def _tree_weights(tableau: Tableau) -> Iterator[Weights]:

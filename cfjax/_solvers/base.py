@@ -1,7 +1,6 @@
 """What all Lie group methods are to diffrax: one-step maps made of flows."""
 
 import abc
-import dataclasses
 from collections.abc import Callable
 from typing import Any, ClassVar
 
@@ -13,7 +12,8 @@ from jax import lax
 from jaxtyping import Array, Inexact, PyTree, Real
 
 from .._components import by_components, is_inside, is_short, is_small
-from .._dense import NodeInterpolation
+from .._dense import Interpolation, Path
+from .._failure import result_of
 from .._frozen_field import Displaced, flow, is_displaced, value
 from .._functions.held import held
 from .._functions.pack import pack, unpack
@@ -34,9 +34,7 @@ class AbstractLieSolver(diffrax.AbstractSolver):
 
     term_structure: ClassVar = diffrax.AbstractTerm
 
-    interpolation_cls: ClassVar[Callable[..., diffrax.AbstractLocalInterpolation]] = (
-        NodeInterpolation
-    )
+    interpolation_cls: ClassVar[Callable[..., diffrax.AbstractLocalInterpolation]] = Interpolation
 
     @property
     def first_same_as_last(self) -> bool:
@@ -111,14 +109,14 @@ class AbstractLieSolver(diffrax.AbstractSolver):
                 made.end,
                 is_leaf=_is_leaf,
             )
-            made = dataclasses.replace(made, end=end)
-            return made, None if first is None else values[-1]
+            # The end of a step and the field there are always wanted, the rest is not.
+            return (end, None if first is None else values[-1]), (made.error, made.path)
 
-        made, last = by_components(move, y0)
+        (end, last), (error, path) = by_components(move, y0, has_extra=True)
         sums = jtu.tree_map(
             lambda lost, p: (p, None) if lost is None else lost.up_to(p),
             lost,
-            made.end,
+            end,
             is_leaf=_is_leaf,
         )
         y1, new_lost = (
@@ -127,19 +125,18 @@ class AbstractLieSolver(diffrax.AbstractSolver):
         )
         has_two = self.first_same_as_last and solver_state is not None
         solver_state = (new_lost, last) if has_two else new_lost
-        dense_info = dict(y0=y0, y1=y1, **made.dense)
-        return y1, made.error, dense_info, solver_state, diffrax.RESULTS.successful
+        return y1, error, dict(path=path), solver_state, result_of(y1)
 
     def func(self, terms, t0, y0, args) -> Any:
         return terms.vf(t0, y0, args)
 
 
 class Move(eqx.Module):
-    """A step: where it ends, an estimate of its error, and what output within it needs."""
+    """A step: where it ends, the way there for output within it, and an estimate of its error."""
 
     end: PyTree
+    path: Path
     error: PyTree = None
-    dense: dict[str, Any] = eqx.field(default_factory=dict)
 
 
 def _select(made_jump: Any, anew: Callable[[], PyTree], kept: PyTree) -> PyTree:

@@ -2,7 +2,7 @@
 
 import dataclasses
 from collections.abc import Sequence
-from typing import Any, ClassVar, Literal
+from typing import ClassVar, Literal
 
 import equinox as eqx
 import jax.numpy as jnp
@@ -10,7 +10,8 @@ import jax.tree_util as jtu
 from jaxtyping import PyTree
 
 from .. import _pairs, _tableau
-from .._dense import FlowInterpolation, NodeInterpolation, Path
+from .._dense import Path
+from .._extension import extension
 from .._frozen_field import (
     combine,
     enter,
@@ -53,10 +54,6 @@ class AbstractCommutatorFree(AbstractLieSolver):
 
     def without_estimate(self) -> "AbstractCommutatorFree":
         return dataclasses.replace(self, estimate=None)
-
-    @property
-    def interpolation_cls(self) -> Any:  # pyright: ignore[reportIncompatibleMethodOverride]
-        return NodeInterpolation if self.tableau.extension is None else FlowInterpolation
 
     @property
     def first_same_as_last(self) -> bool:
@@ -102,9 +99,10 @@ class AbstractCommutatorFree(AbstractLieSolver):
         # All that follows is for error control and output within the step. It is dead code, left
         # out by the compiler, where nobody asks for them.
         companion = None if self.estimate is None else tableau.companion
-        if any(map(tableau.uses_last, (companion or (), *(tableau.extension or ())))):
+        within = extension(tableau)
+        if any(map(tableau.uses_last, (companion or (), *within))):
             evaluate(1.0, stages[-1])
-        error, dense = None, {}
+        error = None
         if companion is not None:
             if self.estimate == "algebra":
                 difference = _combined(_difference(companion, tableau.beta), fields)
@@ -116,9 +114,7 @@ class AbstractCommutatorFree(AbstractLieSolver):
                     last_stage = leave(fields[0], point(stages[-2]))
                     blind = _same(evaluated[-2], evaluated[-1], end)
                     error = jtu.tree_map(jnp.where, blind, minus(end, last_stage), error)
-        if tableau.extension is not None:
-            dense["path"] = Path.of(tableau.extension, value(points[()]), fields)
-        return Move(end, error, dense)
+        return Move(end, Path.of(within, value(points[()]), fields), error)
 
 
 def _combined(row: Row, fields: Sequence[PyTree]) -> PyTree:
@@ -164,7 +160,9 @@ class CommutatorFree(AbstractCommutatorFree):
 
     One step costs `tableau.num_evaluations` evaluations of the field and `tableau.num_flows`
     flows. Its order is `cfjax.order(tableau)`. With a companion in the tableau there is an error
-    estimate, which costs `tableau.num_companion_flows` more, and with an extension dense output.
+    estimate, which costs `tableau.num_companion_flows` more. Dense output is by the tableau's
+    extension, else by one that the order conditions decide, of order one below the method's but at
+    most 4: for that a step evaluates the field at its end where the stages do not suffice.
 
     **Raises** `TypeError` if `tableau` is not a `cfjax.Tableau`.
     """
@@ -259,6 +257,8 @@ class CG3(AbstractCommutatorFree):
 class CG4(AbstractCommutatorFree):
     """A Crouch-Grossman method of order 4: 5 evaluations, 15 flows of single fields.
 
+    Dense output of order 3.
+
     Source: Jackiewicz, Marthinsen & Owren, Adv. Comput. Math. 13 (2000).
     """
 
@@ -267,6 +267,8 @@ class CG4(AbstractCommutatorFree):
 
 class CG5(AbstractCommutatorFree):
     """A Crouch-Grossman method of order 5: 9 evaluations, 43 flows of single fields.
+
+    Dense output of order 4, which uses the field at the end of the step.
 
     Source: Jackiewicz, Marthinsen & Owren, Adv. Comput. Math. 13 (2000).
     """

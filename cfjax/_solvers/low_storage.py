@@ -8,6 +8,8 @@ import jax.numpy as jnp
 import jax.tree_util as jtu
 from jax import lax
 
+from .._dense import Path
+from .._extension import extension
 from .._frozen_field import combine, enter, flow
 from .._frozen_field import value as value_of
 from .._tableau import Product, Row, Tableau
@@ -24,7 +26,8 @@ class AbstractLowStorage(AbstractCommutatorFree):
     """`d <- a[i] d + h f(t + c[i] h, Y)`, `Y <- exp(b[i] d) Y` for every stage i, with a[0] = 0.
 
     That takes two copies of the state's size, the point and the sum of fields that moves it.
-    Fields in coordinates of a step (`LowRankSkew`) need the memory of all stages all the same.
+    Fields in coordinates of a step (`LowRankSkew`) need the memory of all stages all the same, and
+    so does output within a step.
     """
 
     a: ClassVar[Row]
@@ -57,15 +60,19 @@ class AbstractLowStorage(AbstractCommutatorFree):
         def stage(carry, coefficients):
             a, b, c = coefficients
             total, point, _ = carry
-            total = combine((a, 1.0), (total, field(c, point)))
-            return (total, flow(combine((b,), (total,)), point), point), None
+            here = field(c, point)
+            total = combine((a, 1.0), (total, here))
+            return (total, flow(combine((b,), (total,)), point), point), here
 
         after = flow(combine((float(self.b[0]),), (total,)), point)
         coefficients = tuple(
             jnp.asarray([float(x) for x in row[1:]]) for row in (self.a, self.b, self.tableau.c)
         )
-        (_, end, before), _ = lax.scan(stage, (total, after, point), coefficients)
-        return Move(end, minus(end, before) if penultimate else None)
+        (_, end, before), later = lax.scan(stage, (total, after, point), coefficients)
+        # Not kept where nobody asks for output within the step.
+        fields = [value, *(jtu.tree_map(lambda x: x[i], later) for i in range(len(self.b) - 1))]  # noqa: B023
+        path = Path.of(extension(self.tableau), value_of(y0), fields)
+        return Move(end, path, minus(end, before) if penultimate else None)
 
 
 def _tableau(a: Row, b: Row, companion: Callable[[Product], Any] | None = None) -> Tableau:
@@ -82,7 +89,7 @@ def _tableau(a: Row, b: Row, companion: Callable[[Product], Any] | None = None) 
 
 
 class Williamson3(AbstractLowStorage):
-    """Order 3, 3 evaluations, 3 flows.
+    """Order 3, 3 evaluations, 3 flows. Dense output of order 2.
 
     Source: Williamson, J. Comput. Phys. 35 (1980); Bazavov, BIT 62 (2022).
     """
@@ -93,7 +100,7 @@ class Williamson3(AbstractLowStorage):
 
 
 class BWRRK33(AbstractLowStorage):
-    """Order 3, 3 evaluations, 3 flows.
+    """Order 3, 3 evaluations, 3 flows. Dense output of order 2.
 
     Source: Bazavov, BIT 62 (2022).
     """
@@ -104,7 +111,8 @@ class BWRRK33(AbstractLowStorage):
 
 
 class BWRRK53(AbstractLowStorage):
-    """Order 3, 5 evaluations, 5 flows. The estimate, of order 2, costs nothing.
+    """Order 3, 5 evaluations, 5 flows. The estimate, of order 2, costs nothing. Dense output
+    of order 3.
 
     Source: Bazavov, BIT 62 (2022).
     """
@@ -127,7 +135,8 @@ class BWRRK53(AbstractLowStorage):
 
 
 class CK34(AbstractLowStorage):
-    """Order 3, 4 evaluations, 4 flows. The estimate, of order 2, costs nothing.
+    """Order 3, 4 evaluations, 4 flows. The estimate, of order 2, costs nothing. Dense output
+    of order 3.
 
     Source: Carpenter & Kennedy, NASA TM-109112 (1994).
     """
@@ -143,7 +152,7 @@ class CK34(AbstractLowStorage):
 
 
 class CK54(AbstractLowStorage):
-    """Order 4, 5 evaluations, 5 flows.
+    """Order 4, 5 evaluations, 5 flows. Dense output of order 3.
 
     Source: Carpenter & Kennedy, NASA TM-109112 (1994).
     """
@@ -167,7 +176,7 @@ class CK54(AbstractLowStorage):
 
 class Luscher3(AbstractLowStorage):
     """Order 3, 3 evaluations, 3 flows. The estimate, of order 2, costs 1 flow more, and two more
-    copies of the state.
+    copies of the state. Dense output of order 2.
 
     Source: Luscher, JHEP 08 (2010) 071; estimate: Fritzsch & Ramos, JHEP 10 (2013) 008.
     """
@@ -178,7 +187,7 @@ class Luscher3(AbstractLowStorage):
 
 
 class YRK135(AbstractLowStorage):
-    """Order 5, 13 evaluations, 13 flows.
+    """Order 5, 13 evaluations, 13 flows. Dense output of order 4.
 
     Source: Yan (2017); Bazavov, BIT 62 (2022).
     """
@@ -218,7 +227,7 @@ class YRK135(AbstractLowStorage):
 
 class CFEES25(AbstractLowStorage):
     """Order 2, 3 evaluations, 3 flows; a step back undoes it to order 5. The estimate, of order 1,
-    costs 1 flow more, and one more copy of the state.
+    costs 1 flow more, and one more copy of the state. Dense output of order 2.
 
     Source: Shmelev, Thompson & Salvi, arXiv:2509.20599 (2025).
     """
@@ -231,7 +240,8 @@ class CFEES25(AbstractLowStorage):
 
 
 class CFEES27(AbstractLowStorage):
-    """Order 2, 4 evaluations, 4 flows; a step back undoes it to order 7.
+    """Order 2, 4 evaluations, 4 flows; a step back undoes it to order 7. Dense output of order
+    2.
 
     Source: Shmelev, Thompson & Salvi, arXiv:2509.20599 (2025).
     """

@@ -5,13 +5,15 @@ import functools
 from collections.abc import Callable
 from fractions import Fraction
 from math import factorial
-from typing import Any
+from typing import Any, ClassVar
 
 import diffrax
 import equinox as eqx
 import jax.tree_util as jtu
 from jaxtyping import PyTree
 
+from .._dense import Path
+from .._extension import runge_kutta_extension
 from .._frozen_field import (
     AbstractAlgebraElement,
     bracket,
@@ -22,23 +24,36 @@ from .._frozen_field import (
     leave,
     without_bracket,
 )
+from .._frozen_field import value as value_of
 from .._order_conditions import runge_kutta_order
+from .._tableau import Extension, Row
 from .base import AbstractLieSolver, Move
 
 
 class AbstractMuntheKaas(AbstractLieSolver):
     """The step `exp(v) y0` with v in the Lie algebra. Fields without a bracket are refused."""
 
+    b: eqx.AbstractVar[Row]
+    # Of the flow of v, so that it leads to points within the step.
+    extension: eqx.AbstractVar[Extension]
+
     @abc.abstractmethod
-    def increment(self, field: Callable[[float, PyTree], PyTree]) -> PyTree:
-        """The element v; `field(c, u)` is `h f(t + c h, exp(u) y0)`, and `u = None` means zero."""
+    def elements(self, field: Callable[[float, PyTree], PyTree]) -> list[PyTree]:
+        """What v is the combination of that has the weights `b`.
+
+        `field(c, u)` is `h f(t + c h, exp(u) y0)`, and `u = None` means zero.
+        """
 
     def move(self, field, y0):
-        v, start = self.logarithm(field, y0)
-        return Move(leave(v, flow(v, start)))
+        v, elements, start = self.logarithm(field, y0)
+        path = Path.of(self.extension, value_of(start), elements)
+        return Move(leave(v, flow(v, start)), path)
 
     def logarithm(self, field: Callable[[float, PyTree], PyTree], y0: PyTree) -> Any:
-        """The element v with the end of the step `exp(v) y0`, and y0, in the step's coordinates."""
+        """The element v with the end of the step `exp(v) y0`, what it is a combination of, and y0.
+
+        They are in the step's coordinates.
+        """
         fields: list[PyTree] = []
         start = y0
 
@@ -55,42 +70,65 @@ class AbstractMuntheKaas(AbstractLieSolver):
             fields.append(value)
             return value
 
-        return self.increment(field_at), start
+        elements = self.elements(field_at)
+        return _combine_nonzero(self.b, elements), elements, start
+
+
+def _sixths(*numerators: int | Fraction) -> Row:
+    return tuple(Fraction(n) / 6 for n in numerators)
 
 
 class RKMK3(AbstractMuntheKaas):
     """Munthe-Kaas method of order 3 with one commutator: 3 evaluations, 3 flows.
 
+    Dense output of order 2.
+
     Source: Munthe-Kaas & Owren, Computations in a free Lie algebra, Phil. Trans. R. Soc. A 357
     (1999).
     """
 
+    b: ClassVar[Row] = _sixths(1, 4, 1, -1)
+    extension: ClassVar[Extension] = (
+        (_sixths(6, 0, 0, 0), _sixths(-5, 4, 1, 0), _sixths(0, 0, 0, -1)),
+    )
+
     def order(self, terms) -> int:
         return 3
 
-    def increment(self, field):
+    def elements(self, field):
         k1 = field(0.0, None)
         k2 = field(0.5, combine((1 / 2,), (k1,)))
         k3 = field(1.0, combine((-1.0, 2.0), (k1, k2)))
-        return combine((1 / 6, 2 / 3, 1 / 6, -1 / 6), (k1, k2, k3, bracket(k1, k2)))
+        return [k1, k2, k3, bracket(k1, k2)]
 
 
 class RKMK4(AbstractMuntheKaas):
     """Munthe-Kaas method of order 4 with two commutators: 4 evaluations, 4 flows.
 
+    Dense output of order 3.
+
     Source: Munthe-Kaas & Owren, Computations in a free Lie algebra, Phil. Trans. R. Soc. A 357
     (1999). Their two brackets of the last line, `-[Q1, Q2]/6 - [Q1, Q4]/12`, are `-[K1, K4]/12`.
     """
 
+    b: ClassVar[Row] = _sixths(1, 2, 2, 1, Fraction(-1, 2))
+    extension: ClassVar[Extension] = (
+        (
+            _sixths(6, 0, 0, 0, 0),
+            _sixths(-9, 6, 6, -3, 0),
+            _sixths(4, -4, -4, 4, Fraction(-1, 2)),
+        ),
+    )
+
     def order(self, terms) -> int:
         return 4
 
-    def increment(self, field):
+    def elements(self, field):
         k1 = field(0.0, None)
         k2 = field(0.5, combine((1 / 2,), (k1,)))
         k3 = field(0.5, combine((1 / 2, -1 / 8), (k2, bracket(k1, k2))))
         k4 = field(1.0, k3)
-        return combine((1 / 6, 1 / 3, 1 / 3, 1 / 6, -1 / 12), (k1, k2, k3, k4, bracket(k1, k4)))
+        return [k1, k2, k3, k4, bracket(k1, k4)]
 
 
 class RKMK(AbstractMuntheKaas):
@@ -98,6 +136,8 @@ class RKMK(AbstractMuntheKaas):
 
     Each stage takes the inverse derivative of the exponential as a series, with all its
     commutators: an s-stage method of order q costs up to `(s - 1)(q - 2)` of them. It has order q.
+    Its stages also make the dense output: of order q - 1 with every tableau of diffrax but that of
+    `Dopri8`, with which it is of order 5.
 
     **Arguments:** `tableau`, a `diffrax.ButcherTableau`, for example `diffrax.Dopri5.tableau`.
 
@@ -128,21 +168,25 @@ class RKMK(AbstractMuntheKaas):
     def order(self, terms) -> int:
         return _classical_order(self.a[1:], self.b)
 
-    def increment(self, field):
+    @property
+    def extension(self) -> Extension:
+        return runge_kutta_extension(self.a, self.b)
+
+    def elements(self, field):
         degree = self.order(None) - 2
         stages: list[PyTree] = []
         for c, row in zip(self.c, self.a, strict=True):
             u = _combine_nonzero(row, stages) if any(row) else None
             value = field(c, u)
             stages.append(value if u is None else _dexpinv(u, value, degree))
-        return _combine_nonzero(self.b, stages)
+        return stages
 
 
 _classical_order = functools.lru_cache(runge_kutta_order)
 
 
 def _combine_nonzero(weights: Any, fields: Any) -> PyTree:
-    used = [(w, f) for w, f in zip(weights, fields, strict=True) if w != 0]
+    used = [(float(w), f) for w, f in zip(weights, fields, strict=True) if w != 0]
     return combine(*zip(*used, strict=True))
 
 

@@ -1,20 +1,28 @@
 """Runge-Kutta methods on the tangent space, by a retraction: for the Stiefel manifold."""
 
+from typing import NamedTuple
+
 import jax.numpy as jnp
 import jax.tree_util as jtu
 from jaxtyping import Array, Float, PyTree
 
+from .._dense import Path
+from .._extension import runge_kutta_extension
 from .._fields.low_rank import BorderedSkew, LowRankSkew
 from .._frozen_field import combine, is_field, tangent
 from .._functions.matmul import matmul
 from .base import AbstractLieSolver, Move
 
+_EXTENSION = runge_kutta_extension(
+    ((), (0.5,), (0.0, 0.5), (0.0, 0.0, 1.0)), (1 / 6, 1 / 3, 1 / 3, 1 / 6)
+)
+
 
 class CayleyRK4(AbstractLieSolver):
     """The classical Runge-Kutta method on the tangent space, by the Cayley retraction.
 
-    Order 4, 4 evaluations. The step from Q solves for the tangent vector V at Q, from V = 0, with
-    `Y = cay(a) Q`, `a = [g, -Q] [Q, g]^T`, `g = V - Q (Q^T V) / 2` and
+    Order 4, 4 evaluations. Dense output of order 3. The step from Q solves for the tangent vector V
+    at Q, from V = 0, with `Y = cay(a) Q`, `a = [g, -Q] [Q, g]^T`, `g = V - Q (Q^T V) / 2` and
     `cay(a) = (I - a / 2)^-1 (I + a / 2)`. Of the field it takes only the velocity at a point. Where
     the state is in a linear space, this is the classical Runge-Kutta method.
 
@@ -36,11 +44,10 @@ class CayleyRK4(AbstractLieSolver):
         _check(first)
         curved = jtu.tree_map(is_field, first, is_leaf=is_field)
 
-        def end(v: PyTree) -> PyTree:
-            return jtu.tree_map(lambda c, q, v: _Cayley(q, v).end() if c else q + v, curved, y0, v)
+        end = _End(tuple(jtu.tree_leaves(curved)))
 
         def rate(c: float, v: PyTree) -> PyTree:
-            y = end(v)
+            y = end(v, y0)
             return jtu.tree_map(
                 lambda c, q, v, f: _Cayley(q, v).rate(f) if c else f,
                 curved,
@@ -53,7 +60,19 @@ class CayleyRK4(AbstractLieSolver):
         k2 = rate(0.5, combine((1 / 2,), (k1,)))
         k3 = rate(0.5, combine((1 / 2,), (k2,)))
         k4 = rate(1.0, k3)
-        return Move(end(combine((1 / 6, 1 / 3, 1 / 3, 1 / 6), (k1, k2, k3, k4))))
+        rates = [k1, k2, k3, k4]
+        y1 = end(combine((1 / 6, 1 / 3, 1 / 3, 1 / 6), rates), y0)
+        return Move(y1, Path.of(_EXTENSION, y0, rates, end))
+
+
+class _End(NamedTuple):
+    """The point with tangent vector v at q as its coordinates. Equal to itself and hashable."""
+
+    curved: tuple[bool, ...]
+
+    def __call__(self, v: PyTree, q: PyTree) -> PyTree:
+        curved = jtu.tree_unflatten(jtu.tree_structure(q), self.curved)
+        return jtu.tree_map(lambda c, q, v: _Cayley(q, v).end() if c else q + v, curved, q, v)
 
 
 def _check(field: PyTree) -> None:
