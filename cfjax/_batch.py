@@ -20,7 +20,7 @@ import jax.tree_util as jtu
 import numpy as np
 from jax.experimental import multihost_utils
 from jax.sharding import Mesh, NamedSharding, PartitionSpec
-from jaxtyping import Array, Int, PyTree, Shaped
+from jaxtyping import Array, Bool, Int, PyTree, Shaped
 
 
 class BatchResult(NamedTuple):
@@ -28,9 +28,8 @@ class BatchResult(NamedTuple):
 
     - `values`: what `solve` returned, each array with an axis of the batch's length in front, in
       NumPy.
-    - `failed`: indices of the members that failed, in order. Where `solve` returns a
-      `diffrax.Solution`, those whose `result` is not successful; else those with an entry that is
-      not finite.
+    - `failed`: indices of the members that failed, in order: those with an entry that is not
+      finite, and, where `solve` returns a `diffrax.Solution`, whose `result` is not successful.
     """
 
     values: PyTree
@@ -249,11 +248,20 @@ def _digest(arrays: Iterable[Shaped[Array | np.ndarray, "..."]]) -> bytes:
 
 
 def _failed(values: PyTree) -> Int[np.ndarray, " failures"]:
-    if isinstance(values, diffrax.Solution):
-        return np.flatnonzero(np.asarray(values.result != diffrax.RESULTS.successful))
-    numbers = [a for a in jtu.tree_leaves(values) if eqx.is_inexact_array_like(a)]
-    bad = [~np.isfinite(a).reshape(len(a), -1).all(axis=1) for a in numbers]
+    if not isinstance(values, diffrax.Solution):
+        return np.flatnonzero(np.any(_not_finite(values), axis=0))
+    bad = [np.asarray(values.result != diffrax.RESULTS.successful)]
+    # diffrax fills what is left of the room for saved times and states with infinity.
+    jtu.tree_map(lambda ts, ys: bad.extend(_not_finite(ys, np.isfinite(ts))), values.ts, values.ys)
     return np.flatnonzero(np.any(bad, axis=0))
+
+
+def _not_finite(values: PyTree, where: Any = True) -> list[Bool[np.ndarray, " members"]]:
+    """For each array of numbers, which members have one that is not finite there."""
+    arrays = [a for a in jtu.tree_leaves(values) if eqx.is_inexact_array_like(a)]
+    places = [np.reshape(where, np.shape(where) + (1,) * (a.ndim - np.ndim(where))) for a in arrays]
+    bad = [~np.isfinite(a) & place for a, place in zip(arrays, places, strict=True)]
+    return [a.reshape(len(a), -1).any(axis=1) for a in bad]
 
 
 @contextlib.contextmanager

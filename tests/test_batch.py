@@ -95,6 +95,30 @@ def test_a_solution_of_diffrax_and_members_that_fail():
     np.testing.assert_allclose(good, np.exp(-1), rtol=0, atol=1e-7)
 
 
+def test_a_blow_up_with_constant_steps_is_a_failure_and_room_left_is_none():
+    """Of these diffrax gives no result for each member, and fills 2 of 10 places with infinity."""
+    y0 = np.full((SIZE, 1), 0.1)
+    y0[[4, 17]] = 3.0
+
+    def solve(y0):
+        return diffrax.diffeqsolve(
+            cfjax.LieTerm(lambda t, y, args: y * y),
+            cfjax.CF4(),
+            0.0,
+            1.0,
+            0.125,
+            y0,
+            saveat=diffrax.SaveAt(subs=diffrax.SubSaveAt(steps=True)),
+            max_steps=10,
+        )
+
+    values, failed = cfjax.map_batch(solve, y0, chunk_size=CHUNK)
+    np.testing.assert_array_equal(failed, [4, 17])
+    assert np.isinf(values.ts[0, 8:]).all()
+    # The error of CF4 is some 1e-9 here.
+    np.testing.assert_allclose(values.ys[0, 7], 0.1 / 0.9, rtol=1e-7)
+
+
 def test_entries_that_are_not_finite_are_failures():
     x = np.array([1.0, 0.0, 2.0, 0.0])
     values, failed = cfjax.map_batch(lambda x: {"a": x, "b": 1 / x, "c": 1}, x, chunk_size=3)
