@@ -9,6 +9,7 @@ from jaxtyping import Array, Inexact
 
 from .._frozen_field import AbstractAlgebraElement
 from .._functions.expm import expm_parts
+from .._functions.expm_times import expm_minus_one_times
 from .._functions.matmul import matmul
 
 
@@ -20,7 +21,8 @@ class LeftMatrix(AbstractAlgebraElement):
     keeps unitary ones, and so on.
 
     A flow costs one dense exponential, 5 products of size n and one for each squaring, and a
-    product with the point.
+    product with the point. For few columns, `8 k <= n` (`16 k <= n` if complex), and a 1-norm of
+    `a` up to 2.4 it costs 10 to 25 products with the point and no exponential.
 
     **Arguments:** `a`, shape `(n, n)`, float32, float64, complex64 or complex128. A real `a` may
     act on a complex point of the same precision.
@@ -34,12 +36,19 @@ class LeftMatrix(AbstractAlgebraElement):
         _check_square(self.a)
 
     def flow(self, point: Inexact[Array, "n *k"]) -> Inexact[Array, "n *k"]:
+        if _is_thin(self.a, point):
+            return point + self.displacement(point)
         weight, rest = expm_parts(self.a)
         return weight.astype(point.dtype) * point + _product(rest, point)
 
     def displacement(self, point: Inexact[Array, "n *k"]) -> Inexact[Array, "n *k"]:
-        weight, rest = expm_parts(self.a)
-        return (weight - 1).astype(point.dtype) * point + _product(rest, point)
+        def dense() -> Array:
+            weight, rest = expm_parts(self.a)
+            return (weight - 1).astype(point.dtype) * point + _product(rest, point)
+
+        if not _is_thin(self.a, point):
+            return dense()
+        return expm_minus_one_times(lambda x: _product(self.a, x), point, _norm(self.a), dense)
 
     def tangent(self, point: Inexact[Array, "n *k"]) -> Inexact[Array, "n *k"]:
         n = len(self.a)
@@ -67,12 +76,19 @@ class RightMatrix(AbstractAlgebraElement):
         _check_square(self.a)
 
     def flow(self, point: Inexact[Array, "*k n"]) -> Inexact[Array, "*k n"]:
+        if _is_thin(self.a, point):
+            return point + self.displacement(point)
         weight, rest = expm_parts(self.a)
         return weight.astype(point.dtype) * point + _product(point, rest)
 
     def displacement(self, point: Inexact[Array, "*k n"]) -> Inexact[Array, "*k n"]:
-        weight, rest = expm_parts(self.a)
-        return (weight - 1).astype(point.dtype) * point + _product(point, rest)
+        def dense() -> Array:
+            weight, rest = expm_parts(self.a)
+            return (weight - 1).astype(point.dtype) * point + _product(point, rest)
+
+        if not _is_thin(self.a, point):
+            return dense()
+        return expm_minus_one_times(lambda x: _product(x, self.a), point, _norm(self.a), dense)
 
     def tangent(self, point: Inexact[Array, "*k n"]) -> Inexact[Array, "*k n"]:
         n = len(self.a)
@@ -93,6 +109,16 @@ def _check_square(a: Array) -> None:
         raise ValueError(f"a must have shape (n, n), got {a.shape}.")
     if a.dtype not in (jnp.float32, jnp.float64, jnp.complex64, jnp.complex128):
         raise TypeError(f"a must be float32, float64, complex64 or complex128, got {a.dtype}.")
+
+
+def _is_thin(a: Array, point: Array) -> bool:
+    """Whether some 15 products with the point are cheaper than 5 of size n, as measured."""
+    return (16 if jnp.iscomplexobj(point) else 8) * point.size <= a.size
+
+
+def _norm(a: Array) -> Array:
+    magnitude = jnp.abs(a.real) + jnp.abs(a.imag) if jnp.iscomplexobj(a) else jnp.abs(a)
+    return jnp.max(jnp.sum(magnitude, axis=0))
 
 
 def _product(a: Array, b: Array) -> Array:

@@ -1,0 +1,68 @@
+"""The exponential of a dense matrix, applied to a few columns."""
+
+from collections.abc import Callable
+
+import jax
+import jax.numpy as jnp
+from jax import lax
+from jaxtyping import Array, Inexact, Real
+
+from .expm import max_over_batch
+
+# So many terms of Taylor's series, and the largest norm for which they have a backward error below
+# half a unit in the last place, up to where the terms grow and cancel. The values agree with Table
+# 3.1 of the source; tests/functions/test_expm_times.py derives them again.
+_DEGREES = {
+    "float32": ((5, 0.1308), (10, 0.9951), (15, 2.217)),
+    "float64": ((10, 0.1441), (15, 0.641), (20, 1.438), (25, 2.428)),
+}
+
+
+def expm_minus_one_times(
+    product: Callable[[Array], Array],
+    x: Inexact[Array, "..."],
+    norm: Real[Array, ""],
+    dense: Callable[[], Array],
+) -> Inexact[Array, "..."]:
+    """`(exp(A) - 1) x = A x + A^2 x / 2! + ...`. Added to x, it rounds less than exp(A) times x.
+
+    **Arguments:**
+
+    - `product`: multiplies an array like `x` by A.
+    - `norm`: a consistent norm of A, such as the 1-norm.
+    - `dense`: gives the result in another way. Used if the norm is above 2.4.
+
+    **Cost:** 10, 15, 20 or 25 products for norms up to 0.14, 0.64, 1.4 and 2.4; in single precision
+    5, 10 or 15 up to 0.13, 0.99 and 2.2. Under `jax.vmap` the largest decides.
+
+    **Accuracy:** a backward error of a few units in the last place. The number of terms depends on
+    A alone and not on `x`, so derivatives are as accurate.
+
+    Source: Al-Mohy & Higham, Computing the action of the matrix exponential, SIAM J. Sci. Comput.
+    33 (2011).
+    """
+    norm = max_over_batch(lax.stop_gradient(norm))
+    degrees, thetas = zip(*_DEGREES[jnp.finfo(x.dtype).dtype.name], strict=True)
+
+    # One branch within the other: a loop over all of them has a far slower derivative.
+    def add(term: Array, total: Array, first: int, n: int) -> Array:
+        for k in range(first, degrees[n] + 1):
+            term = product(term) / k
+            total = total + term
+        if n + 1 == len(degrees):
+            return total
+        return lax.cond(
+            norm > thetas[n],
+            lambda term, total: add(term, total, degrees[n] + 1, n + 1),
+            lambda term, total: total,
+            term,
+            total,
+        )
+
+    # Without a checkpoint the branch not taken must still hand out room for what the other saves.
+    return lax.cond(
+        norm > thetas[-1],
+        jax.checkpoint(lambda x: dense()),
+        lambda x: add(x, jnp.zeros_like(x), 1, 0),
+        x,
+    )
