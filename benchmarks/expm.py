@@ -1,7 +1,7 @@
 """Exponentials against `jax.scipy.linalg.expm`: time in a loop, with gradients, and compile time.
 
-The dense `expm` for several sizes, and the closed form for rotations of space against the dense
-exponential of the 3 x 3 matrix.
+The dense `expm` for several sizes, the flow of a matrix field on one vector, and the closed form
+for rotations of space against the dense exponential of the 3 x 3 matrix.
 
 Run `python benchmarks/expm.py`. Both are timed in turns in one process, so the ratios carry over to
 other machines and the times do not.
@@ -19,12 +19,13 @@ from jax import Array, lax
 from rich.console import Console
 from rich.table import Table
 
+import cfjax
 from cfjax._functions.expm import expm
 from cfjax._functions.rotate import rotate
 
 SIZES = (3, 8, 32)
 BATCHES = (1, 100, 1000)
-NORMS = (0.5, 3.0)
+NORMS = (0.1, 0.5, 3.0)
 REPEATS = 7
 FLOPS = 2e7  # Products per timed call, n³·batch·steps: some 10 to 100 milliseconds.
 
@@ -45,6 +46,10 @@ def apply_ours(a: Array, v: Array) -> Array:
 
 def apply_theirs(a: Array, v: Array) -> Array:
     return jax.scipy.linalg.expm(a) @ v
+
+
+def flow_ours(a: Array, v: Array) -> Array:
+    return cfjax.LeftMatrix(a).flow(v)
 
 
 def rotate_ours(a: Array, v: Array) -> Array:
@@ -86,7 +91,7 @@ def compare(
     ratios = [t / o for o, t in zip(*times, strict=True)]
     return [
         "gradient" if gradient else "forward",
-        "rotate" if ours is rotate_ours else "expm",
+        {rotate_ours: "rotate", flow_ours: "flow", apply_ours: "expm"}[ours],
         *(str(x) for x in (n, batch, norm)),
         f"{statistics.median(times[0]) / steps / batch * 1e6:.2f}",
         f"{statistics.median(ratios):.1f}",
@@ -102,7 +107,7 @@ def main() -> None:
     for column in columns:
         table.add_column(column, justify="right")
     for gradient in (False, True):
-        for ours, sizes in ((rotate_ours, (3,)), (apply_ours, SIZES)):
+        for ours, sizes in ((rotate_ours, (3,)), (apply_ours, SIZES), (flow_ours, SIZES[1:])):
             for n, batch, norm in itertools.product(sizes, BATCHES, NORMS):
                 table.add_row(*compare(ours, n, batch, norm, gradient))
         table.add_section()

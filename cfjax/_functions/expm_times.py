@@ -10,11 +10,11 @@ from jaxtyping import Array, Inexact, Real
 from .expm import max_over_batch
 
 # So many terms of Taylor's series, and the largest norm for which they have a backward error below
-# half a unit in the last place, up to where the terms grow and cancel. The values agree with Table
-# 3.1 of the source; tests/functions/test_expm_times.py derives them again.
+# half a unit in the last place, up to where the terms grow and cancel. As in Table 3.1 of the
+# source; tests/functions/test_expm_times.py derives them.
 _DEGREES = {
     "float32": ((5, 0.1308), (10, 0.9951), (15, 2.217)),
-    "float64": ((10, 0.1441), (15, 0.641), (20, 1.438), (25, 2.428)),
+    "float64": ((12, 0.2996), (16, 0.7802), (20, 1.438), (25, 2.428)),
 }
 
 
@@ -32,7 +32,7 @@ def expm_minus_one_times(
     - `norm`: a consistent norm of A, such as the 1-norm.
     - `dense`: gives the result in another way. Used if the norm is above 2.4.
 
-    **Cost:** 10, 15, 20 or 25 products for norms up to 0.14, 0.64, 1.4 and 2.4; in single precision
+    **Cost:** 12, 16, 20 or 25 products for norms up to 0.3, 0.78, 1.4 and 2.4; in single precision
     5, 10 or 15 up to 0.13, 0.99 and 2.2. Under `jax.vmap` the largest decides.
 
     **Accuracy:** a backward error of a few units in the last place. The number of terms depends on
