@@ -56,6 +56,13 @@ def rotate_ours(a: Array, v: Array) -> Array:
     return rotate(jnp.array([a[2, 1], a[0, 2], a[1, 0]]), v)
 
 
+PROGRAMS = (
+    ("rotate", rotate_ours, (3,)),
+    ("expm", apply_ours, SIZES),
+    ("flow", flow_ours, SIZES[1:]),
+)
+
+
 def loop(action: Callable[[Array, Array], Array], steps: int, gradient: bool) -> jax.stages.Wrapped:
     """A batch of loops that multiply a vector with an exponential which changes every step."""
 
@@ -71,7 +78,12 @@ def loop(action: Callable[[Array, Array], Array], steps: int, gradient: bool) ->
 
 
 def compare(
-    ours: Callable[[Array, Array], Array], n: int, batch: int, norm: float, gradient: bool
+    name: str,
+    ours: Callable[[Array, Array], Array],
+    n: int,
+    batch: int,
+    norm: float,
+    gradient: bool,
 ) -> list[str]:
     """One row of the table for the exponential `ours`."""
     a, v = matrices(n, batch, norm)
@@ -91,7 +103,7 @@ def compare(
     ratios = [t / o for o, t in zip(*times, strict=True)]
     return [
         "gradient" if gradient else "forward",
-        {rotate_ours: "rotate", flow_ours: "flow", apply_ours: "expm"}[ours],
+        name,
         *(str(x) for x in (n, batch, norm)),
         f"{statistics.median(times[0]) / steps / batch * 1e6:.2f}",
         f"{statistics.median(ratios):.1f}",
@@ -107,9 +119,9 @@ def main() -> None:
     for column in columns:
         table.add_column(column, justify="right")
     for gradient in (False, True):
-        for ours, sizes in ((rotate_ours, (3,)), (apply_ours, SIZES), (flow_ours, SIZES[1:])):
+        for name, ours, sizes in PROGRAMS:
             for n, batch, norm in itertools.product(sizes, BATCHES, NORMS):
-                table.add_row(*compare(ours, n, batch, norm, gradient))
+                table.add_row(*compare(name, ours, n, batch, norm, gradient))
         table.add_section()
     Console(width=100).print(table)
 

@@ -2,6 +2,7 @@
 
 from collections.abc import Callable
 from fractions import Fraction
+from operator import itemgetter
 from typing import Any, ClassVar
 
 import jax.numpy as jnp
@@ -70,8 +71,8 @@ class AbstractLowStorage(AbstractCommutatorFree):
         )
         (_, end, before), later = lax.scan(stage, (total, after, point), coefficients)
         # Not kept where nobody asks for output within the step.
-        fields = [value, *(jtu.tree_map(lambda x: x[i], later) for i in range(len(self.b) - 1))]  # noqa: B023
-        path = Path.of(extension(self.tableau), value_of(y0), fields)
+        fields = [jtu.tree_map(itemgetter(i), later) for i in range(len(self.b) - 1)]
+        path = Path.of(extension(self.tableau), value_of(y0), [value, *fields])
         return Move(end, path, minus(end, before) if penultimate else None)
 
 
