@@ -84,7 +84,7 @@ def check(fun, x, atol, seed=0, forwards=True):
         ("integrate", "CF4", MATRIX),
         ("integrate", "CF4", FLIGHT),
         ("diffeqsolve", "CF4", BODY),
-        ("diffeqsolve", "RKMK4", MATRIX),
+        pytest.param("diffeqsolve", "RKMK4", MATRIX, marks=pytest.mark.slow),
     ],
     ids=lambda x: x if isinstance(x, str) else x[0].__name__,
 )
@@ -122,7 +122,7 @@ class Network(eqx.Module):
         return cfjax.Rotation(self.mlp(jnp.append(y, t)))
 
 
-@pytest.mark.parametrize("loop", ["integrate", "diffeqsolve"])
+@pytest.mark.parametrize("loop", ["integrate", pytest.param("diffeqsolve", marks=pytest.mark.slow)])
 def test_gradients_in_a_network_held_by_the_term(loop):
     """By `eqx.filter_grad` over the term, for a batch of starts."""
     mlp = eqx.nn.MLP(4, 3, 5, 1, activation=jnp.tanh, key=jax.random.key(0), dtype=float)

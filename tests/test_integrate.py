@@ -310,6 +310,7 @@ def test_the_derivative_in_the_end_time_is_the_velocity():
     close(d_t0, -d_y0 @ velocity(t0, y0), atol=1e-10)
 
 
+@pytest.mark.slow
 def test_a_hessian():
     def fun(y):
         return jnp.sum(jnp.sin(end(*POINT[:2], y, ARGS)))

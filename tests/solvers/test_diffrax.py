@@ -354,7 +354,12 @@ DIFFERENCE_STEP, DIFFERENCE_ERROR = 1e-3, 2e-9
 
 @pytest.mark.parametrize(
     "name, adjoint",
-    [("CF4", "checkpointed"), ("CF4", "direct"), ("CF4", "forward"), ("RKMK4", "checkpointed")],
+    [
+        ("CF4", "checkpointed"),
+        ("CF4", "direct"),
+        ("CF4", "forward"),
+        pytest.param("RKMK4", "checkpointed", marks=pytest.mark.slow),
+    ],
 )
 def test_derivatives_in_start_args_and_field(name, adjoint):
     fun = jax.jit(lambda x: functional(SOLVERS[name], ADJOINTS[adjoint], x))
