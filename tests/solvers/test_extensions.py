@@ -17,7 +17,7 @@ from scipy.integrate import solve_ivp
 import cfjax
 from cfjax._extension import extension
 
-# The uniform order of each: at least one below that of the method.
+# The uniform order of each: at most one below that of the method.
 FLOWS: dict[str, Any] = {
     "LieEuler": (cfjax.LieEuler(), 1),
     "CF2": (cfjax.CF2(), 2),
@@ -113,8 +113,8 @@ def test_the_order_conditions_of_the_extension(solver, order):
         weight = weigher(rows)
         return max(abs(weight(w, len(rows)) - theta**n * number(exact(w))) for w in words(n))
 
-    # Coefficients up to 10 that are rounded, in products of up to four; or exact. Those of YRK135
-    # are up to 300, in sums that grow and cancel.
+    # Coefficients up to 10 that are rounded, in products of up to four that are rarely all large;
+    # or exact. In YRK135, up to 12, they grow and cancel: 12^4 units of rounding are 2e-12.
     tolerance = 0 if is_exact else 2e-14 if solver != cfjax.YRK135() else 1e-12
     for theta in (number(1) / 7, number(1) / 2, number(1)):
         for n in range(1, order + 1):
