@@ -87,7 +87,7 @@ def compare(
 ) -> list[str]:
     """One row of the table for the exponential `ours`."""
     a, v = matrices(n, batch, norm)
-    steps = max(3, min(1000, int(FLOPS / (n**3 * batch) / (10 if gradient else 3))))
+    steps = max(10, min(1000, int(FLOPS / (n**3 * batch) / (10 if gradient else 3))))
     programs, compiling, times = [], [], ([], [])
     for action in (ours, apply_theirs):
         lowered = loop(action, steps, gradient).lower(a, v)

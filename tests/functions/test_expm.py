@@ -11,14 +11,19 @@ import numpy as np
 import pytest
 import scipy.linalg
 
-from cfjax._functions.expm import _DEGREE_15, _DEGREE_21, _SCHEMES, expm
+from cfjax._functions.expm import _DEGREE_15, _DEGREE_15_DOUBLE, _DEGREE_21, _SCHEMES, expm
 
 # One compilation for each size and dtype keeps this file fast.
 compiled = jax.jit(expm)
 
 DTYPES = [np.float32, np.float64, np.complex64, np.complex128]
 SCHEMES = pytest.mark.parametrize(
-    ("scheme", "degree", "unit"), [(_DEGREE_15, 15, 2.0**-24), (_DEGREE_21, 21, 2.0**-53)]
+    ("scheme", "degree", "unit"),
+    [
+        (_DEGREE_15, 15, 2.0**-24),
+        (_DEGREE_15_DOUBLE, 15, 2.0**-53),
+        (_DEGREE_21, 21, 2.0**-53),
+    ],
 )
 
 
@@ -150,6 +155,20 @@ def test_accuracy(kind, norm, dtype):
     assert error(got, reference(a)) <= bound
 
 
+@pytest.mark.parametrize("scheme", [_DEGREE_15_DOUBLE, _DEGREE_21])
+@pytest.mark.parametrize("dtype", [np.float64, np.complex128])
+@pytest.mark.parametrize("relative", [0.999, 1.001])
+def test_accuracy_on_both_sides_of_theta(relative, dtype, scheme):
+    # A general matrix of size 6, where the next scheme takes over or a squaring begins.
+    a = random("general", 6, 1.0, dtype=dtype)
+    square = a @ a
+    size = (np.abs(square.real) + np.abs(square.imag)).sum(0).max()
+    a = a * (relative * scheme.theta / np.sqrt(size))
+    # As in test_accuracy.
+    bound = 4 * 6 * 2.3e-16 * max(1.0, scipy.linalg.expm_cond(a))
+    assert error(compiled(jnp.asarray(a)), reference(a)) <= bound
+
+
 @pytest.mark.parametrize("n", [0, 1, 2, 3, 4, 5, 7, 8, 9, 33])
 @pytest.mark.parametrize("dtype", [np.float32, np.complex128])
 def test_every_size(n, dtype):
@@ -232,7 +251,7 @@ def test_overflow_and_too_large_are_never_a_plausible_number(dtype):
     assert not np.isfinite(np.diag(compiled(jnp.asarray(2000, dtype) * eye))).any()
     rotation = jnp.asarray([[0, 1], [-1, 0]], dtype)
     digits = 2.0 ** np.finfo(dtype).nmant
-    theta = _SCHEMES[np.dtype(dtype).name].theta
+    theta = _SCHEMES[np.dtype(dtype).name][-1].theta
     assert np.isfinite(compiled(jnp.asarray(0.99 * theta * digits, dtype) * rotation)).all()
     assert np.isnan(compiled(jnp.asarray(1.01 * theta * digits, dtype) * rotation)).all()
     largest = jnp.asarray(np.finfo(dtype).max / 8, dtype)
@@ -243,9 +262,10 @@ def conditions(f, *args):
     return str(jax.make_jaxpr(f)(*args)).count(" cond[")
 
 
-def test_branches_stay_branches_in_a_batch():
+@pytest.mark.parametrize("n", [3, 6])
+def test_branches_stay_branches_in_a_batch(n):
     # A batched condition would become a select that squares every time, up to 52 times.
-    a = jnp.asarray(np.stack([random("skew", 3, norm) for norm in (0.1, 50.0)]))
+    a = jnp.asarray(np.stack([random("skew", n, norm) for norm in (0.1, 50.0)]))
 
     def total(a):
         return jnp.sum(expm(a))
@@ -387,3 +407,13 @@ def test_refuses_what_is_not_a_square_matrix(shape):
 def test_refuses_other_dtypes(dtype):
     with pytest.raises(TypeError, match=rf"`a` must have dtype .*got {jnp.dtype(dtype).name}"):
         inspect.unwrap(expm)(jnp.zeros((2, 2), dtype))
+
+
+@pytest.mark.parametrize("norm", [0.0, 0.3, 1.0])
+def test_second_derivative_of_a_size_with_two_schemes(norm):
+    # d²/dx² exp(x·a) = a²·exp(x·a).
+    a = random("skew", 6, 1.0)
+    entry = jax.jit(jax.grad(jax.grad(lambda x: jnp.sum(expm(x * a)))))
+    exact = np.sum(a @ a @ scipy.linalg.expm(norm * a))
+    # 36 entries, each of at most three factors that lose as in test_accuracy.
+    assert abs(float(entry(norm)) - exact) <= 36 * 3 * 4 * 6 * 2.3e-16
