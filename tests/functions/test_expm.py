@@ -162,7 +162,7 @@ def test_accuracy_on_both_sides_of_theta(relative, dtype, scheme):
     # A general matrix of size 6, where the next scheme takes over or a squaring begins.
     a = random("general", 6, 1.0, dtype=dtype)
     square = a @ a
-    size = (np.abs(square.real) + np.abs(square.imag)).sum(0).max()
+    size = (np.abs(np.real(square)) + np.abs(np.imag(square))).sum(0).max()
     a = a * (relative * scheme.theta / np.sqrt(size))
     # As in test_accuracy.
     bound = 4 * 6 * 2.3e-16 * max(1.0, scipy.linalg.expm_cond(a))
