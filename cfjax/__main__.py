@@ -59,7 +59,7 @@ def main(argv: Sequence[str] | None = None) -> int:
         command.add_argument(
             "--output",
             metavar="DIR",
-            type=Path,
+            type=_folder,
             default=Path("figures"),
             help="folder for the files, made if it is missing (default: %(default)s)",
         )
@@ -88,6 +88,12 @@ def main(argv: Sequence[str] | None = None) -> int:
     except OSError as error:
         command.error(f"cannot write to {arguments.output}: {error.strerror or error}")
     return 0
+
+
+def _folder(text: str) -> Path:
+    if not text:
+        raise argparse.ArgumentTypeError("must name a folder, got ''")
+    return Path(text)
 
 
 def _seconds(text: str) -> float:

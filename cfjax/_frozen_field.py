@@ -5,6 +5,7 @@ from collections.abc import Sequence
 from typing import Any, ClassVar
 
 import equinox as eqx
+import jax
 import jax.numpy as jnp
 import jax.tree_util as jtu
 import numpy as np
@@ -60,7 +61,12 @@ class AbstractFrozenField(eqx.Module):
 
     @classmethod
     def combine(cls, weights: Sequence[Weight], fields: Sequence[Any]) -> Any:
-        """The field `sum_i weights[i] * fields[i]`. Weights are real scalars."""
+        """The field `sum_i weights[i] * fields[i]`. Weights are real scalars.
+
+        **Raises** `TypeError` if a leaf of the class is not a floating or complex array.
+        """
+        for path, leaf in jtu.tree_leaves_with_path(fields[0]):
+            _check_coordinates(f"{cls.__name__}{jtu.keystr(path)}", leaf)
         return jtu.tree_map(lambda *leaves: _linear_combination(weights, leaves), *fields)
 
     def enter(self, point: Any, earlier: Sequence[Any]) -> tuple["AbstractFrozenField", Any]:
@@ -109,7 +115,15 @@ def flow(field: PyTree, point: PyTree) -> PyTree:
             if moved is not None:
                 return Displaced(p.start, p.displacement + moved)
         p = value(p)
-        return f.flow(p) if is_field(f) else p + f
+        if not is_field(f):
+            return p + f
+        moved = f.flow(p)
+        if struct(moved) != struct(p):
+            raise ValueError(
+                f"{type(f).__name__}.flow must return what is shaped like its point, "
+                f"{describe(p)}, got {describe(moved)}. Shape and dtype must agree."
+            )
+        return moved
 
     return jtu.tree_map(flow_leaf, field, point, is_leaf=is_field)
 
@@ -151,6 +165,7 @@ def combine(weights: Sequence[Weight], fields: Sequence[PyTree]) -> PyTree:
     def combine_leaf(*leaves):
         if is_field(leaves[0]):
             return type(leaves[0]).combine(weights, leaves)
+        _check_coordinates("A translation", leaves[0])
         return _linear_combination(weights, leaves)
 
     return jtu.tree_map(combine_leaf, *fields, is_leaf=is_field)
@@ -159,10 +174,16 @@ def combine(weights: Sequence[Weight], fields: Sequence[PyTree]) -> PyTree:
 def bracket(a: PyTree, b: PyTree) -> PyTree:
     """The bracket `[a, b]` part by part. Translations commute.
 
-    **Raises** `TypeError` if a part is a frozen field without a bracket.
+    **Raises** `TypeError` if a part is a frozen field without a bracket, or the two parts are not
+    of one class.
     """
 
     def bracket_leaf(x, y):
+        if (is_field(x) or is_field(y)) and type(x) is not type(y):
+            raise TypeError(
+                "bracket: the two fields must be of one class, got "
+                f"{type(x).__name__} and {type(y).__name__}."
+            )
         if isinstance(x, AbstractAlgebraElement):
             return x.bracket(y)
         if is_field(x):
@@ -197,6 +218,26 @@ def without_bracket(field: AbstractFrozenField) -> str:
         "AbstractFrozenField but not an AbstractAlgebraElement. Use a commutator-free method, "
         "for example cfjax.CF4()."
     )
+
+
+def struct(x: PyTree) -> PyTree:
+    """The shapes and dtypes of the arrays of `x`."""
+    return jtu.tree_map(lambda a: jax.ShapeDtypeStruct(jnp.shape(a), jnp.result_type(a)), x)
+
+
+def describe(x: PyTree) -> str:
+    """`x` in one line, with the dtypes and shapes of its arrays."""
+    return eqx.tree_pformat(x, struct_as_array=True, width=10_000)
+
+
+def _check_coordinates(name: str, x: Any) -> None:
+    # A weight in an integer dtype would be rounded to zero.
+    if not jnp.issubdtype(getattr(x, "dtype", object), jnp.inexact):
+        raise TypeError(
+            f"{name} must be a floating or complex array to be combined linearly, got "
+            f"{describe(x)}. What is no coordinate belongs in a static field, "
+            "`eqx.field(static=True)`, or asks for a `combine` of the class's own."
+        )
 
 
 def _linear_combination(

@@ -37,7 +37,8 @@ def integrate(
     **Arguments:**
 
     - `term`, `solver`, `t0`, `t1`, `y0`, `args`: as for `diffrax.diffeqsolve`. `t1 < t0`
-      integrates backwards. Times take the precision of `y0`. Python floats in `args` are traced.
+      integrates backwards. Times are real scalars and take the precision of `y0`. Python floats
+      in `args` are traced; a Python int or bool is part of the program, as in equinox.
     - `num_steps`: how many steps, at least 1.
     - `save_every`: saves the state after every so many steps; must divide `num_steps`. By default
       only the final state is saved.
@@ -65,7 +66,7 @@ def integrate(
         checkpoint_every = count("checkpoint_every", checkpoint_every)
     y0 = jtu.tree_map(jnp.asarray, y0)
     dtype = time_dtype(y0)
-    t0, t1 = jnp.asarray(t0, dtype), jnp.asarray(t1, dtype)
+    t0, t1 = _time("t0", t0, dtype), _time("t1", t1, dtype)
     args = jtu.tree_map(lambda x: jnp.asarray(x) if isinstance(x, float | complex) else x, args)
     return _integrate(
         term, solver, t0, t1, y0, args, num_steps, save_every, checkpoint_every, throw
@@ -157,6 +158,15 @@ def time_dtype(y0: PyTree) -> Any:
     """The state's precision: times of another would promote it."""
     with jax.numpy_dtype_promotion("standard"):
         return jnp.finfo(jnp.result_type(*jtu.tree_leaves(y0))).dtype
+
+
+def _time(name: str, t: Any, dtype: Any) -> Real[Array, ""]:
+    is_number = isinstance(t, jax.Array | np.ndarray | np.generic | int | float)
+    kinds = jnp.integer, jnp.floating
+    is_real = is_number and any(jnp.issubdtype(jnp.result_type(t), kind) for kind in kinds)
+    if not is_real or jnp.shape(t):
+        raise TypeError(f"{name} must be a real scalar, got {eqx.tree_pformat(t)}.")
+    return jnp.asarray(t, dtype)
 
 
 def _is_finite(y: PyTree) -> Bool[Array, ""]:

@@ -63,7 +63,11 @@ def order(tableau: Tableau) -> int:
 
     Exact tableaus are decided exactly. With floats, it is the order that a method may have of
     which these are the rounded coefficients; see `_defects`.
+
+    **Raises:** `TypeError` if `tableau` is not a `Tableau`.
     """
+    if not isinstance(tableau, Tableau):
+        raise TypeError(f"order: tableau must be a cfjax.Tableau, got {tableau!r}.")
     return _largest_order(_defects(_end_weights(tableau), exact_weight), tableau)
 
 

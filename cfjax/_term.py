@@ -11,7 +11,7 @@ import jax.tree_util as jtu
 import numpy as np
 from jaxtyping import Array, PyTree, Real
 
-from ._frozen_field import combine, is_field, tangent
+from ._frozen_field import combine, describe, is_field, struct, tangent
 
 _ARRAY_TYPES = jax.Array | np.ndarray | np.generic | int | float | complex
 
@@ -35,12 +35,16 @@ class LieTerm(diffrax.AbstractTerm):
 
     Where every part is a translation this is an ordinary term, and every diffrax solver runs it.
     With frozen fields diffrax's own solvers either refuse it (Tsit5, Dopri5 and most others) or
-    make ordinary steps in the ambient space, which leave the manifold (Euler, Heun, Midpoint):
-    `vf_prod` is the tangent vector there. So `diffrax.BacksolveAdjoint(solver=diffrax.Tsit5())`
-    works.
+    make ordinary steps in the ambient space, which leave the manifold (Euler, Heun, Midpoint,
+    Ralston, LeapfrogMidpoint): `vf_prod` is the tangent vector there. So
+    `diffrax.BacksolveAdjoint(solver=diffrax.Tsit5())` works.
     """
 
     field: Callable[[Any, Any, Any], PyTree]
+
+    def __check_init__(self):
+        if not callable(self.field):
+            raise TypeError(f"field must be a function of t, y and args, got {self.field!r}.")
 
     def vf(self, t: Any, y: PyTree, args: PyTree) -> PyTree:
         return _checked(self.field(t, y, args), y)
@@ -62,7 +66,7 @@ def _checked(field: PyTree, y: PyTree) -> PyTree:
     except ValueError as error:
         raise ValueError(
             "The field of a LieTerm must return a pytree whose structure is a prefix of the "
-            f"state's. Got {eqx.tree_pformat(field)} for the state {_describe(y)}: {error}"
+            f"state's. Got {eqx.tree_pformat(field)} for the state {describe(y)}: {error}"
         ) from error
     return treedef.unflatten(
         _checked_part("y" + jtu.keystr(path), part, point)
@@ -76,48 +80,59 @@ def _checked_part(place: str, part: Any, point: PyTree) -> Any:
         if not part.acts_on_subtree and not jtu.all_leaves([point]):
             raise TypeError(
                 f"The field returned {name} for {place}. It acts on one array, but the state has "
-                f"{_describe(point)} there."
+                f"{describe(point)} there."
             )
+        _check_precision(place, part, point)
         try:
             velocity = eqx.filter_eval_shape(type(part).tangent, part, point)
         except (TypeError, ValueError) as error:
             # Not the error's own class: some of JAX's are not made from a text.
             kind = TypeError if isinstance(error, TypeError) else ValueError
             raise kind(
-                f"The field returned {name} for {place}, where the state is {_describe(point)}. "
+                f"The field returned {name} for {place}, where the state is {describe(point)}. "
                 f"It does not act there: {error}"
             ) from error
-        if _struct(velocity) != _struct(point):
+        if struct(velocity) != struct(point):
             raise ValueError(
-                f"The field returned {name} for {place}. Its tangent is {_describe(velocity)}, but "
-                f"the state is {_describe(point)} there. Shape and dtype must agree."
+                f"The field returned {name} for {place}. Its tangent is {describe(velocity)}, but "
+                f"the state is {describe(point)} there. Shape and dtype must agree."
             )
         return part
     if not isinstance(part, _ARRAY_TYPES) or not jtu.all_leaves([point]):
         raise TypeError(
-            f"The field returned {_describe(part)} for {place}, where the state is "
-            f"{_describe(point)}. Expected a frozen field, or an array of the state's shape and "
+            f"The field returned {describe(part)} for {place}, where the state is "
+            f"{describe(point)}. Expected a frozen field, or an array of the state's shape and "
             "dtype (a translation)."
         )
     if _is_scalar_for(part, jnp.result_type(point)):
         part = jnp.asarray(part, jnp.result_type(point))
-    if _struct(part) != _struct(point) or not jnp.issubdtype(jnp.result_type(part), jnp.inexact):
+    if struct(part) != struct(point) or not jnp.issubdtype(jnp.result_type(part), jnp.inexact):
         raise ValueError(
-            f"The field returned a translation of type {_describe(part)} for {place}, where the "
-            f"state is {_describe(point)}. Shape and dtype must agree, and be floating or complex."
+            f"The field returned a translation of type {describe(part)} for {place}, where the "
+            f"state is {describe(point)}. Shape and dtype must agree, and be floating or complex."
         )
     return jnp.asarray(part)
+
+
+def _check_precision(place: str, field: Any, point: PyTree) -> None:
+    # Under JAX's standard promotion the tangent would hide it, and the field's rounding would
+    # become the state's drift.
+    precisions = {_precision(p) for p in jtu.tree_leaves(point)}
+    for path, leaf in jtu.tree_leaves_with_path(field):
+        if eqx.is_inexact_array(leaf) and _precision(leaf) not in precisions:
+            raise TypeError(
+                f"The field returned {type(field).__name__} for {place}, where the state is "
+                f"{describe(point)}. Its {jtu.keystr(path)} is {describe(leaf)}. Both must have "
+                "one precision."
+            )
+
+
+def _precision(x: Any) -> Any:
+    dtype = jnp.result_type(x)
+    return jnp.finfo(dtype).dtype if jnp.issubdtype(dtype, jnp.inexact) else dtype
 
 
 def _is_scalar_for(part: Any, dtype: Any) -> bool:
     """Whether `part` is a Python number without a precision of its own that `dtype` can hold."""
     kind = jnp.complexfloating if type(part) is complex else jnp.inexact
     return type(part) in (int, float, complex) and jnp.issubdtype(dtype, kind)
-
-
-def _struct(x: PyTree) -> PyTree:
-    return jtu.tree_map(lambda a: jax.ShapeDtypeStruct(jnp.shape(a), jnp.result_type(a)), x)
-
-
-def _describe(x: PyTree) -> str:
-    return eqx.tree_pformat(x, struct_as_array=True, width=10_000)

@@ -1,7 +1,10 @@
 """Frozen fields on pytrees, and classes a user writes."""
 
-from typing import ClassVar
+import itertools
+from typing import Any, ClassVar
 
+import diffrax
+import equinox as eqx
 import jax
 import jax.numpy as jnp
 import mpmath
@@ -240,3 +243,55 @@ def test_displacement_has_the_rounding_of_the_displacement(make, size):
     np.testing.assert_allclose(moved, exact, rtol=0, atol=atol)
     flow = cfjax.flow(make(jnp.asarray(a)), jnp.eye(3))
     np.testing.assert_allclose(flow, exact + np.eye(3), rtol=0, atol=max(atol, 1e-15))
+
+
+class Growth(AbstractFrozenField):
+    rate: Any
+    fault: str = eqx.field(static=True, default="none")
+
+    def flow(self, point):
+        moved = point * jnp.exp(self.rate)
+        return {"none": moved, "shape": moved[:1], "dtype": moved.astype(jnp.float32)}[self.fault]
+
+    def tangent(self, point):
+        return point * self.rate
+
+
+@pytest.mark.parametrize("rate", [np.array([1, -1]), np.array([True, False]), 1, 1.0, "text"])
+def test_a_field_of_other_than_floating_arrays_is_refused(rate):
+    with pytest.raises(TypeError, match=r"Growth\.rate must be a floating or complex array"):
+        cfjax.combine([0.5, 0.5], [Growth(rate), Growth(rate)])
+
+
+@pytest.mark.parametrize("rate", [[1, -1], [True, False]])
+def test_a_field_of_integers_is_refused_by_solvers(rate):
+    # In integers a weight of 1/2 is 0: the state would never move.
+    term = cfjax.LieTerm(lambda t, y, args: Growth(jnp.asarray(rate)))
+    with (
+        jax.numpy_dtype_promotion("standard"),
+        pytest.raises(TypeError, match=r"Growth\.rate must be a floating or complex array"),
+    ):
+        cfjax.integrate(term, cfjax.CF4(), 0.0, 1.0, np.ones(2), num_steps=2)
+
+
+def test_translations_of_integers_are_refused():
+    with pytest.raises(TypeError, match=r"translation must be a floating or complex array.*i64\[3"):
+        cfjax.combine([0.5, 0.5], [jnp.arange(3), jnp.arange(3)])
+
+
+@pytest.mark.parametrize("fault", ["shape", "dtype"])
+@pytest.mark.parametrize("size", [2, 12])
+def test_a_flow_of_another_shape_is_refused(fault, size):
+    # Small states are held in components and large ones are not.
+    term = cfjax.LieTerm(lambda t, y, args: Growth(-y, fault))
+    for solve in (cfjax.integrate, diffrax.diffeqsolve):
+        step = {"num_steps": 2} if solve is cfjax.integrate else {"dt0": 0.5}
+        with pytest.raises(ValueError, match=rf"Growth\.flow must return .*f64\[{size}\], got f"):
+            solve(term, cfjax.CF4(), t0=0.0, t1=1.0, y0=jnp.ones(size), **step)
+
+
+def test_brackets_of_two_classes_are_refused():
+    fields = [Rotation(W), jnp.asarray(W), LeftMatrix(np.eye(3)), cfjax.RightMatrix(np.eye(3))]
+    for a, b in itertools.permutations(fields, 2):
+        with pytest.raises(TypeError, match=f"one class, got {type(a).__name__} and"):
+            cfjax.bracket(a, b)

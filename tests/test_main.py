@@ -111,6 +111,7 @@ main(["chart", "rigid_body"])
         (["rigid_body", "--budget=-1"], "positive number of seconds, got '-1'"),
         (["rigid_body", "--budget", "nan"], "positive number of seconds, got 'nan'"),
         (["rigid_body", "--output"], "--output"),
+        (["rigid_body", "--output", ""], "must name a folder, got ''"),
     ],
 )
 def test_bad_arguments(arguments, message, capsys):

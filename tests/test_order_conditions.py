@@ -8,6 +8,7 @@ import hypothesis.strategies as st
 import numpy as np
 import pytest
 
+import cfjax
 from cfjax._order_conditions import (
     error_constant,
     exact_tree_weight,
@@ -364,3 +365,9 @@ def test_in_a_linear_space_the_order_may_be_higher():
     wrong = reversed_composition(CG4)
     assert order(wrong) == 2
     assert runge_kutta_order(*row_sums(wrong)) == 4
+
+
+def test_order_is_of_a_tableau(no_shape_hook):
+    # The method instead of its tableau is an easy mistake.
+    with pytest.raises(TypeError, match=r"tableau must be a cfjax.Tableau, got CF4\(\)"):
+        order(cfjax.CF4())  # pyright: ignore[reportArgumentType]

@@ -104,9 +104,36 @@ PAIR = {"q": V3, "p": (V3, V3)}
         (Doubling(jnp.asarray(1.0), "branch"), V3, "for y[.,]"),
     ],
 )
-def test_wrong_values_are_refused_with_their_place(value, y, text):
-    with pytest.raises((TypeError, ValueError), match=text):
+@pytest.mark.parametrize("promotion", ["strict", "standard"])
+def test_wrong_values_are_refused_with_their_place(value, y, text, promotion, no_shape_hook):
+    # Users have JAX's standard promotion, under which a tangent hides a field's precision.
+    with (
+        jax.numpy_dtype_promotion(promotion),
+        pytest.raises((TypeError, ValueError), match=text),
+    ):
         vf(value, y)
+
+
+@pytest.mark.parametrize("promotion", ["strict", "standard"])
+@pytest.mark.parametrize(
+    ("value", "y", "text"),
+    [
+        (Rotation(F32), V3, r"Rotation for y, .*f64\[3\].* "),
+        (LeftMatrix(jnp.eye(3, dtype=jnp.float32)), V3, "LeftMatrix for y, "),
+        (LeftMatrix(jnp.eye(3, dtype=jnp.complex64)), V3.astype(complex), "LeftMatrix for y, "),
+        (Doubling(F32), V3, "Doubling for y, "),
+        ({"q": V3, "p": (V3, Rotation(F32))}, PAIR, r"Rotation for y\['p'\]\[1\]"),
+    ],
+)
+def test_a_field_of_lower_precision_is_refused(value, y, text, promotion, no_shape_hook):
+    """Its rounding would become the state's drift, in an answer that looks like float64."""
+    with jax.numpy_dtype_promotion(promotion), pytest.raises(TypeError, match=text):
+        vf(value, y)
+
+
+def test_the_field_must_be_a_function(no_shape_hook):
+    with pytest.raises(TypeError, match="field must be a function of t, y and args, got None"):
+        LieTerm(None)  # pyright: ignore[reportArgumentType]
 
 
 @pytest.mark.parametrize("solver", [CF4(), cfjax.RKMK4()])

@@ -52,3 +52,5 @@ class Rotation(AbstractAlgebraElement):
 def _check_point(point: Array) -> None:
     if point.ndim not in (1, 2) or point.shape[0] != 3:
         raise ValueError(f"Rotation acts on shapes (3,) and (3, k), got {point.shape}.")
+    if jnp.iscomplexobj(point):
+        raise TypeError(f"Rotation acts on real arrays, got {point.dtype}.")

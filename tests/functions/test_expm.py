@@ -107,6 +107,14 @@ def test_polynomial_is_the_taylor_polynomial(scheme, degree, unit):
     )
 
 
+@pytest.mark.parametrize("scheme", [_DEGREE_15, _DEGREE_21])
+def test_the_first_coefficients_have_no_bias(scheme):
+    """What they are off by is the same in every step, and drift grows with the number of steps."""
+    got = coefficients(scheme)
+    for k in range(2, 7):
+        assert abs(float(got[k] - Fraction(1, math.factorial(k)))) < 1e-17
+
+
 @SCHEMES
 def test_theta_is_where_the_backward_error_reaches_the_unit_roundoff(scheme, degree, unit):
     length = 60  # At theta the terms beyond are below 1e-20 of the first.
