@@ -27,8 +27,8 @@ class _Scheme(NamedTuple):
 # The rows solve "the product has the coefficients 1/k!" for k = 2..15 and k = 2..21. Both systems
 # have many solutions; these are the ones with the least cancellation among those found by Newton's
 # method from random starts, refined in 60 digits and rounded to double so that 1/2! to 1/6! come
-# out within 1e-17: an error of 1/2! is one of exp(a)ᵀ exp(a), the same in every step. theta is where
-# the backward error of the rest of the series reaches half a unit in the last place.
+# out within 1e-17: an error of 1/2! is one of exp(a)ᵀ exp(a), the same in every step. theta is
+# where the backward error of the rest of the series reaches half a unit in the last place.
 # tests/functions/test_expm.py derives both again.
 _DEGREE_15 = _Scheme(
     powers=2,
