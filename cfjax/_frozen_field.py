@@ -118,7 +118,9 @@ def flow(field: PyTree, point: PyTree) -> PyTree:
         if not is_field(f):
             return p + f
         moved = f.flow(p)
-        if struct(moved) != struct(p):
+        # A point in a step's own coordinates may come back in more of them.
+        is_state = f.acts_on_subtree or jtu.all_leaves([p])
+        if is_state and struct(moved) != struct(p):
             raise ValueError(
                 f"{type(f).__name__}.flow must return what is shaped like its point, "
                 f"{describe(p)}, got {describe(moved)}. Shape and dtype must agree."
@@ -174,14 +176,14 @@ def combine(weights: Sequence[Weight], fields: Sequence[PyTree]) -> PyTree:
 def bracket(a: PyTree, b: PyTree) -> PyTree:
     """The bracket `[a, b]` part by part. Translations commute.
 
-    **Raises** `TypeError` if a part is a frozen field without a bracket, or the two parts are not
-    of one class.
+    **Raises** `TypeError` if a part is a frozen field without a bracket, or only one of the two
+    parts is a frozen field.
     """
 
     def bracket_leaf(x, y):
-        if (is_field(x) or is_field(y)) and type(x) is not type(y):
+        if is_field(x) != is_field(y):
             raise TypeError(
-                "bracket: the two fields must be of one class, got "
+                "bracket: a translation has no bracket with a frozen field, got "
                 f"{type(x).__name__} and {type(y).__name__}."
             )
         if isinstance(x, AbstractAlgebraElement):

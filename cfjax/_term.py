@@ -82,7 +82,6 @@ def _checked_part(place: str, part: Any, point: PyTree) -> Any:
                 f"The field returned {name} for {place}. It acts on one array, but the state has "
                 f"{describe(point)} there."
             )
-        _check_precision(place, part, point)
         try:
             velocity = eqx.filter_eval_shape(type(part).tangent, part, point)
         except (TypeError, ValueError) as error:
@@ -97,6 +96,7 @@ def _checked_part(place: str, part: Any, point: PyTree) -> Any:
                 f"The field returned {name} for {place}. Its tangent is {describe(velocity)}, but "
                 f"the state is {describe(point)} there. Shape and dtype must agree."
             )
+        _check_precision(place, part, point)
         return part
     if not isinstance(part, _ARRAY_TYPES) or not jtu.all_leaves([point]):
         raise TypeError(

@@ -83,7 +83,7 @@ PAIR = {"q": V3, "p": (V3, V3)}
         # States that do not move.
         (jnp.arange(3), jnp.arange(3), "for y,"),
         (1.0, jnp.arange(3), "for y,"),
-        (Rotation(V3), jnp.arange(3), "for y,"),
+        (Rotation(V3), jnp.arange(3), "for y[.,]"),
         # Fields.
         (Rotation(V3), jnp.ones(4), "for y,"),
         (
@@ -114,7 +114,6 @@ def test_wrong_values_are_refused_with_their_place(value, y, text, promotion, no
         vf(value, y)
 
 
-@pytest.mark.parametrize("promotion", ["strict", "standard"])
 @pytest.mark.parametrize(
     ("value", "y", "text"),
     [
@@ -125,9 +124,9 @@ def test_wrong_values_are_refused_with_their_place(value, y, text, promotion, no
         ({"q": V3, "p": (V3, Rotation(F32))}, PAIR, r"Rotation for y\['p'\]\[1\]"),
     ],
 )
-def test_a_field_of_lower_precision_is_refused(value, y, text, promotion, no_shape_hook):
+def test_a_field_of_lower_precision_is_refused(value, y, text, no_shape_hook):
     """Its rounding would become the state's drift, in an answer that looks like float64."""
-    with jax.numpy_dtype_promotion(promotion), pytest.raises(TypeError, match=text):
+    with jax.numpy_dtype_promotion("standard"), pytest.raises(TypeError, match=text):
         vf(value, y)
 
 

@@ -52,6 +52,7 @@ class LeftMatrix(AbstractAlgebraElement):
         return _product(self.a, point)
 
     def bracket(self, other: Any) -> "LeftMatrix":
+        _check_other(LeftMatrix, other)
         return type(self)(_product(self.a, other.a) - _product(other.a, self.a))
 
 
@@ -83,8 +84,17 @@ class RightMatrix(AbstractAlgebraElement):
         return _product(point, self.a)
 
     def bracket(self, other: Any) -> "RightMatrix":
+        _check_other(RightMatrix, other)
         # Flows from the right compose the other way round.
         return type(self)(_product(other.a, self.a) - _product(self.a, other.a))
+
+
+def _check_other(side: type, other: Any) -> None:
+    if not isinstance(other, side):
+        raise TypeError(
+            f"{side.__name__} has a bracket with another {side.__name__} only, got "
+            f"{type(other).__name__}."
+        )
 
 
 def _check_square(a: Array) -> None:

@@ -46,6 +46,10 @@ class Rotation(AbstractAlgebraElement):
         return cross(self.omega, point)
 
     def bracket(self, other: Any) -> "Rotation":
+        if not isinstance(other, Rotation):
+            raise TypeError(
+                f"Rotation has a bracket with another Rotation only, got {type(other).__name__}."
+            )
         return type(self)(cross(self.omega, other.omega))
 
 
