@@ -51,7 +51,8 @@ def test_order_on_matrices(matrix_problems, side, name):
     assert abs(observed_order(matrix_problems[side], solver) - ORDERS[name]) < TOLERANCE
 
 
-# Dopri5 and Tsit5 meet the error of the reference here before their order shows.
+# Dopri5 and Tsit5 meet the error of the reference here before their order shows: their test is in
+# scenes/test_rigid_body.py.
 @pytest.mark.parametrize("name", ["RKMK3", "RKMK4", "Heun", "Bosh3"])
 def test_order_on_the_sphere(body_problem, name):
     assert abs(observed_order(body_problem, METHODS[name]) - ORDERS[name]) < TOLERANCE
