@@ -20,6 +20,7 @@ test-all: .venv/dev
 
 .venv/paper .venv/dev: pyproject.toml
 	test -x $(BIN)/python || $(PYTHON) -m venv .venv
+	@echo "Installing into .venv, which takes some minutes the first time."
 	$(BIN)/python -m pip install --quiet --editable '.[$(notdir $@)]'
 	touch $@
 

@@ -90,6 +90,7 @@ def _in_chunks(members: Member, chunk_size: int) -> Program:
     mesh = jax.make_mesh((jax.device_count(),), ("batch",)) if jax.device_count() > 1 else None
     start = time.perf_counter()
     program = _batch._Program(_solve, members, chunk_size, mesh)
+    executable = program.run
     compile_seconds = time.perf_counter() - start
 
     def run():
@@ -97,7 +98,7 @@ def _in_chunks(members: Member, chunk_size: int) -> Program:
         with mock.patch.object(_batch, "_Program", lambda *_: program):
             return cfjax.map_batch(_solve, members, chunk_size=chunk_size, mesh=mesh).values
 
-    return Program(run, _memory(program.run), compile_seconds)
+    return Program(run, _memory(executable), compile_seconds)
 
 
 def _whole(function: Callable[[Member], Any], members: Member) -> Program:

@@ -1,5 +1,11 @@
 """Commutator-free Lie group integrators for JAX."""
 
+from . import _signals
+
+if _signals.is_command():
+    # Before the imports below, which take seconds.
+    _signals.end_the_command()
+
 from . import scenes as scenes
 from ._batch import BatchResult as BatchResult
 from ._batch import map_batch as map_batch
@@ -22,6 +28,7 @@ from ._functions.transforms import CosineTransform as CosineTransform
 from ._functions.transforms import FourierTransform as FourierTransform
 from ._functions.transforms import RealFourierTransform as RealFourierTransform
 from ._functions.transforms import SineTransform as SineTransform
+from ._functions.transforms import TensorTransform as TensorTransform
 from ._integrate import integrate as integrate
 from ._order_conditions import error_constant as error_constant
 from ._order_conditions import order as order

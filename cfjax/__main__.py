@@ -8,7 +8,10 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import NoReturn
 
+import jax
+
 from . import scenes
+from ._extra import paper_extra
 
 # A scene may have several charts: `scenes.stiefel.chart_first` is that of stiefel_first.
 _SCENES = {
@@ -18,6 +21,10 @@ _SCENES = {
     for name, function in vars(module).items()
     if name == "chart" or name.startswith("chart_")
 }
+
+# On two cores with nothing else to do.
+_PAPER_TIME = "Takes 2 to 4 minutes, more on a busy machine."
+_CHART_TIME = "Compiles for 10 to 50 seconds, more on a busy machine."
 
 
 class _Parser(argparse.ArgumentParser):
@@ -35,8 +42,8 @@ def main(argv: Sequence[str] | None = None) -> int:
         help="repeat the paper's experiments",
         description=(
             "Repeats the experiments of Celledoni, Marthinsen & Owren (2003): prints Tables 1 to 4 "
-            "beside the printed numbers and draws Figures 1 to 4 as PNG and PDF. In float64; takes "
-            "one to two minutes."
+            "beside the printed numbers and draws Figures 1 to 4 as PNG and PDF. In float64. "
+            + _PAPER_TIME
         ),
     )
     chart = commands.add_parser(
@@ -44,7 +51,7 @@ def main(argv: Sequence[str] | None = None) -> int:
         help="chart speed against accuracy for a scene",
         description=(
             "Measures what an error costs with each method, prints the table, and draws the chart "
-            "as PNG and PDF. The table is written as CSV, too. In float64."
+            "as PNG and PDF. The table is written as CSV, too. In float64. " + _CHART_TIME
         ),
     )
     chart.add_argument("scene", metavar="SCENE", choices=_SCENES, help=", ".join(_SCENES))
@@ -67,24 +74,21 @@ def main(argv: Sequence[str] | None = None) -> int:
     if arguments.command is None:
         parser.print_help()
         return 0
-    import jax
-
     command = {"paper": paper, "chart": chart}[arguments.command]
     try:
-        from . import _paper, _report
+        with paper_extra():
+            from . import _paper, _report
     except ModuleNotFoundError as error:
-        missing = (error.name or "").partition(".")[0]
-        if missing not in ("matplotlib", "rich"):
-            raise
-        command.error(f"{missing} is missing: pip install cfjax[paper]")
+        command.error(str(error))
     jax.config.update("jax_enable_x64", True)
     if command is paper:
-        experiments = _paper.EXPERIMENTS
+        experiments, patience = _paper.EXPERIMENTS, _PAPER_TIME
     else:
         scene, budget = arguments.scene, arguments.budget
         experiments = [lambda progress: _report.chart(scene, _SCENES[scene], budget, progress)]
+        patience = f"{_CHART_TIME} Then measures for {budget:g} seconds."
     try:
-        _report.run(arguments.output, experiments)
+        _report.run(arguments.output, experiments, patience)
     except OSError as error:
         command.error(f"cannot write to {arguments.output}: {error.strerror or error}")
     return 0

@@ -10,7 +10,7 @@ from jax import lax
 from jaxtyping import Array, PyTree, Real
 
 from ._frozen_field import flow, tangent
-from ._integrate import time_dtype
+from ._integrate import as_state, time_dtype
 from ._term import LieTerm
 
 
@@ -92,7 +92,7 @@ def starting_step(
             f"term must be a cfjax.LieTerm or a diffrax.ODETerm, got {type(term).__name__}."
         )
     norm = (lambda y: jnp.sqrt(_mean_square(y))) if norm is None else norm
-    y0 = jtu.tree_map(jnp.asarray, y0)
+    y0 = as_state(y0)
     dtype = time_dtype(y0)
     t0, t1, atol = (jnp.asarray(x, dtype) for x in (t0, t1, atol))
     longest = jnp.abs(t1 - t0)

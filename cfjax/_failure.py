@@ -1,6 +1,7 @@
 """A step that ends in infinity or NaN is a failure."""
 
 import diffrax
+import jax.core
 import jax.numpy as jnp
 import jax.tree_util as jtu
 from jax import lax
@@ -15,7 +16,10 @@ def result_of(y: PyTree) -> diffrax.RESULTS:
     diffrax ends a solve where a step fails. In a batch that is another end for each member, and a
     select for every value that its loop carries: several times the cost of a small step.
     """
-    is_finite = is_finite_p.bind(*map(lax.stop_gradient, jtu.tree_leaves(y)))
+    leaves = jtu.tree_leaves(y)
+    if not leaves:
+        return diffrax.RESULTS.successful
+    is_finite = is_finite_p.bind(*map(lax.stop_gradient, leaves))
     nonfinite: diffrax.RESULTS = diffrax.RESULTS.nonfinite  # pyright: ignore[reportAssignmentType]
     return diffrax.RESULTS.where(is_finite, diffrax.RESULTS.successful, nonfinite)
 
@@ -30,7 +34,7 @@ def _impl(*leaves):
 
 @is_finite_p.def_abstract_eval
 def _(*leaves):
-    return jnp.zeros((), bool).aval
+    return jax.core.ShapedArray((), bool)
 
 
 def _batch(leaves, dims):

@@ -149,6 +149,11 @@ def _inlined(
     return None
 
 
+def _count_of_one_rank(outside: Sequence[Any], inside: Sequence[Any]) -> int:
+    """How many of a scan's values have no axis that it scans over."""
+    return sum(len(_shape(a)) == len(_shape(b)) for a, b in zip(outside, inside, strict=True))
+
+
 def _unrolled(
     eqn: JaxprEqn, operands: Sequence[Hashable], program: _Program
 ) -> list[Hashable] | None:
@@ -156,7 +161,10 @@ def _unrolled(
     params = eqn.params
     if not all(x in program.values for x in operands):
         return None
-    first, last = params["num_consts"], params["num_consts"] + params["num_carry"]
+    # By the axis that is scanned over: the names of the parameters change with JAX's version.
+    inner = params["jaxpr"].jaxpr
+    last = _count_of_one_rank(eqn.invars, inner.invars)
+    first = last - _count_of_one_rank(eqn.outvars, inner.outvars)
     carry, outputs = operands[first:last], []
     order = range(params["length"])
     for i in reversed(order) if params["reverse"] else order:
@@ -326,6 +334,14 @@ def _unknown_length(eqn: JaxprEqn) -> int:
     )
 
 
+def _check(eqn: JaxprEqn) -> int:
+    """A check of equinox, which calls the host to raise its error. Others may compute anything."""
+    callback = getattr(eqn.params["callback"], "callback_func", eqn.params["callback"])
+    if not getattr(callback, "__module__", "").startswith("equinox."):
+        raise NotImplementedError("count_flops cannot count what a function of the host computes.")
+    return 0
+
+
 # Calls by the parameter that holds the program.
 _CALLS = {
     "checkpoint": "jaxpr",
@@ -368,6 +384,7 @@ _COSTS: dict[str, Callable[[JaxprEqn], int]] = {
     **dict.fromkeys(_FREE.split(), _nothing),
     **_CONTROL,
     "abs": _modulus,
+    "pure_callback": _check,
     "cholesky": _cholesky,
     "cumsum": _cumulative,
     "cumprod": _cumulative,

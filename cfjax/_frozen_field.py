@@ -42,9 +42,16 @@ class AbstractFrozenField(eqx.Module):
     def tangent(self, point: Any) -> Any:
         """The ambient velocity at `point`, the derivative of the flow at time zero."""
 
+    # What diffrax's explicit methods try, and what its implicit ones do (`field**ω`), both in an
+    # error that says nothing to their user.
     def __array__(self, *args: Any, **kwargs: Any) -> Any:
-        # What diffrax's Runge-Kutta methods try, in an error that says nothing to their user.
-        raise TypeError(
+        raise TypeError(self._is_no_array())
+
+    def __pow__(self, other: Any) -> Any:
+        raise TypeError(self._is_no_array())
+
+    def _is_no_array(self) -> str:
+        return (
             f"{type(self).__name__} is a frozen vector field and not an array. A solver of linear "
             "spaces cannot take it: use a method of cfjax, for example cfjax.CF4(), or give the "
             "velocity as an array."
@@ -68,6 +75,16 @@ class AbstractFrozenField(eqx.Module):
         for path, leaf in jtu.tree_leaves_with_path(fields[0]):
             _check_coordinates(f"{cls.__name__}{jtu.keystr(path)}", leaf)
         return jtu.tree_map(lambda *leaves: _linear_combination(weights, leaves), *fields)
+
+    @classmethod
+    def defect(cls, point: Any) -> tuple[Real[Array, ""], str] | None:
+        """How far `point` is off the manifold that such fields act on, and what is expected of it.
+
+        None, the default, if they act on every point. A solve refuses a start that is off by more
+        than the root of a unit of rounding.
+        """
+        del point
+        return None
 
     def enter(self, point: Any, earlier: Sequence[Any]) -> tuple["AbstractFrozenField", Any]:
         """This field and the point where it is frozen, in the coordinates of the step.
@@ -162,15 +179,45 @@ def combine(weights: Sequence[Weight], fields: Sequence[PyTree]) -> PyTree:
 
     The weights are real scalars. They take the precision of the field, so a step in float64
     does not promote a field in float32.
-    """
 
-    def combine_leaf(*leaves):
+    **Raises** `TypeError` if the fields have different structures, or different classes in a part.
+    """
+    parts, treedef = jtu.tree_flatten_with_path(fields[0], is_leaf=is_field)
+    try:
+        others = [treedef.flatten_up_to(field) for field in fields[1:]]
+    except ValueError as error:
+        structures = [describe(jtu.tree_map(_name, f, is_leaf=is_field)) for f in fields]
+        raise TypeError(
+            f"Only fields of one structure can be added, got {' and '.join(structures)}."
+        ) from error
+
+    def combine_part(path: Any, *leaves: Any) -> Any:
+        if len({_kind(leaf) for leaf in leaves}) > 1:
+            names = " and ".join(dict.fromkeys(map(_name, leaves)))
+            place = jtu.keystr(path) and f" at {jtu.keystr(path)}"
+            raise TypeError(
+                f"Only fields of one kind can be added, got {names}{place}. If these are the terms "
+                "of a diffrax.MultiTerm, give each a part of the state of its own."
+            )
         if is_field(leaves[0]):
             return type(leaves[0]).combine(weights, leaves)
         _check_coordinates("A translation", leaves[0])
         return _linear_combination(weights, leaves)
 
-    return jtu.tree_map(combine_leaf, *fields, is_leaf=is_field)
+    columns = zip(parts, *others, strict=True)
+    return treedef.unflatten(combine_part(path, part, *rest) for (path, part), *rest in columns)
+
+
+def _name(x: Any) -> str:
+    return type(x).__name__ if is_field(x) else "a translation"
+
+
+def _kind(x: Any) -> Any:
+    """Of a field its class, or the one whose own `combine` it has inherited."""
+    if not is_field(x):
+        return None
+    owner = next(c for c in type(x).__mro__ if "combine" in vars(c))
+    return type(x) if owner is AbstractFrozenField else owner
 
 
 def bracket(a: PyTree, b: PyTree) -> PyTree:
@@ -195,7 +242,7 @@ def bracket(a: PyTree, b: PyTree) -> PyTree:
     return jtu.tree_map(bracket_leaf, a, b, is_leaf=is_field)
 
 
-def enter(field: PyTree, point: PyTree, earlier: Sequence[PyTree]) -> tuple[PyTree, PyTree]:
+def enter(field: PyTree, point: PyTree, earlier: Sequence[PyTree]) -> tuple[PyTree, ...]:
     """`field` and the point where it is frozen, in the coordinates of a step, part by part."""
     parts, treedef = jtu.tree_flatten(field, is_leaf=is_field)
     columns = [treedef.flatten_up_to(tree) for tree in (point, *earlier)]
@@ -203,8 +250,8 @@ def enter(field: PyTree, point: PyTree, earlier: Sequence[PyTree]) -> tuple[PyTr
         f.enter(p, before) if is_field(f) else (f, p)
         for f, p, *before in zip(parts, *columns, strict=True)
     ]
-    fields, points = zip(*entered, strict=True)
-    return treedef.unflatten(fields), treedef.unflatten(points)
+    # A state may have no parts.
+    return tuple(treedef.unflatten([pair[k] for pair in entered]) for k in range(2))
 
 
 def leave(field: PyTree, point: PyTree) -> PyTree:

@@ -8,7 +8,7 @@ import jax
 import jax.numpy as jnp
 import jax.tree_util as jtu
 from jax import lax
-from jaxtyping import Array, PyTree
+from jaxtyping import Array, Int, PyTree
 
 from ._components import has_few, join, split, trace
 from ._functions.pack import pack, unpack
@@ -21,11 +21,13 @@ _MOST_FORWARD = 48
 _MOST_BACKWARD = 18
 
 
-def repeat(step: Callable[[PyTree], PyTree], carry: PyTree, num_steps: int) -> PyTree:
+def repeat(
+    step: Callable[[PyTree], PyTree], carry: PyTree, num_steps: int | Int[Array, ""]
+) -> PyTree:
     """Replaces `carry` by `step(carry)`, `num_steps` times.
 
     `step` may close over traced values. Reverse mode keeps one carry a step, and computes the step
-    again.
+    again. It needs a Python int; an array makes one program for every number of steps.
 
     On CPU a loop of small steps is fast if XLA has few operations left after fusion, and it fuses
     towards each result all that leads to it. So there is one result: the components of all small
@@ -52,7 +54,7 @@ def _repeat(
     values: list[Array],
     *,
     program: Callable,
-    num_steps: int,
+    num_steps: int | Int[Array, ""],
     most: tuple[int, int],
 ) -> list[Array]:
     matrices = has_few(leaves, most[0])
@@ -76,7 +78,7 @@ def _(primals, tangents, *, program, num_steps, most):
 
 def _scan(
     program: Callable[[list[Any], list[Any], bool], list[Any]],
-    num_steps: int,
+    num_steps: int | Int[Array, ""],
     leaves: list[Array],
     values: list[Array],
     matrices: bool,
@@ -115,7 +117,12 @@ def _scan(
         return (pack([*numbers, *travellers]) if numbers else None, rest), None
 
     vector = pack([*numbers, *known]) if numbers else None
-    (vector, rest), _ = lax.scan(body, (vector, rest), length=num_steps)
+    if isinstance(num_steps, int):
+        (vector, rest), _ = lax.scan(body, (vector, rest), length=num_steps)
+    else:
+        vector, rest = lax.fori_loop(
+            0, num_steps, lambda _, carry: body(carry, None)[0], (vector, rest)
+        )
     numbers = [] if vector is None else unpack(vector)[: sum(packed)]
     return join(jtu.tree_unflatten(structure, _join(numbers, rest, packed)))
 

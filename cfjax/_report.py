@@ -17,6 +17,8 @@ from matplotlib.ticker import EngFormatter, LogLocator, NullFormatter
 from rich.console import Console, RenderableType
 from rich.progress import Progress
 
+from ._progress import on_terminal
+from ._signals import busy
 from ._work_precision import WorkPrecision
 
 # Colours of Okabe & Ito that colour-blind readers tell apart; the line styles serve all others.
@@ -52,29 +54,40 @@ class Report(NamedTuple):
     data: Mapping[str, WorkPrecision] = {}
 
 
-def run(output: Path, experiments: Sequence[Callable[[Progress], Report]]) -> None:
+def run(output: Path, experiments: Sequence[Callable[[Progress], Report]], patience: str) -> None:
     """Prints tables and writes figures as PNG and PDF, and data as CSV, to the folder `output`.
+
+    Says before the work how long it takes: `patience`.
 
     **Raises** `OSError` if the folder cannot be made or written to.
     """
     output.mkdir(parents=True, exist_ok=True)
-    # On the folder's own disk, so that each file arrives whole by a rename. Made first, so that
-    # a folder without permission fails before the work.
-    with tempfile.TemporaryDirectory(dir=output, prefix=".cfjax-") as folder:
-        bar, console = Console(stderr=True), Console()
-        for experiment in experiments:
-            with Progress(console=bar, transient=True, disable=not bar.is_terminal) as progress:
-                report = experiment(progress)
-            for part in report.printed:
-                console.print(part)
-            for name, figure in report.figures.items():
-                for path in (f"{name}.png", f"{name}.pdf"):
-                    figure.savefig(Path(folder, path), dpi=200)
-            for name, work in report.data.items():
-                work.to_csv(Path(folder, f"{name}.csv"))
-            for path in sorted(os.listdir(folder)):
-                os.replace(Path(folder, path), output / path)
-                console.print(f"Wrote {output / path}", soft_wrap=True)
+    # A folder without permission fails before the work.
+    tempfile.TemporaryFile(dir=output).close()
+    Console(stderr=True).print(patience, soft_wrap=True)
+    console = Console()
+    for experiment in experiments:
+        with on_terminal(transient=True) as progress:
+            report = experiment(progress)
+        for part in report.printed:
+            console.print(part)
+        for name in _write(report, output):
+            console.print(f"Wrote {output / name}", soft_wrap=True)
+
+
+def _write(report: Report, output: Path) -> list[str]:
+    """Writes the files of a report and returns their names."""
+    # On the folder's own disk, so that each file arrives whole by a rename.
+    with busy, tempfile.TemporaryDirectory(dir=output, prefix=".cfjax-") as folder:
+        for name, figure in report.figures.items():
+            for path in (f"{name}.png", f"{name}.pdf"):
+                figure.savefig(Path(folder, path), dpi=200)
+        for name, work in report.data.items():
+            work.to_csv(Path(folder, f"{name}.csv"))
+        names = sorted(os.listdir(folder))
+        for name in names:
+            os.replace(Path(folder, name), output / name)
+    return names
 
 
 def chart(

@@ -36,7 +36,7 @@ class LieTerm(diffrax.AbstractTerm):
     Where every part is a translation this is an ordinary term, and every diffrax solver runs it.
     With frozen fields diffrax's own solvers either refuse it (Tsit5, Dopri5 and most others) or
     make ordinary steps in the ambient space, which leave the manifold (Euler, Heun, Midpoint,
-    Ralston, LeapfrogMidpoint): `vf_prod` is the tangent vector there. So
+    Ralston, LeapfrogMidpoint, ImplicitEuler): `vf_prod` is the tangent vector there. So
     `diffrax.BacksolveAdjoint(solver=diffrax.Tsit5())` works.
     """
 
@@ -57,6 +57,34 @@ class LieTerm(diffrax.AbstractTerm):
 
     def vf_prod(self, t: Any, y: PyTree, args: PyTree, control: Any) -> PyTree:
         return tangent(self.prod(self.vf(t, y, args), control), y)
+
+
+def product(terms: diffrax.AbstractTerm, value: PyTree, control: PyTree) -> PyTree:
+    """The product of what a term's vector field returned with its control: a frozen field.
+
+    `diffrax.MultiTerm` would add the arrays within the fields of its terms, whatever they are.
+
+    **Raises** `TypeError` for a term that cannot multiply a frozen field, or a sum of terms whose
+    fields are of different kinds.
+    """
+    if not any(map(is_field, jtu.tree_leaves(value, is_leaf=is_field))):
+        return terms.prod(value, control)
+    if isinstance(terms, diffrax.MultiTerm):
+        parts = [product(*each) for each in zip(terms.terms, value, control, strict=True)]
+        return combine([1.0] * len(parts), parts)
+    if isinstance(value, tuple) and isinstance(control, tuple):
+        raise TypeError(
+            "A diffrax.MultiTerm of frozen fields must not be wrapped in another term, got "
+            f"{type(terms).__name__}. Wrap its terms, or return the sum from one field."
+        )
+    try:
+        return terms.prod(value, control)
+    except ValueError as error:
+        raise TypeError(
+            "The term cannot multiply a frozen field by its control, "
+            f"{describe(control)}: use cfjax.LieTerm(field). A diffrax.ControlTerm multiplies "
+            "arrays only. To drive a field by x(t), multiply it by dx/dt in a LieTerm."
+        ) from error
 
 
 def _checked(field: PyTree, y: PyTree) -> PyTree:
@@ -95,6 +123,7 @@ def _checked_part(place: str, part: Any, point: PyTree) -> Any:
             raise ValueError(
                 f"The field returned {name} for {place}. Its tangent is {describe(velocity)}, but "
                 f"the state is {describe(point)} there. Shape and dtype must agree."
+                f"{_make_complex(velocity, point)}"
             )
         _check_precision(place, part, point)
         return part
@@ -110,8 +139,15 @@ def _checked_part(place: str, part: Any, point: PyTree) -> Any:
         raise ValueError(
             f"The field returned a translation of type {describe(part)} for {place}, where the "
             f"state is {describe(point)}. Shape and dtype must agree, and be floating or complex."
+            f"{_make_complex(part, point)}"
         )
     return jnp.asarray(part)
+
+
+def _make_complex(velocity: PyTree, point: PyTree) -> str:
+    is_complex = [any(map(jnp.iscomplexobj, jtu.tree_leaves(x))) for x in (velocity, point)]
+    advice = " The field is complex and the state is real: make y0 complex."
+    return advice if is_complex == [True, False] else ""
 
 
 def _check_precision(place: str, field: Any, point: PyTree) -> None:

@@ -6,7 +6,7 @@ import functools
 import os
 import time
 from collections import Counter
-from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from typing import TYPE_CHECKING, Any, ClassVar, NamedTuple
 
 import diffrax
@@ -15,18 +15,21 @@ import jax
 import jax.numpy as jnp
 import jax.tree_util as jtu
 import numpy as np
-from jaxtyping import Array, Float, PyTree
+from jaxtyping import Array, Float, Int, PyTree
 
+from ._extra import paper_extra
 from ._flops import count_flops
 from ._frozen_field import AbstractAlgebraElement, bracket, combine, flow, is_field, tangent
 from ._integrate import (
-    check_state,
+    as_state,
     check_term_and_solver,
     count,
-    integrate,
+    equal_steps,
     time_dtype,
+    time_scalar,
     without_estimate,
 )
+from ._progress import progress_bar
 
 if TYPE_CHECKING:
     import matplotlib.figure
@@ -53,7 +56,8 @@ class WorkPrecision(NamedTuple):
       one flow; a translation is none.
     - `flops`: floating-point operations of all attempted steps, as traced. NaN where a step has an
       operation without a rule. The step size controller's own are not in it.
-    - `compile_seconds`: time to trace and compile the solve.
+    - `compile_seconds`: time to trace and compile the solve. One program serves all settings of a
+      method.
     - `seconds`: the time of every repeated run, without the first. Its minimum is the figure to
       compare.
     - `note`: why a run failed, else empty.
@@ -86,14 +90,21 @@ class WorkPrecision(NamedTuple):
         return WorkPrecision(**columns)
 
     def plot(self, figure: "matplotlib.figure.Figure | None" = None) -> "matplotlib.figure.Figure":
-        """The chart: error against time, and beside it against flops. Needs matplotlib.
+        """The chart: error against time, and beside it against flops. Needs `cfjax[paper]`.
 
         A mark is the fastest run; its bar reaches to the upper quartile. Where no flops are known
         of any method, the second panel shows evaluations of the field. Draws into `figure` if there
         is one.
-        """
-        from . import _report
 
+        **Raises** `ModuleNotFoundError` without matplotlib and rich, and `TypeError` if `figure` is
+        none.
+        """
+        with paper_extra():
+            from matplotlib.figure import FigureBase
+
+            from . import _report
+        if figure is not None and not isinstance(figure, FigureBase):
+            raise TypeError(f"figure must be a matplotlib figure, got {figure!r}.")
         figure = _report.new_figure((7.0, 4.2)) if figure is None else figure
         left, right = figure.subplots(1, 2, sharey=True)
         counts_flops = bool(np.any(np.isfinite(self.flops)))
@@ -117,12 +128,15 @@ class WorkPrecision(NamedTuple):
         return figure
 
     def table(self) -> "rich.table.Table":
-        """The table for a terminal, with the notes below. Needs rich.
+        """The table for a terminal, with the notes below. Needs `cfjax[paper]`.
 
         Beside the fastest run stands how much longer the upper quartile took.
+
+        **Raises** `ModuleNotFoundError` without rich.
         """
-        from rich import box
-        from rich.table import Table
+        with paper_extra():
+            from rich import box
+            from rich.table import Table
 
         is_adaptive = bool(np.any(np.isfinite(self.tolerance)))
         headings = ["error", "steps", "evals", "flows", "flops", "compile\n(s)", "time\n(ms)"]
@@ -184,21 +198,22 @@ def work_precision(
     *,
     methods: Mapping[str, Method],
     reference: PyTree,
-    num_steps: Sequence[int] | None = None,
-    tolerances: Sequence[float] | None = None,
+    num_steps: Sequence[int] | Int[Array | np.ndarray, " settings"] | None = None,
+    tolerances: Sequence[float] | Float[Array | np.ndarray, " settings"] | None = None,
     controller: Callable[[Any], diffrax.AbstractStepSizeController] = absolute_tolerance,
     dt0: Any = None,
     max_steps: int = 100_000,
     error: Callable[[PyTree, PyTree], float] = distance,
     repeats: int = 100,
     budget: int | float = 20,
-    progress: "rich.progress.Progress | None" = None,
+    progress: "bool | rich.progress.Progress" = True,
 ) -> WorkPrecision:
     """Measures what an error costs with each method.
 
-    Either with equal steps, `cfjax.integrate` for each of `num_steps`, or with adaptive steps,
-    `diffrax.diffeqsolve` for each of `tolerances`. Compiles every program, then runs all of them
-    in turns, so that what else the machine does falls on all alike.
+    Either with equal steps, those of `cfjax.integrate`, for each of `num_steps`, or with adaptive
+    steps, `diffrax.diffeqsolve` for each of `tolerances`. Compiles a program for each method, which
+    takes seconds, then runs all of them in turns, so that what else the machine does falls on all
+    alike.
 
     **Arguments:**
 
@@ -207,15 +222,17 @@ def work_precision(
       own solvers take `diffrax.ODETerm` of the ambient field.
     - `reference`: the state at `t1` that counts as exact; shaped like `y0`.
     - `num_steps`, `tolerances`: one of the two.
-    - `controller`: makes the step size controller of a tolerance, which is an array. By default
-      the absolute error is controlled, with `rtol=0`: a relative one depends on the frame.
+    - `controller`: makes the step size controller of a tolerance, which is a traced array. By
+      default the absolute error is controlled, with `rtol=0`: a relative one depends on the frame.
     - `dt0`: the first of the adaptive steps; by default a hundredth of the interval.
     - `max_steps`: a run that takes more adaptive steps has failed.
     - `error`: the error of a final state, given it and the reference; by default the 2-norm of the
       difference.
     - `repeats`, `budget`: times are measured so many times, or until so many seconds have passed.
       Every program runs once in any case, and once more to warm up.
-    - `progress`: a `rich.progress.Progress` to report to.
+    - `progress`: whether to show what is being compiled and measured in progress bars, on a
+      terminal. Needs `rich`, and without it there are none. Or a `rich.progress.Progress` that
+      gets the bars.
 
     **Returns:** a `cfjax.WorkPrecision`. A run that fails (infinity or NaN, or too many steps) has
     a row of its own there, with NaN as its error and the reason as its note.
@@ -225,60 +242,68 @@ def work_precision(
     traced, with its name added.
     """
     settings = _checked_settings(num_steps, tolerances)
-    if not methods:
-        raise ValueError("methods must have at least one solver, got none.")
-    for name, value in (("repeats", repeats), ("max_steps", max_steps)):
-        if value < 1:
-            raise ValueError(f"{name} must be at least 1, got {value}.")
-    if not budget > 0:
-        raise ValueError(f"budget must be a positive number of seconds, got {budget}.")
-    check_state(y0)
-    y0 = jtu.tree_map(jnp.asarray, y0)
+    solvers = _checked_methods(methods, term)
+    repeats, max_steps = count("repeats", repeats), count("max_steps", max_steps)
+    if not isinstance(budget, int | float | np.number) or not budget > 0:
+        raise ValueError(f"budget must be a positive number of seconds, got {budget!r}.")
+    for name, function in (("controller", controller), ("error", error)):
+        if not callable(function):
+            raise TypeError(f"{name} must be a function, got {function!r}.")
+    y0 = as_state(y0)
     _check_reference(reference, y0)
     is_adaptive = tolerances is not None
+    dtype = time_dtype(y0)
+    t0, t1 = time_scalar("t0", t0, dtype), time_scalar("t1", t1, dtype)
     if dt0 is None:
         dt0 = (t1 - t0) / (100 if is_adaptive else max(settings))
-    dtype = time_dtype(y0)
-    start, end, first = (jnp.asarray(t, dtype) for t in (t0, t1, dt0))
+    dt0 = time_scalar("dt0", dt0, dtype)
+    if not 0 < abs(t1 - t0) < np.inf:
+        raise ValueError(f"t0 and t1 must be finite and differ, got {t0} and {t1}.")
+    if not 0 < dt0 / (t1 - t0) < np.inf:
+        raise ValueError(f"dt0 must be a step from t0={t0} towards t1={t1}, got {dt0}.")
     args = jtu.tree_map(lambda x: jnp.asarray(x) if eqx.is_inexact_array_like(x) else x, args)
-    # One program serves all tolerances, but only one number of steps.
-    values = [jnp.asarray(x, dtype) for x in settings] if is_adaptive else settings
+    # Arrays, so that one program serves them all.
+    counter = jnp.int32 if max(settings) < 2**31 else int
+    values = [jnp.asarray(x, dtype if is_adaptive else counter) for x in settings]
+    if is_adaptive:
+        _check_controller(controller, values[0])
     solve = _adaptive_steps(controller, max_steps) if is_adaptive else _equal_steps
 
-    def cases() -> Iterator[tuple[str, Any, Callable[[], tuple], "_Cost", float]]:
-        for name, method in methods.items():
-            with _about(name):
-                own_term, solver = _term_and_solver(method, term)
-                solver = solver if is_adaptive else without_estimate(solver)
-                problem = _Problem(own_term, solver, start, end, first, y0, args)
-                cost = _cost(problem, is_adaptive)
-                executable, seconds = None, 0.0
-                for setting, value in zip(settings, values, strict=True):
-                    if executable is None or not is_adaptive:
-                        executable, seconds = compiled(solve, problem, value)
-                    arrays = eqx.filter((problem, value), eqx.is_array)
-                    yield name, setting, functools.partial(executable, arrays), cost, seconds
-
     names, rows, notes, programs = [], [], [], []
-    total = len(methods) * len(settings)
-    for name, setting, program, cost, seconds in _track(progress, cases(), total, "Compiling"):
-        # The first run also warms up.
-        y, attempted, rejected, note = _first_run(program)
-        found = np.nan if note else float(error(y, reference))
-        if not note and not np.isfinite(found):
-            found, note = np.nan, "The error is not finite."
-        if not is_adaptive:
-            # Known also where the run broke off.
-            attempted, rejected = float(setting), 0.0
-        tolerance = setting if is_adaptive else np.nan
-        rows.append((tolerance, found, attempted, rejected, *cost.of(attempted), seconds))
-        names.append(name)
-        notes.append(note)
-        programs.append(program)
-    runs = [program for program, note in zip(programs, notes, strict=True) if not note]
-    measured = take_turns(runs, repeats=repeats, budget=budget, progress=progress)
+    with progress_bar(progress, "Compiling", len(solvers)) as update:
+        for name, (own_term, solver) in solvers.items():
+            update(description=f"Compiling {name}")
+            with _about(name):
+                solver = solver if is_adaptive else without_estimate(solver)
+                problem = _Problem(own_term, solver, t0, t1, dt0, y0, args)
+                cost = _cost(problem, is_adaptive)
+                executable, seconds = compiled(solve, problem, values[0])
+            update(description=f"Running {name}")
+            for setting, value in zip(settings, values, strict=True):
+                program = functools.partial(executable, eqx.filter((problem, value), eqx.is_array))
+                # The first run also warms up.
+                y, attempted, rejected, note = _first_run(program)
+                with _about(name):
+                    found = np.nan if note else _checked_error(error(y, reference))
+                if not note and not np.isfinite(found):
+                    found, note = np.nan, "The error is not finite."
+                if not is_adaptive:
+                    # Known also where the run broke off.
+                    attempted, rejected = float(setting), 0.0
+                tolerance = setting if is_adaptive else np.nan
+                rows.append((tolerance, found, attempted, rejected, *cost.of(attempted), seconds))
+                names.append(name)
+                notes.append(note)
+                programs.append(program)
+            update(advance=1)
+    runs = [i for i, note in enumerate(notes) if not note]
+    # Methods with one setting run one after the other: these are compared, and last about as long.
+    runs.sort(key=lambda i: i % len(settings))
+    measured = take_turns(
+        [programs[i] for i in runs], repeats=repeats, budget=budget, progress=progress
+    )
     seconds = np.full((len(rows), measured.shape[1]), np.nan)
-    seconds[[not note for note in notes]] = measured
+    seconds[runs] = measured
     columns = dict(zip(WorkPrecision._fields[1:9], np.array(rows).T, strict=True))
     return WorkPrecision(method=tuple(names), **columns, seconds=seconds, note=tuple(notes))
 
@@ -310,32 +335,31 @@ def take_turns(
     *,
     repeats: int,
     budget: int | float = np.inf,
-    progress: "rich.progress.Progress | None" = None,
+    progress: "bool | rich.progress.Progress" = False,
 ) -> Float[np.ndarray, "programs rounds"]:
     """Seconds of each program in each round; in a round each runs once, in the order given.
 
     So what else the machine does falls on all alike. There are `repeats` rounds, or as many as
     begin within `budget` seconds, but at least one.
     """
-    task = progress.add_task("Measuring time", total=1.0) if progress is not None else None
     rounds: list[list[float]] = []
     begin = time.perf_counter()
     done = 0.0
-    while done < 1:
-        rounds.append([])
-        for program in programs:
-            start = time.perf_counter()
-            jax.block_until_ready(program())
-            rounds[-1].append(time.perf_counter() - start)
-        done = max(len(rounds) / repeats, (time.perf_counter() - begin) / budget)
-        if progress is not None and task is not None:
-            progress.update(task, completed=done)
+    with progress_bar(progress, "Measuring time", 1.0) as update:
+        while done < 1:
+            rounds.append([])
+            for program in programs:
+                start = time.perf_counter()
+                jax.block_until_ready(program())
+                rounds[-1].append(time.perf_counter() - start)
+            done = max(len(rounds) / repeats, (time.perf_counter() - begin) / budget)
+            update(completed=done)
     return np.array(rounds).T
 
 
-def _equal_steps(problem: _Problem, num_steps: int) -> tuple:
+def _equal_steps(problem: _Problem, num_steps: Int[Array, ""]) -> tuple:
     term, solver, t0, t1, _, y0, args = problem
-    solution = integrate(term, solver, t0, t1, y0, args, num_steps=num_steps, throw=False)
+    solution = equal_steps(term, solver, t0, t1, y0, args, num_steps, None, None, throw=False)
     return _end(solution, num_steps, 0)
 
 
@@ -392,8 +416,9 @@ def _cost(problem: _Problem, is_adaptive: bool) -> _Cost:
         # How often its steps repeat depends on a tolerance that the controller may give it.
         unknown = np.full(3, np.nan)
         return _Cost(unknown, unknown)
-    evaluations, flows = _calls(problem)
+    # First, because it refuses a solver before anything is compiled.
     flops = _flops(problem, is_adaptive)
+    evaluations, flows = _calls(problem)
     first, later = zip(evaluations, flows, flops, strict=True)
     return _Cost(np.array(first, float), np.array(later, float))
 
@@ -453,7 +478,11 @@ def _counted_steps(
     """Counted while the steps run: what a loop repeats cannot be seen in its trace."""
     term, solver, t0, _, dt0, y0, args = problem
     tally = _Tally()
-    is_term = lambda x: isinstance(x, diffrax.AbstractTerm)  # noqa: E731
+
+    def is_term(x: Any) -> bool:
+        # A sum of terms must be seen as one: solvers add its frozen fields themselves.
+        return isinstance(x, diffrax.AbstractTerm) and not isinstance(x, diffrax.MultiTerm)
+
     term = jtu.tree_map(lambda t: _CountingTerm(t, tally, sees_flows), term, is_leaf=is_term)
     step = eqx.filter_jit(functools.partial(solver.step, made_jump=False))
     t1, t2 = t0 + dt0, t0 + 2 * dt0
@@ -530,28 +559,54 @@ class _CountedField(AbstractAlgebraElement):
 # What the caller gives.
 
 
-def _checked_settings(
-    num_steps: Sequence[int] | None, tolerances: Sequence[float] | None
-) -> Sequence[Any]:
+def _checked_settings(num_steps: Any, tolerances: Any) -> list[Any]:
     if (num_steps is None) == (tolerances is None):
         raise ValueError("Give one of num_steps and tolerances, and not the other.")
-    if tolerances is None:
-        settings = [count("num_steps", n) for n in num_steps or ()]
-    else:
-        settings = [float(tolerance) for tolerance in tolerances]
-        if not all(0 < tolerance < np.inf for tolerance in settings):
-            raise ValueError(f"tolerances must be positive and finite, got {settings}.")
+    name, given = ("num_steps", num_steps) if tolerances is None else ("tolerances", tolerances)
+    if isinstance(given, np.ndarray | jax.Array) and given.ndim == 1:
+        given = given.tolist()
+    if not isinstance(given, Sequence) or isinstance(given, str):
+        raise TypeError(f"{name} must be a sequence of numbers, got {given!r}.")
+    settings = list(given)
     if not settings:
-        raise ValueError("num_steps or tolerances must have at least one entry, got none.")
-    return settings
+        raise ValueError(f"{name} must have at least one entry, got none.")
+    if tolerances is None:
+        return [count("num_steps", n) for n in settings]
+    is_number = [isinstance(x, int | float | np.number) for x in settings]
+    if not all(is_number) or not all(0 < x < np.inf for x in settings):
+        raise ValueError(f"tolerances must be positive and finite, got {settings}.")
+    return [float(x) for x in settings]
 
 
-def _term_and_solver(method: Any, term: PyTree) -> tuple[PyTree, diffrax.AbstractSolver]:
-    solver = method
-    if isinstance(method, tuple) and len(method) == 2:
-        term, solver = method
-    check_term_and_solver(term, solver)
-    return term, solver
+def _checked_methods(methods: Any, term: PyTree) -> dict[str, tuple[PyTree, Any]]:
+    """A term and a solver for each name."""
+    if not isinstance(methods, Mapping) or not all(isinstance(name, str) for name in methods):
+        raise TypeError(f"methods must be a dict of solvers by name, got {methods!r}.")
+    if not methods:
+        raise ValueError("methods must have at least one solver, got none.")
+    found = {}
+    for name, method in methods.items():
+        is_pair = isinstance(method, tuple) and len(method) == 2
+        found[name] = method if is_pair else (term, method)
+        with _about(name):
+            check_term_and_solver(*found[name])
+    return found
+
+
+def _check_controller(controller: Callable, tolerance: Float[Array, ""]) -> None:
+    found = eqx.filter_eval_shape(controller, tolerance)
+    if not isinstance(found, diffrax.AbstractStepSizeController):
+        raise TypeError(f"controller must return a diffrax step size controller, got {found!r}.")
+
+
+def _checked_error(found: Any) -> float:
+    is_real = isinstance(found, jax.Array | np.ndarray | np.generic | int | float)
+    if not is_real or np.ndim(found) or np.iscomplexobj(found):
+        raise TypeError(f"error must return a real number, got {eqx.tree_pformat(found)}.")
+    value = float(found)
+    if value < 0:
+        raise ValueError(f"error must return a number of at least 0, got {value}.")
+    return value
 
 
 def _check_reference(reference: PyTree, y0: PyTree) -> None:
@@ -567,11 +622,3 @@ def _about(name: str) -> Iterator[None]:
     except Exception as mistake:
         mistake.add_note(f"This is about methods[{name!r}].")
         raise
-
-
-def _track(progress: Any, items: Iterable, total: int, description: str) -> Iterator:
-    task = None if progress is None else progress.add_task(description, total=total)
-    for item in items:
-        yield item
-        if progress is not None:
-            progress.advance(task)

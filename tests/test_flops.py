@@ -1,5 +1,7 @@
+import equinox as eqx
 import jax
 import jax.numpy as jnp
+import numpy as np
 import pytest
 from jax import lax
 
@@ -228,3 +230,11 @@ def test_complex_products_of_matrices():
 def test_what_has_no_rule_raises(fun, message):
     with pytest.raises(NotImplementedError, match=message):
         count_flops(fun, matrix(3, 3))
+
+
+def test_a_check_counts_nothing_and_a_function_of_the_host_is_refused():
+    checked = lambda x: eqx.error_if(2 * x, x > 3, "too large")  # noqa: E731
+    assert count_flops(checked, 1.0) == 1
+    host = lambda x: jax.pure_callback(np.sin, jax.ShapeDtypeStruct((), float), x)  # noqa: E731
+    with pytest.raises(NotImplementedError, match="function of the host"):
+        count_flops(host, 1.0)

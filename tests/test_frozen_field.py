@@ -194,8 +194,16 @@ def test_bracket_refuses_a_field_without_one():
 def test_structures_that_do_not_match():
     with pytest.raises(ValueError):
         cfjax.flow({"a": Rotation(W)}, {"b": jnp.asarray(W)})
-    with pytest.raises(ValueError):
+    with pytest.raises(TypeError, match="Only fields of one structure can be added"):
         cfjax.combine((1.0, 1.0), ((jnp.ones(2), jnp.ones(2)), (jnp.ones(2),)))
+
+
+@pytest.mark.parametrize("other", [cfjax.LeftMatrix(np.eye(3)), np.ones(3)])
+@pytest.mark.parametrize("turned", [False, True])
+def test_fields_of_two_kinds_are_not_added(other, turned):
+    pair = [{"a": Rotation(W)}, {"a": other}]
+    with pytest.raises(TypeError, match=r"Only fields of one kind .* at \['a'\]"):
+        cfjax.combine((1.0, 1.0), pair[::-1] if turned else pair)
 
 
 def test_abstract_methods_are_required():

@@ -91,6 +91,20 @@ def test_values(case):
     assert jtu.tree_map(lambda x: x.dtype, found) == jtu.tree_map(lambda x: x.dtype, want)
 
 
+@pytest.mark.parametrize("case", ["parts", "matrix", "no short vector"])
+def test_a_number_of_steps_that_is_traced(case):
+    case = CASES[case]
+
+    @jax.jit
+    def several(case, num_steps):
+        carry, parameters = case
+        return repeat(lambda c: mix(c, parameters), carry, num_steps)
+
+    close(several(case, jnp.asarray(NUM_STEPS)), jax.jit(plain)(*case), case)
+    # The same program.
+    close(several(case, jnp.asarray(0)), case[0], case)
+
+
 TRANSFORMS = {
     "reverse": jax.grad,
     "forward": lambda f: lambda x, rest: jax.jvp(lambda x: f(x, rest), (x,), (x,)),

@@ -13,6 +13,7 @@ import problems
 import pytest
 
 import cfjax
+from cfjax import Tableau
 from cfjax.scenes import rigid_body
 
 RNG = np.random.default_rng(5)
@@ -105,6 +106,36 @@ def test_negative_rows_overflow_where_dissipation_is_strong():
         assert not np.isfinite(np.asarray(step)).any()
     for solver in (cfjax.CF3(), cfjax.CF4()):
         assert np.abs(cfjax.stability_function(solver.tableau, z, 1.0)) < 1e-5
+
+
+def test_methods_with_flows_backwards_in_time_say_so():
+    solvers = [x for x in vars(cfjax).values() if isinstance(getattr(x, "tableau", None), Tableau)]
+    assert {cfjax.CF4, cfjax.CF54, cfjax.YRK135} < set(solvers)
+    for solver in solvers:
+        tableau = solver.tableau
+        products = (*tableau.alpha, tableau.beta, tableau.companion or ())
+        sums = [float(sum(row)) for rows in products for row in rows]
+        # A sum of zero is rounded.
+        backwards = min(sums) < -1e-12
+        assert backwards == ("backwards in time" in solver.__doc__), solver
+        # exp(1e6) would overflow, and exp(-1e6) is 0.
+        assert backwards == (not np.isfinite(cfjax.stability_function(tableau, -1e6, 1.0))), solver
+
+
+@pytest.mark.parametrize("dtype, limit", [("float64", 3000), ("float32", 370)])
+def test_how_long_a_step_of_cf54_may_be(dtype, limit):
+    """Up to what its docstring says. Behind, error control rejects; CF43 has no such limit."""
+
+    def step(solver, length):
+        spectrum = jnp.asarray([-1.0, -100.0], dtype)
+        term = cfjax.LieTerm(lambda t, u, args: cfjax.Affine(1.0, jnp.cos(u), spectrum))
+        times = jnp.zeros((), dtype), jnp.asarray(length / 100, dtype)
+        return solver.step(term, *times, jnp.ones(2, dtype), None, None, made_jump=False)[:2]
+
+    assert np.isfinite(step(cfjax.CF54(), limit)).all()
+    assert np.isnan(step(cfjax.CF54(), 1.03 * limit)[0][1])
+    assert np.isnan(step(cfjax.CF54(), 1.03 * limit)[1][1])
+    assert np.isfinite(step(cfjax.CF43(), 100 * limit)).all()
 
 
 @pytest.mark.parametrize("solver, order", [(cfjax.CF3(), 3), (cfjax.CF4(), 4), (cfjax.CF2(), 2)])

@@ -2,6 +2,7 @@
 
 import csv
 import io
+import sys
 
 import diffrax
 import equinox as eqx
@@ -92,6 +93,17 @@ def test_errors_are_those_of_a_loop_of_its_own(equal, answer):
     np.testing.assert_allclose(
         equal.select("CF4").error[:2], expected, rtol=0, atol=16 * np.finfo(float).eps
     )
+
+
+def test_one_program_takes_the_steps_of_integrate(equal, answer):
+    for name, term, solver in [("CF4", TERM, cfjax.CF4()), ("Tsit5", SPACE, diffrax.Tsit5())]:
+        rows = equal.select(name)
+        assert len(set(rows.compile_seconds)) == 1
+        for n, found in zip([8, 32], rows.error[[0, 2]], strict=True):
+            solution = cfjax.integrate(term, solver, 0.0, 1.0, Y0, ARGS, num_steps=n)
+            expected = np.linalg.norm(solution.ys[-1] - answer)
+            # A unit of rounding of the state for each step of another program.
+            np.testing.assert_allclose(found, expected, rtol=0, atol=n * np.finfo(float).eps)
 
 
 def test_evaluations_and_flows_of_equal_steps(equal):
@@ -414,12 +426,13 @@ def test_progress_is_reported():
             ARGS,
             methods={"Heun": diffrax.Heun()},
             reference=Y0,
-            num_steps=[2, 4],
+            num_steps=np.array([2, 4]),
             progress=progress,
             **QUICK,
         )
     compiling, measuring = progress.tasks
-    assert (compiling.total, compiling.completed) == (2, 2)
+    assert compiling.description == "Running Heun"
+    assert (compiling.total, compiling.completed) == (1, 1)
     assert measuring.completed >= 1
 
 
@@ -438,20 +451,77 @@ def test_progress_is_reported():
             dict(num_steps=None, tolerances=[1e-3], methods={"m": cfjax.CG4()}),
             "CG4 has none: use diffrax.HalfSolver",
         ),
+        (dict(num_steps=8), "num_steps must be a sequence of numbers, got 8"),
+        (dict(num_steps=None, tolerances="1e-3"), "tolerances must be a sequence of numbers"),
+        (dict(num_steps=None, tolerances=["1e-3"]), "tolerances must be positive"),
         (dict(methods={}), "at least one solver"),
+        (dict(methods=[cfjax.CF4()]), "methods must be a dict of solvers by name"),
+        (dict(methods={4: cfjax.CF4()}), "methods must be a dict of solvers by name"),
         (dict(methods={"m": "CF4"}), "solver must be a diffrax solver"),
         (dict(methods={"m": (1, cfjax.CF4())}), "term must be a diffrax term"),
         (dict(reference=np.ones(4)), "reference must be shaped like y0"),
         (dict(reference={"y": Y0}), "reference must be shaped like y0"),
+        (dict(t1=0.0), "t0 and t1 must be finite and differ, got 0.0 and 0.0"),
+        (dict(t1=np.nan), "t0 and t1 must be finite"),
+        (dict(t1="1"), "t1 must be a real scalar"),
+        (dict(dt0=-0.1), "dt0 must be a step from t0=0.0 towards t1=1.0, got -0.1"),
+        (dict(dt0="0.1"), "dt0 must be a real scalar"),
+        (dict(controller=diffrax.PIDController(0.0, 1e-3)), "controller must be a function"),
+        (
+            dict(num_steps=None, tolerances=[1e-3], controller=lambda tolerance: tolerance),
+            "controller must return a diffrax step size controller",
+        ),
+        (dict(error=1e-3), "error must be a function, got 0.001"),
+        (dict(progress=None), "progress must be a bool or a rich.progress.Progress, got None"),
         (dict(budget=0.0), "budget must be a positive number"),
-        (dict(repeats=0), "repeats must be at least 1"),
-        (dict(max_steps=0), "max_steps must be at least 1"),
+        (dict(budget="20"), "budget must be a positive number"),
+        (dict(repeats=0), "repeats must be an integer of at least 1"),
+        (dict(max_steps=0), "max_steps must be an integer of at least 1"),
     ],
 )
 def test_mistakes(change, message, no_shape_hook):
-    arguments = dict(methods={"m": cfjax.CF4()}, reference=Y0, num_steps=[2])
+    arguments = dict(
+        t0=0.0, t1=1.0, methods={"m": cfjax.CF4()}, reference=Y0, num_steps=[2], **QUICK
+    )
     with pytest.raises((TypeError, ValueError), match=message):
-        cfjax.work_precision(TERM, 0.0, 1.0, Y0, ARGS, **(arguments | change))
+        cfjax.work_precision(TERM, y0=Y0, args=ARGS, **(arguments | change))
+
+
+def test_an_error_that_is_no_number():
+    with pytest.raises(TypeError, match=r"error must return a real number, got f64\[3\]") as info:
+        cfjax.work_precision(
+            TERM,
+            0.0,
+            1.0,
+            Y0,
+            ARGS,
+            methods={"m": cfjax.LieEuler()},
+            reference=Y0,
+            num_steps=[2],
+            error=lambda y, reference: y - reference,
+        )
+    assert info.value.__notes__[-1] == "This is about methods['m']."
+
+
+@pytest.mark.parametrize("value", [None, "1", 1j, np.ones(1), -1.0])
+def test_what_is_no_error(value):
+    with pytest.raises((TypeError, ValueError), match="error must return a"):
+        _work_precision._checked_error(value)
+
+
+@pytest.mark.parametrize("package, part", [("matplotlib", "plot"), ("rich", "table")])
+def test_a_missing_extra(package, part, equal, monkeypatch):
+    for name in [name for name in sys.modules if name.partition(".")[0] == package]:
+        monkeypatch.setitem(sys.modules, name, None)
+    monkeypatch.delitem(sys.modules, "cfjax._report", raising=False)
+    monkeypatch.delattr(cfjax, "_report", raising=False)
+    with pytest.raises(ModuleNotFoundError, match=rf"{package} is missing.*'cfjax\[paper\]'"):
+        getattr(equal, part)()
+
+
+def test_plot_refuses_what_is_no_figure(equal):
+    with pytest.raises(TypeError, match=r"figure must be a matplotlib figure, got 'work\.png'"):
+        equal.plot("work.png")
 
 
 def test_a_mistake_names_its_method():

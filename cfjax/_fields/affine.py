@@ -9,11 +9,9 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Inexact
 
-from .._frozen_field import AbstractAlgebraElement, Weight, combine
+from .._frozen_field import AbstractAlgebraElement, Weight, combine, describe, struct
 from .._functions.phi import phi_1
-from .._functions.transforms import AbstractTransform
-
-_DTYPES = ("float32", "float64", "complex64", "complex128")
+from .._functions.transforms import DTYPES, AbstractTransform, TensorTransform
 
 
 class Affine(AbstractAlgebraElement):
@@ -21,7 +19,13 @@ class Affine(AbstractAlgebraElement):
 
     M is diagonal in the coefficients of a transform, with the eigenvalues `spectrum`. Its flow is
     `exp(alpha M) x + phi_1(alpha M) b` with `phi_1(z) = (exp(z) - 1) / z`, exact however stiff M
-    is. So to solve `u' = M u + g(u)` return `Affine(1.0, g(u), spectrum, transform)`.
+    is. So to solve `u' = M u + g(u)` return `Affine(1.0, g(u), spectrum, transform)`. On a grid
+    the transform is a `cfjax.TensorTransform` and u has the shape of the grid.
+
+    Boundary values or fluxes other than zero are lifted: take a smooth w that has them and solve
+    for `v = u - w`, which has zeros, `v' = M v + g(v + w) + L w - w'`. Here `L w` is M applied to
+    w with its boundary values in place, so as smooth as w. Put into b as they are, divided by
+    `dx^2`, boundary values that vary in time would leave CF4 with little more than order one.
 
     Without a transform the state, and `b`, are the coefficients themselves, and a flow costs an
     exponential, a division and a polynomial for each eigenvalue. With one they are points, and a
@@ -38,9 +42,10 @@ class Affine(AbstractAlgebraElement):
     - `b`: shaped like the state, `(n,)` or `(n, k)` or any other shape. float32, float64,
       complex64 or complex128.
     - `spectrum`: the eigenvalues, shaped like the coefficients of `b` or, if these have more axes,
-      like the first of them: with shape `(m,)` every column has the same. Real, or complex where
-      the coefficients are.
-    - `transform`: a `cfjax.AbstractTransform`, for example `cfjax.SineTransform()`, or None.
+      like the first of them: with shape `(m,)` every column has the same. It has all axes that a
+      `cfjax.TensorTransform` transforms. Real, or complex where the coefficients are.
+    - `transform`: a `cfjax.AbstractTransform`, for example `cfjax.SineTransform()`, or None. One
+      of your own provides `forward(point)`, the coefficients, and `inverse(coefficients)`.
 
     **Raises** `ValueError` for shapes that do not fit, `TypeError` for dtypes that do not, or
     another kind of transform.
@@ -63,8 +68,8 @@ class Affine(AbstractAlgebraElement):
         transform: AbstractTransform | None = None,
     ):
         self.b, self.spectrum, self.transform = jnp.asarray(b), jnp.asarray(spectrum), transform
-        if self.b.dtype.name not in _DTYPES:
-            raise TypeError(f"b must be one of {', '.join(_DTYPES)}, got {self.b.dtype}.")
+        if self.b.dtype.name not in DTYPES:
+            raise TypeError(f"b must be one of {', '.join(DTYPES)}, got {self.b.dtype}.")
         if transform is not None and not isinstance(transform, AbstractTransform):
             raise TypeError(f"transform must be a cfjax.AbstractTransform, got {transform!r}.")
         # A Python number takes the precision of the field.
@@ -77,13 +82,18 @@ class Affine(AbstractAlgebraElement):
                 f"{self.alpha.dtype} of shape {self.alpha.shape}."
             )
         c = jax.eval_shape(self._coefficients, self.b)
+        axes = min(1, c.ndim)
+        if isinstance(transform, TensorTransform):
+            # One with fewer axes would leave an operator out, which a square grid would not show.
+            axes = len(transform.transforms)
         if (
-            not 1 <= self.spectrum.ndim <= c.ndim
+            not axes <= self.spectrum.ndim <= c.ndim
             or self.spectrum.shape != c.shape[: self.spectrum.ndim]
         ):
+            shapes = " or ".join(str(c.shape[:ndim]) for ndim in range(c.ndim, axes - 1, -1))
             raise ValueError(
-                f"spectrum must have the shape {c.shape} of the coefficients of b, or of their "
-                f"first axes, got {self.spectrum.shape}."
+                f"spectrum must have the shape {shapes} of the coefficients of b or of their first "
+                f"axes, got {self.spectrum.shape}."
             )
         if self.spectrum.dtype not in (c.dtype, precision):
             raise TypeError(
@@ -92,16 +102,13 @@ class Affine(AbstractAlgebraElement):
             )
 
     def flow(self, point: Inexact[Array, "*point"]) -> Inexact[Array, "*point"]:
+        self._check(point)
         z = self._exponent()
         x, b = self._coefficients(point), self._coefficients(self.b)
         return self._point(_times(jnp.exp(z), x) + _times(phi_1(z), b))
 
     def tangent(self, point: Inexact[Array, "*point"]) -> Inexact[Array, "*point"]:
-        if point.shape != self.b.shape or point.dtype != self.b.dtype:
-            raise ValueError(
-                f"Affine acts on points like its b, {self.b.dtype} of shape {self.b.shape}, got "
-                f"{point.dtype} of shape {point.shape}."
-            )
+        self._check(point)
         return self._point(_times(self._exponent(), self._coefficients(point))) + self.b
 
     def bracket(self, other: Any) -> "Affine":
@@ -112,8 +119,16 @@ class Affine(AbstractAlgebraElement):
 
     @classmethod
     def combine(cls, weights: Sequence[Weight], fields: Sequence[Any]) -> "Affine":
+        b = _of_one_operator(fields)
         alpha = combine(weights, [field.alpha for field in fields])
-        return fields[0]._with(alpha, combine(weights, [field.b for field in fields]))
+        return fields[0]._with(alpha, combine(weights, b))
+
+    def _check(self, point: Array) -> None:
+        if point.shape != self.b.shape or point.dtype != self.b.dtype:
+            raise ValueError(
+                f"Affine acts on points like its b, {self.b.dtype} of shape {self.b.shape}, got "
+                f"{point.dtype} of shape {point.shape}."
+            )
 
     def _with(self, alpha: Array, b: Array) -> "Affine":
         return eqx.tree_at(lambda field: (field.alpha, field.b), self, (alpha, b))
@@ -126,6 +141,31 @@ class Affine(AbstractAlgebraElement):
 
     def _point(self, coefficients: Array) -> Array:
         return coefficients if self.transform is None else self.transform.inverse(coefficients)
+
+
+def _of_one_operator(fields: Sequence[Affine]) -> list[Array]:
+    """The b of each field, with an error in those whose operator is not that of the first."""
+    first, *others = fields
+    checked = [first.b]
+    for other in others:
+        operators = [(field.spectrum, field.transform) for field in (first, other)]
+        # Arrays are compared by shape here.
+        if struct(operators[0]) != struct(operators[1]) or struct(first.b) != struct(other.b):
+            raise ValueError(
+                "Affine fields that are added must have one operator, got the spectra and "
+                f"transforms {describe(operators[0])} and {describe(operators[1])}."
+            )
+        b = other.b
+        # Most fields close over one array, and need no check of its values.
+        if other.spectrum is not first.spectrum:
+            b = eqx.error_if(
+                b,
+                jnp.any(other.spectrum != first.spectrum),
+                "Affine fields that are added must have one spectrum: it may not depend on time or "
+                "state, and the terms of a diffrax.MultiTerm must share it.",
+            )
+        checked.append(b)
+    return checked
 
 
 def _times(diagonal: Array, coefficients: Array) -> Array:

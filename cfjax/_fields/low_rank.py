@@ -15,7 +15,16 @@ from .._functions.expm_action import phi_1_action
 from .._functions.matmul import matmul
 
 
-class LowRankSkew(AbstractFrozenField):
+class AbstractSkew(AbstractFrozenField):
+    """A skew field, which acts on orthonormal columns."""
+
+    @classmethod
+    def defect(cls, point: Float[Array, "n p"]) -> tuple[Array, str]:
+        off = jnp.eye(point.shape[1], dtype=point.dtype) - _square(point)
+        return jnp.max(jnp.abs(off)), "orthonormal columns (in entries of y0.T @ y0)"
+
+
+class LowRankSkew(AbstractSkew):
     """The field `x' = (g y^T - y g^T) x` at points near y, the point where it is frozen.
 
     It acts on a matrix with orthonormal columns, shape `(n, p)`, and keeps them orthonormal. The
@@ -30,8 +39,9 @@ class LowRankSkew(AbstractFrozenField):
 
     **Arguments:** `g`, shape `(n, p)` with n >= p, float32 or float64.
 
-    **Raises** `ValueError` for another shape, `TypeError` for another dtype. A point that is far
-    from orthonormal (by 0.1 in an entry of `y^T y`) gives NaN.
+    **Raises** `ValueError` for another shape, `TypeError` for another dtype. A solve that starts
+    from columns that are not orthonormal, by more than the root of a unit of rounding in an entry
+    of `y^T y`, is an error. Outside of a solve a point that is off by 0.1 gives NaN.
 
     Source: Celledoni & Owren, On the implementation of Lie group methods on the Stiefel manifold,
     Numer. Algorithms 32 (2003), for exponentials of low rank.
@@ -62,7 +72,20 @@ class LowRankSkew(AbstractFrozenField):
         return SpanSkew.of(self.g, frozen_at, span), point
 
 
-class BorderedSkew(AbstractAlgebraElement):
+class AbstractSkewElement(AbstractSkew, AbstractAlgebraElement):
+    """One with a bracket. Those of a form that sums keep, and those on a span, can be added."""
+
+    @classmethod
+    def combine(cls, weights: Sequence[Weight], fields: Sequence[Any]) -> Any:
+        if all(isinstance(f, BorderedSkew) for f in fields):
+            gammas = [f.gamma for f in fields]
+            return BorderedSkew(combine(weights, gammas))
+        fields = _on_one_span(fields)
+        k, a = combine(weights, [(f.k, f.a) for f in fields])
+        return SpanSkew(k, a, fields[0].span)
+
+
+class BorderedSkew(AbstractSkewElement):
     """The field `x' = (gamma E^T - E gamma^T) x`, where E is the first p columns of the identity.
 
     With the first p rows of `gamma` called L and the others B its matrix is
@@ -74,8 +97,9 @@ class BorderedSkew(AbstractAlgebraElement):
 
     **Arguments:** `gamma`, shape `(n, p)` with n >= p, float32 or float64.
 
-    **Raises** `ValueError` for another shape, `TypeError` for another dtype. A point that is far
-    from orthonormal (by 0.1 in an entry of `y^T y`) gives NaN.
+    **Raises** `ValueError` for another shape, `TypeError` for another dtype. A solve that starts
+    from columns that are not orthonormal, by more than the root of a unit of rounding in an entry
+    of `y^T y`, is an error. Outside of a solve a point that is off by 0.1 gives NaN.
 
     Source: Celledoni, Marthinsen & Owren, Commutator-free Lie group methods, FGCS 19 (2003),
     Section 3.2.
@@ -124,12 +148,6 @@ class BorderedSkew(AbstractAlgebraElement):
         velocity = matmul(self.gamma, point[:p])
         return jnp.concatenate([velocity[:p] - matmul(self.gamma.T, point), velocity[p:]])
 
-    @classmethod
-    def combine(cls, weights: Sequence[Weight], fields: Sequence[Any]) -> Any:
-        if all(isinstance(f, BorderedSkew) for f in fields):
-            return super().combine(weights, fields)
-        return SpanSkew.combine(weights, fields)
-
     def bracket(self, other: Any) -> "SpanSkew":
         return _spanned(self).bracket(other)
 
@@ -177,7 +195,7 @@ class SpanPoint(eqx.Module):
     blocks: _Blocks
 
 
-class SpanSkew(AbstractAlgebraElement):
+class SpanSkew(AbstractSkewElement):
     """The field `x' = W k W^T x` with a skew k on the span of some columns W.
 
     Its rank is `len(k)` at most. Sums and brackets of fields on different spans live on the sum
@@ -225,12 +243,6 @@ class SpanSkew(AbstractAlgebraElement):
         blocks = self.span.blocks
         velocity = matmul(self.k, _inner(blocks, point))
         return _plus_product(jnp.zeros_like(point), blocks, velocity)
-
-    @classmethod
-    def combine(cls, weights: Sequence[Weight], fields: Sequence[Any]) -> "SpanSkew":
-        fields = _on_one_span(fields)
-        k, a = combine(weights, [(f.k, f.a) for f in fields])
-        return cls(k, a, fields[0].span)
 
     def bracket(self, other: Any) -> "SpanSkew":
         x, y = _on_one_span((self, other))

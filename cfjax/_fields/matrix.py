@@ -107,18 +107,26 @@ def _check_square(a: Array) -> None:
 def _flow(product: Callable[[Array, Array], Array], a: Array, point: Array) -> Array:
     if _is_thin(a, point):
         return point + _displacement(product, a, point)
-    weight, rest = expm_parts(a)
-    return weight.astype(point.dtype) * point + product(rest, point)
+    weight, moved = _dense(product, a, point)
+    return weight * point + moved
 
 
 def _displacement(product: Callable[[Array, Array], Array], a: Array, point: Array) -> Array:
     def dense() -> Array:
-        weight, rest = expm_parts(a)
-        return (weight - 1).astype(point.dtype) * point + product(rest, point)
+        weight, moved = _dense(product, a, point)
+        return (weight - 1) * point + moved
 
     if not _is_thin(a, point):
         return dense()
     return expm_minus_one_times(lambda x: product(a, x), point, one_norm(a), dense)
+
+
+def _dense(product: Callable[[Array, Array], Array], a: Array, point: Array) -> tuple[Array, Array]:
+    """`w, z` with `w x + z` the point that x moves to."""
+    weight, rest = expm_parts(a)
+    weight = weight.astype(point.dtype)
+    # With a itself the product is exact but for the rounding of its sums, which is random.
+    return weight, weight * product(a, point) + product(rest, point)
 
 
 def _is_thin(a: Array, point: Array) -> bool:

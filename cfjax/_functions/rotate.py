@@ -4,7 +4,7 @@ import jax
 from jaxtyping import Array, Float
 
 from .pack import pack
-from .stumpff import stumpff_1_2
+from .stumpff import stumpff_1_2_apart
 
 
 def cross(a: Float[Array, "3"], x: Float[Array, "3 *k"]) -> Float[Array, "3 *k"]:
@@ -24,13 +24,21 @@ def rotate(a: Float[Array, "3"], x: Float[Array, "3 *k"]) -> Float[Array, "3 *k"
 
 @jax.jit
 def displacement(a: Float[Array, "3"], x: Float[Array, "3 *k"]) -> Float[Array, "3 *k"]:
-    """`rotate(a, x) - x`, with a rounding as small as it is."""
+    """`rotate(a, x) - x`, with a rounding as small as it is.
+
+    The rounding of c_1 and c_2 is the same in every step of equal angle, so lengths would drift
+    in proportion to the number of steps. What c_1 and c_2 are at zero is exact, and is kept apart:
+    then the roundings are smaller by the square of the angle.
+    """
     a0, a1, a2 = a[0], a[1], a[2]
     s = a0 * a0 + a1 * a1 + a2 * a2
-    c1, c2 = stumpff_1_2(s)
+    near, d1, d2 = stumpff_1_2_apart(s)
     once = _cross((a0, a1, a2), (x[0], x[1], x[2]))
     twice = _cross((a0, a1, a2), once)
-    return pack([c1 * once[i] + c2 * twice[i] for i in range(3)], sums=True)
+    return pack(
+        [near * (once[i] + twice[i] / 2) + (d1 * once[i] + d2 * twice[i]) for i in range(3)],
+        sums=True,
+    )
 
 
 def _cross(a, x):

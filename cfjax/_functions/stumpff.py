@@ -45,22 +45,36 @@ def _(n, primals, tangents):
     return stumpff(n, s), (n * stumpff(n + 2, s) - stumpff(n + 1, s)) / 2 * s_dot
 
 
-@jax.custom_jvp
 def stumpff_1_2(s: Float[Array, "*batch"]) -> tuple[Float[Array, "*batch"], Float[Array, "*batch"]]:
     """`stumpff(1, s)` and `stumpff(2, s)` together, for the price of one and a half."""
+    near, d1, d2 = stumpff_1_2_apart(s)
+    return near + d1, near / 2 + d2
+
+
+@jax.custom_jvp
+def stumpff_1_2_apart(s: Float[Array, "*batch"]) -> tuple[Float[Array, "*batch"], ...]:
+    """`n, d1, d2` with `c_1 = n + d1` and `c_2 = n / 2 + d2`; n is 1 up to half a turn, else 0.
+
+    So for a small s the roundings of d1 and d2 are as small as s.
+    """
     constants = _DOUBLE if s.dtype == jnp.float64 else _SINGLE
     turns, inverse = _turns(s, constants)
+    near = jnp.where(turns == 0, 1, jnp.zeros_like(s))
     scale = 1 - turns * ((2 * pi) * inverse)
     square = scale * scale
     z = s * square
-    return scale * polynomial(constants.sin, z), square * polynomial(constants.versin, z)
+    p1, p2 = (polynomial(c[1:], z) for c in (constants.sin, constants.versin))
+    # So that little waits for the polynomials.
+    d1 = (scale * z) * p1 + scale * (1 - near)
+    return near, d1, (square * z) * p2 + square * ((1 - near) / 2)
 
 
-@stumpff_1_2.defjvp
+@stumpff_1_2_apart.defjvp
 def _(primals, tangents):
     (s,), (s_dot,) = primals, tangents
-    c1, c2, c3, c4 = _stumpff_1_to_4(s)
-    return (c1, c2), ((c3 - c2) / 2 * s_dot, (c4 - c3 / 2) * s_dot)
+    near, d1, d2 = stumpff_1_2_apart(s)
+    _, c2, c3, c4 = _stumpff_1_to_4(s)
+    return (near, d1, d2), (jnp.zeros_like(s), (c3 - c2) / 2 * s_dot, (c4 - c3 / 2) * s_dot)
 
 
 @jax.custom_jvp

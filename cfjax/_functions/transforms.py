@@ -1,7 +1,7 @@
-"""Fast transforms that diagonalise difference operators on a line."""
+"""Fast transforms that diagonalise difference operators, on a line and on grids."""
 
 import abc
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from math import sqrt
 
 import equinox as eqx
@@ -12,6 +12,8 @@ from jaxtyping import Array, Complex, Float, Inexact
 
 from .matmul import matmul
 
+DTYPES = ("float32", "float64", "complex64", "complex128")
+
 # Up to here a product with the dense matrix is faster than a fast transform, on a CPU.
 _MAX_DENSE = 160
 
@@ -19,8 +21,9 @@ _MAX_DENSE = 160
 class AbstractTransform(eqx.Module):
     """An invertible linear map between points and the coefficients in which M is diagonal.
 
-    Both methods transform along the first axis; further axes are columns. Use `jax.vmap` for
-    batches. A subclass of your own may transform several axes, for problems in more dimensions.
+    A transform of your own provides both methods, `forward` and `inverse`, each the inverse of the
+    other, for every dtype that it is used with. Further axes are columns. For grids there is
+    `cfjax.TensorTransform`, which calls them axis by axis. Use `jax.vmap` for batches.
     """
 
     @abc.abstractmethod
@@ -44,12 +47,15 @@ class SineTransform(AbstractTransform):
     """
 
     def forward(self, point: Inexact[Array, "n *k"]) -> Inexact[Array, "n *k"]:
-        if len(point) <= _MAX_DENSE:
-            return _product(sine_matrix(len(point)), point)
-        return _by_parts(_sine, point)
+        return _real_transform(sine_matrix, _sine, _checked(self, point))
 
     def inverse(self, coefficients: Inexact[Array, "n *k"]) -> Inexact[Array, "n *k"]:
         return self.forward(coefficients)
+
+    def second_difference(self, n: int | np.integer) -> Float[np.ndarray, " n"]:
+        """The eigenvalues of the second difference of n points."""
+        n = _positive(n)
+        return -4 * np.sin(np.arange(1, n + 1) * np.pi / (2 * (n + 1))) ** 2
 
 
 class CosineTransform(AbstractTransform):
@@ -64,14 +70,16 @@ class CosineTransform(AbstractTransform):
     """
 
     def forward(self, point: Inexact[Array, "n *k"]) -> Inexact[Array, "n *k"]:
-        if len(point) <= _MAX_DENSE:
-            return _product(cosine_matrix(len(point)), point)
-        return _by_parts(_cosine, point)
+        return _real_transform(cosine_matrix, _cosine, _checked(self, point))
 
     def inverse(self, coefficients: Inexact[Array, "n *k"]) -> Inexact[Array, "n *k"]:
-        if len(coefficients) <= _MAX_DENSE:
-            return _product(cosine_matrix(len(coefficients)).T, coefficients)
-        return _by_parts(_inverse_cosine, coefficients)
+        c = _checked(self, coefficients)
+        return _real_transform(lambda n: cosine_matrix(n).T, _inverse_cosine, c)
+
+    def second_difference(self, n: int | np.integer) -> Float[np.ndarray, " n"]:
+        """The eigenvalues of the second difference of n points."""
+        n = _positive(n)
+        return -4 * np.sin(np.arange(n) * np.pi / (2 * n)) ** 2
 
 
 class FourierTransform(AbstractTransform):
@@ -79,14 +87,30 @@ class FourierTransform(AbstractTransform):
 
     At the points `x_j = j dx`, `j = 0..n-1`, `n dx` the period. It diagonalises every periodic
     difference operator with constant coefficients, and spectral derivatives: coefficient
-    `k = 0..n-1` belongs to `exp(2 pi i j k / n)`. Costs a complex FFT of length `n`.
+    `k = 0..n-1` belongs to `exp(2 pi i j k / n)`. The second difference has the eigenvalues
+    `-4 sin(k pi / n)^2`. Costs a complex FFT of length `n`.
+
+    **Raises** `TypeError` for real arrays.
     """
 
     def forward(self, point: Complex[Array, "n *k"]) -> Complex[Array, "n *k"]:
-        return jnp.fft.fft(point, axis=0, norm="ortho")
+        return jnp.fft.fft(self._complex(point), axis=0, norm="ortho")
 
     def inverse(self, coefficients: Complex[Array, "n *k"]) -> Complex[Array, "n *k"]:
-        return jnp.fft.ifft(coefficients, axis=0, norm="ortho")
+        return jnp.fft.ifft(self._complex(coefficients), axis=0, norm="ortho")
+
+    def second_difference(self, n: int | np.integer) -> Float[np.ndarray, " n"]:
+        """The eigenvalues of the periodic second difference of n points."""
+        return -4 * np.sin(np.pi * np.fft.fftfreq(_positive(n))) ** 2
+
+    def _complex(self, x: Array) -> Array:
+        x = _checked(self, x)
+        if not jnp.iscomplexobj(x):
+            raise TypeError(
+                f"FourierTransform takes complex arrays, got {x.dtype}. Real points take a "
+                "RealFourierTransform(n), along one axis of a grid."
+            )
+        return x
 
 
 class RealFourierTransform(AbstractTransform):
@@ -97,22 +121,118 @@ class RealFourierTransform(AbstractTransform):
 
     **Arguments:** `n`, the number of points, which the coefficients do not tell.
 
-    **Raises** `ValueError` if `n` is not a positive integer, or a point has another length.
+    **Raises** `ValueError` if `n` is not a positive integer, or an array has another length,
+    `TypeError` for complex points.
     """
 
     n: int = eqx.field(static=True)
 
-    def __check_init__(self):
-        if isinstance(self.n, bool) or not isinstance(self.n, int) or self.n < 1:
-            raise ValueError(f"n must be an integer of at least 1, got {self.n!r}.")
+    def __init__(self, n: int | np.integer):
+        self.n = _positive(n)
 
     def forward(self, point: Float[Array, "n *k"]) -> Complex[Array, "m *k"]:
-        if len(point) != self.n:
-            raise ValueError(f"RealFourierTransform({self.n}) got a point of length {len(point)}.")
+        point = _checked(self, point)
+        self._check_length("a point", len(point), self.n)
+        if jnp.iscomplexobj(point):
+            raise TypeError(
+                f"RealFourierTransform({self.n}) takes real points, got {point.dtype}. Complex "
+                "points take a FourierTransform()."
+            )
         return jnp.fft.rfft(point, axis=0, norm="ortho")
 
     def inverse(self, coefficients: Complex[Array, "m *k"]) -> Float[Array, "n *k"]:
+        coefficients = _checked(self, coefficients)
+        self._check_length("coefficients", len(coefficients), self.n // 2 + 1)
         return jnp.fft.irfft(coefficients, self.n, axis=0, norm="ortho")
+
+    def second_difference(self, n: int | np.integer) -> Float[np.ndarray, " m"]:
+        """The eigenvalues of the periodic second difference of n points."""
+        self._check_length("points", _positive(n), self.n)
+        return -4 * np.sin(np.pi * np.fft.rfftfreq(self.n)) ** 2
+
+    def _check_length(self, what: str, length: int, expected: int) -> None:
+        if length != expected:
+            raise ValueError(
+                f"RealFourierTransform({self.n}) got {what} of length {length}, expected "
+                f"{expected}."
+            )
+
+
+class TensorTransform(AbstractTransform):
+    """The tensor product of transforms, the k-th along axis k, for problems on a grid.
+
+    So `TensorTransform((SineTransform(), CosineTransform()))` is for points of shape `(nx, ny)`
+    with zero boundary values in x and zero boundary fluxes in y. Further axes are columns. None
+    in place of a transform leaves its axis as it is, for example the species of a reaction.
+
+    An operator that is a sum of one for each axis has the sums of their eigenvalues, in the shape
+    of the coefficients. So the Laplacian above, by second differences, has
+
+        np.add.outer(
+            SineTransform().second_difference(nx) / dx**2,
+            CosineTransform().second_difference(ny) / dy**2,
+        )
+
+    Periodic axes of real points take one `RealFourierTransform`, with `n//2 + 1` coefficients
+    along its axis, and `FourierTransform` for the others. A difference of odd order must have the
+    eigenvalue zero at `k = n/2` along each of them. Any axis may have any kind, as transforms of
+    different axes commute: `forward` applies `RealFourierTransform` after those that keep real
+    points real and before `FourierTransform`, and `inverse` turns the order round.
+
+    Costs for each axis its transform, of as many columns as there are other entries.
+
+    **Arguments:** `transforms`, a sequence of `cfjax.AbstractTransform` or None, each of which
+    transforms one axis.
+
+    **Raises** `TypeError` if they are anything else, `ValueError` if more than one of them is a
+    `RealFourierTransform`, or an array has fewer axes.
+    """
+
+    transforms: tuple[AbstractTransform | None, ...]
+
+    def __init__(self, transforms: Sequence[AbstractTransform | None]):
+        if isinstance(transforms, AbstractTransform):
+            raise TypeError(f"transforms must be a sequence of transforms, got {transforms!r}.")
+        self.transforms = tuple(transforms)
+        for transform in self.transforms:
+            if transform is not None and not isinstance(transform, AbstractTransform):
+                raise TypeError(
+                    f"transforms must hold cfjax.AbstractTransform or None, got {transform!r}."
+                )
+            if isinstance(transform, TensorTransform):
+                raise TypeError(
+                    "transforms must be of one axis each, got a TensorTransform among them."
+                )
+        if sum(isinstance(transform, RealFourierTransform) for transform in self.transforms) > 1:
+            raise ValueError(
+                "transforms must hold at most one RealFourierTransform, as its coefficients are "
+                f"complex, got {self.transforms!r}. Take FourierTransform() along the other axes."
+            )
+
+    def forward(self, point: Inexact[Array, "*point"]) -> Inexact[Array, "*coefficients"]:
+        self._check_axes(point)
+        for axis, transform in self._in_order():
+            point = _along(axis, transform.forward, point)
+        return point
+
+    def inverse(self, coefficients: Inexact[Array, "*coefficients"]) -> Inexact[Array, "*point"]:
+        self._check_axes(coefficients)
+        for axis, transform in reversed(self._in_order()):
+            coefficients = _along(axis, transform.inverse, coefficients)
+        return coefficients
+
+    def _check_axes(self, x: Array) -> None:
+        if jnp.ndim(x) < len(self.transforms):
+            raise ValueError(
+                f"TensorTransform of {len(self.transforms)} axes got an array of shape "
+                f"{jnp.shape(x)}."
+            )
+
+    def _in_order(self) -> list[tuple[int, AbstractTransform]]:
+        """Axes and their transforms: real ones, that from real to complex, complex ones."""
+        axes = [(k, one) for k, one in enumerate(self.transforms) if one is not None]
+        kinds = (FourierTransform, RealFourierTransform)
+        return sorted(axes, key=lambda axis: [isinstance(axis[1], kind) for kind in kinds])
 
 
 def sine_matrix(n: int) -> Float[np.ndarray, "n n"]:
@@ -175,13 +295,37 @@ def _cosine_shift(like: Float[Array, "n *k"], weights: np.ndarray) -> Complex[Ar
     return jnp.broadcast_to(jnp.asarray(shift, dtype).reshape(shape), like.shape)
 
 
-def _by_parts(
-    transform: Callable[[Float[Array, "n *k"]], Float[Array, "n *k"]], x: Inexact[Array, "n *k"]
+def _real_transform(
+    matrix: Callable[[int], Float[np.ndarray, "n n"]],
+    fast: Callable[[Float[Array, "n *k"]], Float[Array, "n *k"]],
+    x: Inexact[Array, "n *k"],
 ) -> Inexact[Array, "n *k"]:
     if jnp.iscomplexobj(x):
-        return lax.complex(transform(x.real), transform(x.imag))
-    return transform(x)
+        # Also for the matrix: two real products take a third of the time of a complex one.
+        parts = (_real_transform(matrix, fast, part) for part in (x.real, x.imag))
+        return lax.complex(*parts)
+    n = len(x)
+    if n > _MAX_DENSE:
+        return fast(x)
+    return matmul(jnp.asarray(matrix(n), x.dtype), x.reshape(n, -1)).reshape(x.shape)
 
 
-def _product(matrix: Float[np.ndarray, "n n"], x: Inexact[Array, "n *k"]) -> Inexact[Array, "n *k"]:
-    return matmul(jnp.asarray(matrix, x.dtype), x.reshape(len(x), -1)).reshape(x.shape)
+def _along(axis: int, fun: Callable[[Array], Array], x: Array) -> Array:
+    # On matrices XLA takes these transpositions into the products with dense matrices.
+    return jnp.moveaxis(fun(jnp.moveaxis(x, axis, 0)), 0, axis)
+
+
+def _checked(transform: AbstractTransform, x: Array) -> Array:
+    x, name = jnp.asarray(x), type(transform).__name__
+    # In an integer dtype the entries of a dense matrix would be rounded to zero.
+    if x.dtype.name not in DTYPES:
+        raise TypeError(f"{name} takes arrays of {', '.join(DTYPES)}, got {x.dtype}.")
+    if x.ndim == 0 or len(x) == 0:
+        raise ValueError(f"{name} needs points along the first axis, got shape {x.shape}.")
+    return x
+
+
+def _positive(n: int | np.integer) -> int:
+    if isinstance(n, bool) or not isinstance(n, int | np.integer) or n < 1:
+        raise ValueError(f"n must be an integer of at least 1, got {n!r}.")
+    return int(n)

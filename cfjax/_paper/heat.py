@@ -166,7 +166,7 @@ def _solve(method: Method, tolerance: Array, y0: Array, args: heat.Diffusivity):
         y0 = heat.to_grid(y0)
     solution = diffrax.diffeqsolve(
         method.term,
-        Richardson(method.solver),
+        Richardson(method.solver, as_in_paper=True),
         heat.t0,
         heat.t1,
         FIRST_STEP,

@@ -190,6 +190,8 @@ class Luscher3(AbstractLowStorage):
 class YRK135(AbstractLowStorage):
     """Order 5, 13 evaluations, 13 flows. Dense output of order 4.
 
+    Flows go backwards in time too: not for fields that hold strong dissipation, see `CF54`.
+
     Source: Yan (2017); Bazavov, BIT 62 (2022).
     """
 

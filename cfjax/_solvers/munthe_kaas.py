@@ -154,7 +154,11 @@ class RKMK(AbstractMuntheKaas):
 
     def __init__(self, tableau: diffrax.ButcherTableau):
         if not isinstance(tableau, diffrax.ButcherTableau):
-            raise TypeError(f"tableau must be a diffrax.ButcherTableau, got {tableau!r}.")
+            own = getattr(tableau, "tableau", None)
+            is_solver = isinstance(own, diffrax.ButcherTableau)
+            name = tableau.__name__ if isinstance(tableau, type) else type(tableau).__name__
+            advice = f" Write diffrax.{name}.tableau." if is_solver else ""
+            raise TypeError(f"tableau must be a diffrax.ButcherTableau, got {tableau!r}.{advice}")
         if tableau.implicit:
             raise ValueError("tableau must be explicit, got one of an implicit method.")
         b = tableau.b_sol.tolist()

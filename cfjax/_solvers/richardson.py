@@ -1,26 +1,50 @@
 """An error estimate for any solver, by step doubling."""
 
 from collections.abc import Callable
+from functools import partial
 from typing import Any, NamedTuple, cast
 
 import diffrax
 import equinox as eqx
 import jax.numpy as jnp
 import jax.tree_util as jtu
-from jaxtyping import PyTree
+from jax import lax
+from jaxtyping import Array, PyTree
 
 
 class Richardson(diffrax.AbstractAdaptiveSolver, diffrax.AbstractWrappedSolver):
-    """Any solver with the error estimate of step doubling (Richardson extrapolation).
+    """Any solver with an error estimate, by step doubling (Richardson extrapolation).
 
-    Every step is made twice: as one step, to `y1`, and as two halves, to `y2`. For a solver of
-    order p the error of `y1` is `2^p / (2^p - 1)` times their difference, and that of `y2` is
-    `(y1 - y2) / (2^p - 1)`, up to terms of higher order. The estimate is the latter, whichever of
-    the two the solver goes on with. The difference is taken in the ambient space: it is no tangent
-    vector, but on a manifold too it is of order `h^(p+1)`.
+    Every step is made twice: as one step, to `y1`, and as two halves, to `y2`, from which the
+    solver goes on. For a solver of order p the error of `y2` is `e = (y1 - y2) / (2^p - 1)`, up to
+    terms of higher order. The difference is taken in the ambient space: it is no tangent vector,
+    but on a manifold too it is of order `h^(p+1)`.
 
-    It makes adaptive steps with `diffrax.PIDController`; on compact groups use `rtol=0`. The
-    paper's controller is, but for one point,
+    A tolerance for `e` would be one for each step, and tighter tolerances take more steps: the
+    error at the end over the tolerance would grow like `tol^(-1/(p+1))`. So the estimate is that
+    of the error which such steps add up to over the solution's own unit of time, in which one
+    step would have an error as large as the state. There are `(|y| / |e|)^(1/(p+1))` steps in it,
+    and the estimate is `e` times that many, or `e` if that is less than one. It is of order `h^p`,
+    as is the error at the end, which is then proportional to the tolerance. The norms are
+    Euclidean, of one array of the state at a time, so the estimate depends on no frame and no unit.
+    Far from its origin a state takes somewhat shorter steps than it needs: tenfold |y| is
+    `10^(1/(p+1))` times the estimate.
+
+    It makes adaptive steps with `diffrax.PIDController`; on compact groups use `rtol=0`. The error
+    at the end is a number of times the tolerance that depends on the problem and on how long it
+    is: for the free rigid body to t = 10 it is 3.6 to 5.5 with `CF4` at tolerances from 1e-3 to
+    1e-11.
+
+    Costs three steps of the solver. Its first evaluation is shared, if XLA sees it.
+
+    **Arguments:**
+
+    - `solver`: a diffrax solver for ordinary differential equations, of known order. An implicit
+      one solves its equations with the controller's tolerances.
+    - `as_in_paper`: whether to go on from `y1` with `e` itself, as the paper does, for its tables.
+      The error of a step is then `2^p` times the estimate.
+
+    With `as_in_paper` the paper's controller is, but for one point,
 
     ```python
     diffrax.PIDController(
@@ -33,33 +57,25 @@ class Richardson(diffrax.AbstractAdaptiveSolver, diffrax.AbstractWrappedSolver):
     step that was kept, diffrax never shrinks the next one. So a solver at the limit of its
     stability has one step in eight rejected, where the paper's has hardly any.
 
-    Costs three steps of the solver. Its first evaluation is shared, if XLA sees it.
-
-    **Arguments:**
-
-    - `solver`: a diffrax solver for ordinary differential equations, of known order.
-    - `advance_by_halves`: whether to go on from `y2`, the more accurate solution at no further
-      cost, instead of `y1`, as the paper does.
-
-    Output between steps is as good as that of `solver`: by default that of its whole step, else
-    that of its two half steps.
+    Output between steps is that of `solver` in the two half steps, or in the whole one if
+    `as_in_paper`.
 
     **Raises** `TypeError` for arguments of other types, `ValueError` if the solver's order is
     unknown.
 
     Source: Celledoni, Marthinsen & Owren, Commutator-free Lie group methods, FGCS 19 (2003),
     Section 3.3; Hairer, Norsett & Wanner, Solving Ordinary Differential Equations I (1993),
-    Section II.4.
+    Section II.4; for proportionality, Higham, IMA J. Numer. Anal. 11 (1991).
     """
 
     solver: diffrax.AbstractSolver
-    advance_by_halves: bool = eqx.field(default=False, static=True)
+    as_in_paper: bool = eqx.field(default=False, static=True)
 
     def __check_init__(self):
         if not isinstance(self.solver, diffrax.AbstractSolver):
             raise TypeError(f"solver must be a diffrax solver, got {self.solver!r}.")
-        if not isinstance(self.advance_by_halves, bool):
-            raise TypeError(f"advance_by_halves must be a bool, got {self.advance_by_halves!r}.")
+        if not isinstance(self.as_in_paper, bool):
+            raise TypeError(f"as_in_paper must be a bool, got {self.as_in_paper!r}.")
 
     @property
     def term_structure(self):
@@ -79,7 +95,7 @@ class Richardson(diffrax.AbstractAdaptiveSolver, diffrax.AbstractWrappedSolver):
         self,
     ) -> Callable[..., diffrax.AbstractLocalInterpolation]:
         inner = self.solver.interpolation_cls
-        return _HalvesFactory(inner) if self.advance_by_halves else inner
+        return inner if self.as_in_paper else _HalvesFactory(inner)
 
     def order(self, terms) -> int:
         order = self.solver.order(terms)
@@ -89,7 +105,7 @@ class Richardson(diffrax.AbstractAdaptiveSolver, diffrax.AbstractWrappedSolver):
 
     def error_order(self, terms) -> int:
         # diffrax takes the power of h that the estimate behaves like.
-        return self.order(terms) + 1
+        return self.order(terms) + (1 if self.as_in_paper else 0)
 
     def init(self, terms, t0, t1, y0, args) -> PyTree:
         return self.solver.init(terms, t0, t1, y0, args)
@@ -104,20 +120,30 @@ class Richardson(diffrax.AbstractAdaptiveSolver, diffrax.AbstractWrappedSolver):
         y_half, _, first, state_half, result_1 = step(t0, middle, y0, solver_state, made_jump)
         y2, _, second, state_2, result_2 = step(middle, t1, y_half, state_half, False)
 
-        factor = 1 / (2 ** self.order(terms) - 1)
-        error = jtu.tree_map(lambda a, b: (a - b) * factor, y1, y2)
+        order = self.order(terms)
+        error = jtu.tree_map(lambda a, b: (a - b) / (2**order - 1), y1, y2)
+        if not self.as_in_paper:
+            error = jtu.tree_map(partial(_added_up, order), error, y0, y2)
         result = _first_failure(result, result_1, result_2)
         if result is not diffrax.RESULTS.successful:
             # What a failed step returns may look like a small error. As in diffrax, it is rejected.
             okay = diffrax.is_okay(result)
             error = jtu.tree_map(lambda e: jnp.where(okay, e, jnp.inf), error)
-        if self.advance_by_halves:
-            halves = dict(first=first, second=second)
-            return y2, error, halves, state_2, result
-        return y1, error, whole, state, result
+        if self.as_in_paper:
+            return y1, error, whole, state, result
+        return y2, error, dict(first=first, second=second), state_2, result
 
     def func(self, terms, t0, y0, args) -> Any:
         return self.solver.func(terms, t0, y0, args)
+
+
+def _added_up(order: int, error: Array, y0: Array, y2: Array) -> Array:
+    """The error of a step, times the number of such steps in the solution's own unit of time."""
+    size = lax.stop_gradient(jnp.linalg.norm(jnp.ravel(error)))
+    scale = lax.stop_gradient(jnp.maximum(*(jnp.linalg.norm(jnp.ravel(y)) for y in (y0, y2))))
+    # Also where the error is zero or not a number.
+    steps = jnp.where(size > 0, scale / jnp.where(size > 0, size, 1), 1) ** (1 / (order + 1))
+    return error * jnp.maximum(steps, 1).astype(error.dtype)
 
 
 def _first_failure(*results: diffrax.RESULTS) -> diffrax.RESULTS:

@@ -1,7 +1,9 @@
 """Affine: the flow against a dense exponential, derivatives, the algebra, and what is refused."""
 
+import functools
 from typing import Any
 
+import equinox as eqx
 import jax
 import jax.numpy as jnp
 import mpmath
@@ -136,27 +138,247 @@ def test_combine_is_linear_in_the_coordinates_and_keeps_the_rest():
     assert c.transform == a.transform
 
 
-class Plane(cfjax.AbstractTransform):
-    """Sine transforms along both axes of a grid."""
+class Eigenvectors(cfjax.AbstractTransform):
+    """A transform of one's own: all that `Affine` needs of it."""
+
+    vectors: jax.Array
 
     def forward(self, point):
-        sine = cfjax.SineTransform()
-        return sine.forward(sine.forward(point).T).T
+        return self.vectors.T @ point
 
     def inverse(self, coefficients):
-        return self.forward(coefficients)
+        return self.vectors @ coefficients
 
 
-def test_a_transform_of_ones_own_in_two_dimensions():
-    m = dense(cfjax.SineTransform(), DIFFUSION, float)
-    both = np.kron(m, np.eye(N)) + np.kron(np.eye(N), m)
-    rng = np.random.default_rng(0)
-    b, u = rng.standard_normal((2, N, N))
-    field = Affine(0.7, b, DIFFUSION[:, None] + DIFFUSION, Plane())
-    a = np.zeros((N * N + 1, N * N + 1))
-    a[:-1, :-1], a[:-1, -1] = 0.7 * both, b.ravel()
-    wanted = (scipy.linalg.expm(a) @ np.append(u.ravel(), 1))[:-1].reshape(N, N)
-    np.testing.assert_allclose(field.flow(jnp.asarray(u)), wanted, rtol=0, atol=100 * EPS)
+def test_a_transform_of_ones_own():
+    m = np.random.default_rng(0).standard_normal((N, N))
+    m = m + m.T
+    eigenvalues, vectors = np.linalg.eigh(m)
+    b, u = np.random.default_rng(1).standard_normal((2, N))
+    own = Eigenvectors(jnp.asarray(vectors))
+    found = Affine(0.7, b, eigenvalues, own).flow(jnp.asarray(u))
+    wanted = exact(m, 0.7, b, u)
+    # The eigenvalues are known to some units of their largest, 5, and so are their exponentials.
+    np.testing.assert_allclose(found, wanted, rtol=0, atol=100 * EPS * np.abs(wanted).max())
+    # Along one axis of a grid, with a transform of ours along the other.
+    grid = cfjax.TensorTransform((own, cfjax.SineTransform()))
+    b, u = np.random.default_rng(2).standard_normal((2, N, 3))
+    lines = second_difference("sine", 3)
+    both = np.kron(m, np.eye(3)) + np.kron(np.eye(N), lines)
+    spectrum = np.add.outer(eigenvalues, cfjax.SineTransform().second_difference(3))
+    found = Affine(0.7, b, spectrum, grid).flow(jnp.asarray(u))
+    wanted = exact_on_grid(both, 0.7, b, u)
+    np.testing.assert_allclose(found, wanted, rtol=0, atol=100 * EPS * np.abs(wanted).max())
+
+
+# Grids: tensor products of transforms, against Kronecker sums of second differences.
+
+
+def second_difference(kind, n):
+    a = np.diag(np.full(n, -2.0)) + np.diag(np.ones(n - 1), 1) + np.diag(np.ones(n - 1), -1)
+    if kind == "cosine":
+        a[0, 0] = a[-1, -1] = -1
+    if "Fourier" in kind:
+        a[0, -1] += 1
+        a[-1, 0] += 1
+    return a
+
+
+def on_grid(kinds, shape):
+    """The product of transforms, the spectrum of the Laplacian and its dense matrix.
+
+    Axis k has the squared spacing 1 / (k + 1), so no two axes are alike.
+    """
+    transforms, spectra, matrix = [], [], np.zeros((1, 1))
+    for axis, (kind, n) in enumerate(zip(kinds, shape, strict=True)):
+        transform = {
+            "sine": cfjax.SineTransform(),
+            "cosine": cfjax.CosineTransform(),
+            "Fourier": cfjax.FourierTransform(),
+            "real Fourier": cfjax.RealFourierTransform(n),
+        }[kind]
+        transforms.append(transform)
+        spectra.append((axis + 1) * transform.second_difference(n))
+        one = (axis + 1) * second_difference(kind, n)
+        matrix = np.kron(matrix, np.eye(n)) + np.kron(np.eye(len(matrix)), one)
+    is_complex = "Fourier" in kinds and "real Fourier" not in kinds
+    dtype = complex if is_complex else float
+    return cfjax.TensorTransform(transforms), functools.reduce(np.add.outer, spectra), matrix, dtype
+
+
+def exact_on_grid(m, alpha, b, u):
+    """The flow by SciPy's exponential, for every column of the grid."""
+    n = len(m)
+    ends = []
+    for f, p in zip(b.reshape(n, -1).T, u.reshape(n, -1).T, strict=True):
+        a = np.zeros((n + 1, n + 1), b.dtype)
+        a[:-1, :-1], a[:-1, -1] = alpha * m, f
+        ends.append((scipy.linalg.expm(a) @ np.append(p, 1))[:-1])
+    return np.stack(ends, axis=1).reshape(u.shape)
+
+
+def random_points(dtype, shape):
+    b, u = np.random.default_rng(0).standard_normal((2, *shape)).astype(dtype)
+    return (b + 1j * u[::-1], u - 1j * b) if dtype is complex else (b, u)
+
+
+KINDS = ("sine", "cosine", "Fourier", "real Fourier")
+PAIRS = [(a, b) for a in KINDS for b in KINDS if (a, b) != ("real Fourier",) * 2]
+
+
+@pytest.mark.parametrize("pair", PAIRS)
+def test_flow_on_a_grid(pair):
+    transform, spectrum, m, dtype = on_grid(pair, (4, 5))
+    b, u = random_points(dtype, (4, 5))
+    field = Affine(0.7, b, spectrum, transform)
+    found = eqx.filter_jit(field.flow)(jnp.asarray(u))
+    assert found.dtype == u.dtype
+    # The dense exponential of norm 0.7 * 12 is itself that far off.
+    atol = 100 * EPS
+    np.testing.assert_allclose(found, exact_on_grid(m, 0.7, b, u), rtol=0, atol=atol)
+    velocity = (0.7 * m @ u.ravel()).reshape(u.shape) + b
+    np.testing.assert_allclose(field.tangent(jnp.asarray(u)), velocity, rtol=0, atol=atol)
+
+
+@pytest.mark.parametrize("pair", [("sine", "cosine"), ("Fourier", "real Fourier")])
+def test_flow_on_a_grid_beyond_the_dense_limit(pair):
+    """By the dense eigenvectors: an exponential of this size by SciPy is slow."""
+    shape = (3, 166)
+    transform, spectrum, m, dtype = on_grid(pair, shape)
+    b, u = random_points(dtype, shape)
+    eigenvalues, vectors = np.linalg.eigh(m)
+    z = 0.7 * eigenvalues
+    phi = np.where(np.abs(z) < 1e-8, 1.0, np.expm1(z) / np.where(z == 0, 1.0, z))
+    wanted = vectors @ (np.exp(z) * (vectors.T @ u.ravel()) + phi * (vectors.T @ b.ravel()))
+    found = Affine(0.7, b, spectrum, transform).flow(jnp.asarray(u))
+    # Eigenvectors are known to some n units of rounding, as are sums over n entries of size one.
+    np.testing.assert_allclose(np.ravel(found), wanted, rtol=0, atol=498 * EPS * 4)
+
+
+def test_flow_on_a_grid_of_three_dimensions_with_columns():
+    kinds, shape = ("cosine", "real Fourier", "sine"), (3, 4, 2)
+    transform, spectrum, m, dtype = on_grid(kinds, shape)
+    b, u = random_points(dtype, (*shape, 2))
+    wanted = exact_on_grid(m, 0.7, b, u)
+    atol = 100 * EPS
+    found = eqx.filter_jit(Affine(0.7, b, spectrum, transform).flow)(jnp.asarray(u))
+    np.testing.assert_allclose(found, wanted, rtol=0, atol=atol)
+    # A diffusivity for each column, and a batch of points.
+    both = Affine(0.7, b, np.multiply.outer(spectrum, [1.0, 0.5]), transform)
+    found = jax.jit(jax.vmap(lambda u: both.flow(u)))(jnp.stack([u, 2 * u, 0 * u]))
+    wanted[..., 1:] = exact_on_grid(0.5 * m, 0.7, b[..., 1:], u[..., 1:])
+    np.testing.assert_allclose(found[0], wanted, rtol=0, atol=atol)
+    # The flow is affine.
+    np.testing.assert_allclose(found[1] + found[2], 2 * wanted, rtol=0, atol=2 * atol)
+
+
+def test_advection_on_a_periodic_grid():
+    """Complex eigenvalues of real points. Central differences have none at `k = n / 2`."""
+    transform, spectrum, m, _ = on_grid(("Fourier", "real Fourier"), (4, 5))
+    eye = np.eye(4)
+    central = (np.roll(eye, 1, axis=1) - np.roll(eye, -1, axis=1)) / 2
+    spectrum = spectrum + 2j * np.sin(2 * np.pi * np.fft.fftfreq(4))[:, None]
+    b, u = random_points(float, (4, 5))
+    found = Affine(0.7, b, spectrum, transform).flow(jnp.asarray(u))
+    wanted = exact_on_grid(m + 2 * np.kron(central, np.eye(5)), 0.7, b, u)
+    np.testing.assert_allclose(found, wanted, rtol=0, atol=100 * EPS)
+
+
+def test_columns_first_where_an_axis_has_no_transform():
+    transform, spectrum, m, _ = on_grid(("sine", "cosine"), (4, 5))
+    transform = cfjax.TensorTransform((None, *transform.transforms))
+    b, u = random_points(float, (2, 4, 5))
+    field = Affine(0.7, b, np.multiply.outer([1.0, 0.5], spectrum), transform)
+    found = field.flow(jnp.asarray(u))
+    for d, f, p, end in zip((1.0, 0.5), b, u, found, strict=True):
+        np.testing.assert_allclose(end, exact_on_grid(d * m, 0.7, f, p), rtol=0, atol=100 * EPS)
+
+
+@pytest.mark.parametrize("pair", [("sine", "cosine"), ("Fourier", "real Fourier")])
+def test_float32_on_a_grid(pair):
+    transform, spectrum, m, dtype = on_grid(pair, (4, 5))
+    b, u = random_points(dtype, (4, 5))
+    small = np.float32
+    found = Affine(0.7, b.astype(small), spectrum.astype(small), transform).flow(
+        jnp.asarray(u, small)
+    )
+    assert found.dtype == small
+    wanted = exact_on_grid(m, 0.7, b, u)
+    np.testing.assert_allclose(found, wanted, rtol=0, atol=50 * 2.0**-23)
+
+
+@pytest.mark.parametrize("pair", [("sine", "cosine"), ("real Fourier", "Fourier")])
+def test_order_of_a_semilinear_problem_on_a_grid(pair):
+    """Allen-Cahn with a forcing that does not commute with the Laplacian, against SciPy."""
+    shape = (3, 4)
+    transform, spectrum, m, _ = on_grid(pair, shape)
+    x, y = np.meshgrid(*map(np.arange, shape), indexing="ij")
+    weight = 1 + np.cos(x + 2.0 * y)
+
+    def reaction(xp, t, u):
+        return u - u**3 + weight * xp.cos(3 * t)
+
+    def field(t, u, spectrum):
+        return Affine(1.0, reaction(jnp, t, u), spectrum, transform)
+
+    def ode(t, u):
+        return m @ u + np.ravel(reaction(np, t, u.reshape(shape)))
+
+    u0 = np.sin(1.0 + x * y)
+    answer = problems.reference(ode, 0.0, 1.0, u0.ravel())
+    # Eigenvalues up to 12 are resolved, so no order is lost to stiffness.
+    steps = [32, 64, 128]
+    errors = problems.errors(field, cfjax.CF4(), 1.0, u0, spectrum, answer, steps)
+    assert errors.min() > 20 * problems.REFERENCE_ERROR
+    assert abs(problems.slope(steps, errors) - 4) < 0.15
+
+
+def test_boundary_values_by_lifting():
+    """Reaction and diffusion with boundary values that vary, whose exact solution is known.
+
+    `u = 1 + (c - 1) x + x^2 sin t` with `c = cos(t) cos(pi y)`: second differences are exact for
+    its polynomials in x, and `cos(pi y)` is a vector of the cosine transform.
+    """
+    nx, ny = 3, 4
+    sine, cosine = cfjax.SineTransform(), cfjax.CosineTransform()
+    transform = cfjax.TensorTransform((sine, cosine))
+    in_y = ny**2 * cosine.second_difference(ny)
+    laplacian = np.add.outer((nx + 1) ** 2 * sine.second_difference(nx), in_y)
+    x = jnp.arange(1.0, nx + 1)[:, None] / (nx + 1)
+    wave = jnp.cos(jnp.pi * jnp.arange(0.5, ny)[None, :] / ny)
+
+    def solution(t):
+        return 1 - x + x * wave * jnp.cos(t) + x**2 * jnp.sin(t)
+
+    def lift(t):
+        """Linear in x between the boundary values 1 and `u(x = 1)`."""
+        return 1 - x + x * (wave * jnp.cos(t) + jnp.sin(t))
+
+    def rate(fun, t):
+        return jax.jvp(fun, (t,), (jnp.ones_like(t),))[1]
+
+    def forcing(t):
+        """What makes it a solution of `u' = L u + u - u^3 + forcing`."""
+        u = solution(t)
+        diffused = in_y[1] * x * wave * jnp.cos(t) + 2 * jnp.sin(t)
+        return rate(solution, t) - diffused - u + u**3
+
+    def field(t, v, laplacian):
+        u = v + lift(t)
+        lifted = in_y[1] * x * wave * jnp.cos(t) - rate(lift, t)
+        return Affine(1.0, u - u**3 + forcing(t) + lifted, laplacian, transform)
+
+    steps, start, end = [32, 64, 128], solution(0.0) - lift(0.0), solution(1.0) - lift(1.0)
+    errors = problems.errors(field, cfjax.CF4(), 1.0, start, laplacian, np.ravel(end), steps)
+    # Rounding of a hundred steps is below 1e-14. Eigenvalues reach 110 and are resolved.
+    assert errors.min() > 1e-12
+    assert abs(problems.slope(steps, errors) - 4) < 0.15
+
+
+def test_a_state_that_is_a_number():
+    """Of no axes, so neither has its spectrum any."""
+    found = cfjax.flow(Affine(2.0, jnp.asarray(3.0), jnp.asarray(-0.5)), jnp.asarray(1.0))
+    np.testing.assert_allclose(found, np.exp(-1) + 3 * (1 - np.exp(-1)), rtol=4 * EPS)
 
 
 # Derivatives.
@@ -179,7 +401,16 @@ def parts(field, point):
 @pytest.mark.parametrize("alpha", [0.7, 0.0])
 def test_derivatives(case, alpha):
     field, point, _ = data(case)
-    field = Affine(alpha, field.b, field.spectrum, field.transform)
+    check_derivatives(Affine(alpha, field.b, field.spectrum, field.transform), point)
+
+
+def test_derivatives_on_a_grid():
+    transform, spectrum, _, dtype = on_grid(("real Fourier", "sine"), (4, 3))
+    b, u = random_points(dtype, (4, 3))
+    check_derivatives(Affine(0.0, b, spectrum / 2, transform), jnp.asarray(u))
+
+
+def check_derivatives(field, point):
     x, flow = parts(field, point)
     dx, weights = problems.random_like(x, 1), problems.random_like(flow(x), 2)
     size = float(np.abs(flow(x)).max()) + 1
@@ -266,6 +497,10 @@ def ones(dtype: Any = float, shape=(4,)):
     return jnp.ones(shape, dtype)
 
 
+def plane():
+    return cfjax.TensorTransform([cfjax.SineTransform()] * 2)
+
+
 @pytest.mark.parametrize(
     "arguments, error, message",
     [
@@ -287,6 +522,24 @@ def ones(dtype: Any = float, shape=(4,)):
             r"spectrum .* \(3,\) .* got \(4,\)",
         ),
         ((1.0, ones(), ones(), cfjax.RealFourierTransform(5)), ValueError, "length 4"),
+        ((1.0, ones(), ones(), cfjax.FourierTransform()), TypeError, "complex arrays, got float64"),
+        (
+            (1.0, ones(shape=()), ones(), cfjax.SineTransform()),
+            ValueError,
+            r"SineTransform needs points along the first axis, got shape \(\)",
+        ),
+        # Diffusion along one axis of a square, where its spectrum would fit.
+        (
+            (1.0, ones(shape=(4, 4, 2)), ones(), plane()),
+            ValueError,
+            r"spectrum .* shape \(4, 4, 2\) or \(4, 4\) .* got \(4,\)",
+        ),
+        (
+            (1.0, ones(shape=(4, 4)), ones(shape=(4, 1)), plane()),
+            ValueError,
+            r"spectrum .* shape \(4, 4\) .* got \(4, 1\)",
+        ),
+        ((1.0, ones(), ones(), plane()), ValueError, r"TensorTransform of 2 axes .* \(4,\)"),
         (
             (1.0, ones(), ones(complex), cfjax.SineTransform()),
             TypeError,
@@ -304,3 +557,31 @@ def test_wrong_point(point, no_shape_hook):
     term = cfjax.LieTerm(lambda t, y, args: Affine(1.0, ones(), ones()))
     with pytest.raises(ValueError, match="Affine acts on points like its b, float64 of shape"):
         term.vf(0.0, point, None)
+
+
+def test_flow_of_a_wrong_point(no_shape_hook):
+    # b along the rows of a square would pass as one for its columns.
+    with pytest.raises(ValueError, match=r"Affine acts on points like its b.* got .* \(4, 4\)"):
+        cfjax.flow(Affine(1.0, ones(), ones()), ones(shape=(4, 4)))
+
+
+def test_fields_with_different_operators_are_not_added():
+    """The sum would have the operator of the first."""
+    b = jnp.ones(4)
+    field = Affine(1.0, b, -jnp.arange(4.0))
+    for other in (
+        Affine(1.0, b, -jnp.arange(4.0), cfjax.SineTransform()),
+        Affine(1.0, b[:3], -jnp.arange(3.0)),
+    ):
+        with pytest.raises(ValueError, match="must have one operator, got the spectra"):
+            cfjax.combine((1.0, 1.0), (field, other))
+    with pytest.raises(eqx.EquinoxRuntimeError, match="must have one spectrum"):
+        cfjax.combine((1.0, 1.0), (field, Affine(1.0, b, -2 * jnp.arange(4.0))))
+    total = cfjax.combine((1.0, 2.0), (field, Affine(1.0, b, -jnp.arange(4.0) - 0.0)))
+    np.testing.assert_array_equal(total.alpha, 3.0)
+
+
+def test_a_spectrum_that_changes_with_time_is_an_error():
+    term = cfjax.LieTerm(lambda t, y, args: Affine(1.0, y, -(1 + t) * jnp.arange(4.0)))
+    with pytest.raises(eqx.EquinoxRuntimeError, match="must have one spectrum"):
+        cfjax.integrate(term, cfjax.CF4(), 0.0, 1.0, jnp.ones(4), num_steps=2)

@@ -3,6 +3,7 @@
 from typing import Any
 
 import diffrax
+import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -382,21 +383,59 @@ def test_wrong_point(cls, point, no_shape_hook):
         cls(np.ones((3, 2))).flow(jnp.asarray(point))
 
 
+def start(cls, y, way, solver):
+    """A short solve from `y`, as a part of a state."""
+    term = cfjax.LieTerm(lambda t, y, args: {"q": cls(y["q"]), "x": y["x"]})
+    y0 = {"q": jnp.asarray(y), "x": jnp.ones(2)}
+    if way == "integrate":
+        ys = cfjax.integrate(term, solver, 0.0, 0.1, y0, num_steps=1).ys
+    else:
+        ys = diffrax.diffeqsolve(term, solver, 0.0, 0.1, 0.1, y0).ys
+    return np.asarray(ys["q"][-1])
+
+
+@BOTH
+@pytest.mark.parametrize(
+    ("way", "solver"),
+    [
+        ("integrate", cfjax.CF4()),
+        ("diffeqsolve", cfjax.CF4(estimate=None)),
+        ("diffeqsolve", cfjax.CayleyRK4()),
+        ("diffeqsolve", cfjax.Richardson(cfjax.RKMK4())),
+    ],
+    ids=["integrate", "CF4", "CayleyRK4", "Richardson"],
+)
+def test_a_start_off_the_manifold_is_refused(cls, way, solver):
+    """It would become another start, of which the caller knows nothing."""
+    y = frame(6, 2)
+    expected = r"y0\['q'\] must have orthonormal columns .* and is off by more than "
+    for stretch, off in ((1.025, "0.01"), (1.41, "0.1"), (1 + 1e-7, "1e-07")):
+        with pytest.raises(eqx.EquinoxRuntimeError, match=expected + off):
+            start(cls, stretch * y, way, solver)
+    # Within the root of a unit of rounding the correction, of second order, leads to the manifold.
+    # CayleyRK4 has none, and keeps the start as it is.
+    end = start(cls, (1 + 5e-9) * y, way, solver)
+    limit = 2e-8 if isinstance(solver, cfjax.CayleyRK4) else 1e-14
+    np.testing.assert_allclose(end.T @ end, np.eye(2), rtol=0, atol=limit)
+
+
+@BOTH
+def test_in_a_batch_one_start_off_the_manifold_is_an_error(cls):
+    ys = jnp.stack([frame(6, 2), 1.1 * frame(6, 2)])
+    with pytest.raises(eqx.EquinoxRuntimeError, match=r"off by more than 0\.1"):
+        term = cfjax.LieTerm(lambda t, y, args: cls(y))
+        jax.vmap(lambda y: diffrax.diffeqsolve(term, cfjax.CF4(), 0.0, 0.1, 0.1, y).ys)(ys)
+
+
 @BOTH
 def test_a_point_off_the_manifold_gives_nan(cls):
-    y = frame(6, 2)
-    step = jax.jit(
-        lambda y: cfjax.integrate(
-            cfjax.LieTerm(lambda t, y, args: cls(y)),
-            cfjax.CF4(),
-            0.0,
-            0.1,
-            y,
-            num_steps=1,
-            throw=False,
-        ).ys[-1]
-    )
+    """Without a solver's check of the start."""
+    term = cfjax.LieTerm(lambda t, y, args: cls(y))
+
+    def step(y):
+        return cfjax.CF4().step(term, 0.0, 0.1, jnp.asarray(y), None, None, made_jump=False)[0]
+
     # Rounded to two digits it is moved to the nearest point, up to second order of 1e-2.
-    near = step(np.round(y, 2))
+    near = step(np.round(frame(6, 2), 2))
     np.testing.assert_allclose(np.asarray(near).T @ near, np.eye(2), rtol=0, atol=1e-3)
-    assert np.all(np.isnan(step(1.2 * y)))
+    assert np.all(np.isnan(step(1.2 * frame(6, 2))))

@@ -90,7 +90,7 @@ def coefficients(scheme):
     y1 = times(combine(rows[1], known), combine(rows[2], known))
     known.append(plus(y1, combine(rows[3], known)))
     rest = plus(times(combine(rows[4], known), combine(rows[5], known)), combine(rows[6], known))
-    return plus(rest, [Fraction(1)])
+    return plus(rest, [Fraction(1), Fraction(1)])
 
 
 @SCHEMES

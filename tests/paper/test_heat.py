@@ -159,7 +159,7 @@ def test_what_diffrax_makes_of_it(tol):
 
     solution = diffrax.diffeqsolve(
         cfjax.LieTerm(cfjax.scenes.heat.field),
-        cfjax.Richardson(cfjax.CF4()),
+        cfjax.Richardson(cfjax.CF4(), as_in_paper=True),
         0.0,
         0.5,
         5e-3,

@@ -117,6 +117,7 @@ def test_gradients_of_a_whole_solve(problem):
     def fun(x):
         y0, args = x
         term = cfjax.LieTerm(FIELDS[problem])
+        y0 = problems.orthonormal(y0)
         solution = cfjax.integrate(term, cfjax.CF4(), 0.0, 1.0, y0, args, num_steps=6)
         return jnp.sum(jnp.sin(weight * solution.ys[-1]))
 

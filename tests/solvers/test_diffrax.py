@@ -593,7 +593,7 @@ def test_step_doubling_gives_an_estimate(answers, solver):
 
 @pytest.mark.parametrize(
     "solver",
-    [diffrax.Bosh3(), diffrax.Dopri5(), diffrax.Tsit5(), diffrax.ReversibleHeun()],
+    [diffrax.Bosh3(), diffrax.Tsit5(), diffrax.ReversibleHeun(), diffrax.Kvaerno3()],
     ids=lambda solver: type(solver).__name__,
 )
 def test_solvers_of_linear_spaces_refuse_frozen_fields(solver):
@@ -601,14 +601,44 @@ def test_solvers_of_linear_spaces_refuse_frozen_fields(solver):
 
     Euler, Midpoint, Heun and Ralston ask for `vf_prod` alone, which is the ambient tangent.
     """
-    ours = isinstance(solver, diffrax.AbstractERK)
-    # The last one never asks for an array, so the error is diffrax's.
-    message = r"Rotation is a frozen vector field and not an array.*CF4" if ours else "structures"
-    with pytest.raises((TypeError, ValueError), match=message):
-        solve(solver)
-    if ours:
+    message = r"Rotation is a frozen vector field and not an array.*CF4"
+    controller = diffrax.PIDController(rtol=1e-3, atol=1e-3)
+    with pytest.raises(TypeError, match=message):
+        solve(solver, stepsize_controller=controller)
+    if not isinstance(solver, diffrax.AbstractImplicitSolver):
         with pytest.raises(TypeError, match=message):
             cfjax.integrate(TERM, solver, 0.0, 1.0, Y0, ARGS, num_steps=2)
+
+
+def test_a_class_in_place_of_a_solver_is_refused():
+    for solver in (cfjax.CF4, cfjax.RKMK4, cfjax.CayleyRK4):
+        message = rf"must be an instance, {solver.__name__}\(\), got the class"
+        with pytest.raises(AttributeError, match=message):
+            solve(solver)
+
+
+def still(t, y, args):
+    return cfjax.LowRankSkew(jnp.zeros_like(y))
+
+
+@pytest.mark.parametrize("bad", ["t0", "t1"])
+@pytest.mark.parametrize(
+    ("term", "solver", "y0"),
+    [
+        (TERM, cfjax.CF4(), Y0),
+        (TERM, cfjax.CF4(estimate=None), Y0),
+        (TERM, cfjax.Richardson(cfjax.RKMK4()), Y0),
+        (cfjax.LieTerm(lambda t, y, args: -y), cfjax.CF4(), Y0),
+        (cfjax.LieTerm(lambda t, y, args: -y), cfjax.RKMK3(), Y0),
+        (cfjax.LieTerm(still), cfjax.CF43(), jnp.eye(3)[:, :2]),
+    ],
+    ids=["CF4", "no estimate", "Richardson", "same as last", "plain", "Stiefel"],
+)
+def test_a_time_that_is_nan_is_an_error(bad, term, solver, y0):
+    """diffrax makes no step to it, and returns the start as a success."""
+    t0, t1 = (jnp.nan if name == bad else t for name, t in (("t0", 0.0), ("t1", 1.0)))
+    with pytest.raises(eqx.EquinoxRuntimeError, match="t0, t1 and dt0 must be numbers, got NaN"):
+        diffrax.diffeqsolve(term, solver, t0, t1, 0.5, y0, ARGS)
 
 
 @pytest.mark.parametrize("solver", [diffrax.Tsit5(), diffrax.Heun()])

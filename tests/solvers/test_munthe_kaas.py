@@ -430,3 +430,9 @@ def test_equal_solvers_do_not_trace_again():
     assert first > 0
     assert solve(cfjax.RKMK(diffrax.Dopri5.tableau), 2.0) == first
     assert solve(cfjax.RKMK(diffrax.Tsit5.tableau), 2.0) > first
+
+
+@pytest.mark.parametrize("given", [diffrax.Dopri8(), diffrax.Dopri8])
+def test_a_solver_in_place_of_its_tableau(given, no_shape_hook):
+    with pytest.raises(TypeError, match=r"Write diffrax\.Dopri8\.tableau"):
+        cfjax.RKMK(given)

@@ -81,6 +81,7 @@ def test_gradients():
     weight = np.arange(14.0).reshape(7, 2)
 
     def fun(y0):
+        y0 = problems.orthonormal(y0)
         ys = cfjax.integrate(
             cfjax.LieTerm(low_rank), cfjax.CayleyRK4(), 0.0, 1.0, y0, num_steps=3
         ).ys
