@@ -19,10 +19,11 @@ import numpy as np
 from jax import lax
 from jax.core import Tracer
 from jax.custom_batching import custom_vmap
-from jax.extend.core import ClosedJaxpr, DropVar, Jaxpr, JaxprEqn, Literal, jaxpr_as_fun
+from jax.extend.core import ClosedJaxpr, Jaxpr, JaxprEqn, Literal, jaxpr_as_fun
 from jaxtyping import Array, PyTree
 
 from ._functions.held import held, held_p
+from ._functions.operation import evaluate, operation, programs, variables, without_dead_code
 from ._functions.pack import pack, pack_p, unpack, unpack_p
 
 # Larger arrays fuse well as they are, and the program grows with the number of components. With
@@ -120,7 +121,7 @@ def by_components(fun: Callable[[PyTree], PyTree], y: PyTree, *, has_extra: bool
     """
     if is_inside() or not any(map(is_small, jtu.tree_leaves(y))):
         return fun(y)
-    program, parameters, is_straight, has_effects = trace(fun, y, has_extra)
+    program, parameters, is_straight, is_plain = trace(fun, y, has_extra)
     matrices = is_straight and has_few(y, _MAX_SIZE)
     # What is around may use single entries, so that XLA computes anew what these share. It does
     # little harm to a step, but much to a derivative.
@@ -129,13 +130,12 @@ def by_components(fun: Callable[[PyTree], PyTree], y: PyTree, *, has_extra: bool
     def step(y: PyTree, parameters: PyTree) -> PyTree:
         return program(y, parameters, matrices, True)
 
-    if _is_split(y) and not has_effects:
-        # The derivative of an adaptive loop computes a step at one place and uses its derivative at
-        # another. What that needs of the step is many scalars: to compute them again is cheaper
-        # than to send them there through memory. Effects would happen once more, or not be allowed.
-        step = jax.checkpoint(step)
+    # The derivative of an adaptive loop computes a step at one place and uses its derivative at
+    # another. What that needs of the step is many scalars: to compute them again is cheaper than to
+    # send them there through memory.
+    out = as_operation(step, y, parameters) if _is_split(y) and is_plain else step(y, parameters)
     # What is known before the program runs may come out as NumPy's.
-    out = jtu.tree_map(jnp.asarray, step(y, parameters))
+    out = jtu.tree_map(jnp.asarray, out)
     # One by one: what nobody uses is not computed.
     return jtu.tree_map(lambda x: _whole(_held(x, now=False)), out, is_leaf=_is_components)
 
@@ -152,7 +152,7 @@ def trace(
     fun: Callable[[PyTree], PyTree], y: PyTree, has_extra: bool = False
 ) -> tuple[Callable[[PyTree, PyTree, bool, bool], PyTree], list[Array], bool, bool]:
     """A program for `by_components`, what `fun` closes over, whether to split matrices, and whether
-    it has effects, such as prints.
+    it can be an operation.
 
     `program(y, parameters, matrices, cuts)` takes both split, with the same `matrices`, and returns
     what is split. It closes over nothing that is traced. Where it is long, its values go through
@@ -166,7 +166,7 @@ def trace(
         jaxpr, out = jax.make_jaxpr(fun, return_shape=True)(y)
     finally:
         _is_inside.reset(token)
-    code = _without_dead_code(jaxpr.jaxpr)
+    code = without_dead_code(jaxpr.jaxpr)
     needed = code.outvars[: len(jtu.tree_leaves(out[0]))] if has_extra else code.outvars
 
     def program(y: PyTree, parameters: PyTree, matrices: bool, cuts: bool) -> PyTree:
@@ -180,22 +180,7 @@ def trace(
         return split(jtu.tree_unflatten(jtu.tree_structure(out), outs), matrices)
 
     parameters = list(map(jnp.asarray, jaxpr.consts))
-    return program, parameters, _is_straight(code), bool(jaxpr.effects)
-
-
-def _without_dead_code(jaxpr: Jaxpr) -> Jaxpr:
-    """A step computes more than everybody wants, and values for that would be held too."""
-    wanted = set(_variables(jaxpr.outvars))
-    kept = []
-    for eqn in reversed(jaxpr.eqns):
-        if eqn.effects or not wanted.isdisjoint(eqn.outvars):
-            kept.append(eqn)
-            wanted.update(_variables(eqn.invars))
-    return jaxpr.replace(eqns=kept[::-1])
-
-
-def _variables(atoms: Iterable[Any]) -> list[Any]:
-    return [v for v in atoms if not isinstance(v, Literal)]
+    return program, parameters, _is_straight(code), not jaxpr.effects and _has_jvp(code)
 
 
 def _is_straight(jaxpr: Jaxpr) -> bool:
@@ -210,6 +195,29 @@ def _is_straight(jaxpr: Jaxpr) -> bool:
         else eqn.primitive.name not in _BRANCHES or not any(map(is_matrix, eqn.invars))
         for eqn in jaxpr.eqns
     )
+
+
+def _has_jvp(jaxpr: Jaxpr) -> bool:
+    """Whether no function in it has a rule for reverse mode alone."""
+    return all(
+        "custom_vjp" not in eqn.primitive.name and all(map(_has_jvp, programs(eqn)))
+        for eqn in jaxpr.eqns
+    )
+
+
+def as_operation(fun: Callable[..., PyTree], *args: PyTree) -> PyTree:
+    """`fun(*args)` as one operation."""
+    leaves, structure = jtu.tree_flatten(args)
+    out_structure: Any = None
+
+    def of_leaves(*leaves):
+        nonlocal out_structure
+        out = jtu.tree_map(jnp.asarray, fun(*jtu.tree_unflatten(structure, leaves)))
+        out, out_structure = jtu.tree_flatten(out)
+        return out
+
+    outs = operation(of_leaves, *map(jnp.asarray, leaves))
+    return jtu.tree_unflatten(out_structure, outs)
 
 
 class _Rules(NamedTuple):
@@ -283,7 +291,7 @@ def _evaluate(
             ]
         else:
             out = _in_components(eqn, name, values, fixed, rules)
-            outs = [out] if out is not None else _on_whole_arrays(jaxpr, eqn, values)
+            outs = [out] if out is not None else evaluate(jaxpr, eqn, list(map(_whole, values)))
         env.update(zip(eqn.outvars, outs, strict=True))
         loose.update(v for v, is_one in zip(eqn.outvars, outs_fixed, strict=True) if not is_one)
     return [read(v) for v in jaxpr.outvars], [is_fixed(v) for v in jaxpr.outvars]
@@ -327,11 +335,11 @@ def _cuts(jaxpr: Jaxpr, rules: _Rules) -> dict[int, bool]:
 
 def _used(jaxpr: Jaxpr, place: int, needed: Sequence[Any]) -> tuple[list[Any], list[Any]]:
     """What an operation and those after it use for results that are needed, and else."""
-    wanted = dict.fromkeys(_variables(needed))
-    others = dict.fromkeys(_variables(jaxpr.outvars))
+    wanted = dict.fromkeys(variables(needed))
+    others = dict.fromkeys(variables(jaxpr.outvars))
     for eqn in reversed(jaxpr.eqns[place:]):
         is_needed = eqn.effects or not wanted.keys().isdisjoint(eqn.outvars)
-        (wanted if is_needed else others).update(dict.fromkeys(_variables(eqn.invars)))
+        (wanted if is_needed else others).update(dict.fromkeys(variables(eqn.invars)))
     return list(wanted), [v for v in others if v not in wanted]
 
 
@@ -382,20 +390,6 @@ def _in_components(
     if name == "dot_general" and _is_plain_product(eqn, values, fixed):
         return _product(values[0], values[1], eqn.params["dimension_numbers"][0], shape)
     return None
-
-
-def _on_whole_arrays(jaxpr: Jaxpr, eqn: JaxprEqn, values: Sequence[Any]) -> Sequence[Any]:
-    known = {v: x for v, x in zip(eqn.invars, values, strict=True) if not isinstance(v, Literal)}
-    # JAX's own evaluator knows how every operation is called, in every version of JAX.
-    alone = jaxpr.replace(
-        constvars=[],
-        invars=list(known),
-        outvars=[v for v in eqn.outvars if not isinstance(v, DropVar)],
-        eqns=[eqn],
-        debug_info=jaxpr.debug_info.with_unknown_names(),
-    )
-    outs = iter(jaxpr_as_fun(ClosedJaxpr(alone, []))(*map(_whole, known.values())))
-    return [None if isinstance(v, DropVar) else next(outs) for v in eqn.outvars]
 
 
 def _broadcast(places: np.ndarray, shape: tuple[int, ...], params: dict[str, Any]) -> np.ndarray:

@@ -344,6 +344,7 @@ def _check(eqn: JaxprEqn) -> int:
 
 # Calls by the parameter that holds the program.
 _CALLS = {
+    "cfjax_operation": "program",
     "checkpoint": "jaxpr",
     "closed_call": "call_jaxpr",
     "custom_jvp_call": "call_jaxpr",

@@ -10,7 +10,7 @@ import jax.tree_util as jtu
 from jax import lax
 from jaxtyping import Array, Int, PyTree
 
-from ._components import has_few, join, split, trace
+from ._components import as_operation, has_few, join, split, trace
 from ._functions.pack import pack, unpack
 
 # Beyond, the derivative gains less than copying them costs.
@@ -35,7 +35,7 @@ def repeat(
     that is, what `step` closes over, travel with them unchanged: in the reversed loop they are the
     sums of the derivatives, which else would be results of their own.
     """
-    program, parameters, is_straight, _ = trace(step, carry)
+    program, parameters, is_straight, is_plain = trace(step, carry)
     leaves, structure = jtu.tree_flatten(carry)
 
     def step_of_leaves(leaves: list[Any], values: list[Any], matrices: bool) -> list[Any]:
@@ -44,7 +44,14 @@ def repeat(
 
     leaves = list(map(jnp.asarray, leaves))
     most = (_MOST_FORWARD, _MOST_BACKWARD) if is_straight else (0, 0)
-    leaves = _repeat(leaves, parameters, program=step_of_leaves, num_steps=num_steps, most=most)
+    leaves = _repeat(
+        leaves,
+        parameters,
+        program=step_of_leaves,
+        num_steps=num_steps,
+        most=most,
+        is_plain=is_plain,
+    )
     return jtu.tree_unflatten(structure, leaves)
 
 
@@ -56,13 +63,14 @@ def _repeat(
     program: Callable,
     num_steps: int | Int[Array, ""],
     most: tuple[int, int],
+    is_plain: bool,
 ) -> list[Array]:
     matrices = has_few(leaves, most[0])
-    return _scan(program, num_steps, leaves, values, matrices, [False] * len(values))
+    return _scan(program, num_steps, leaves, values, matrices, [False] * len(values), is_plain)
 
 
 @_repeat.def_jvp
-def _(primals, tangents, *, program, num_steps, most):
+def _(primals, tangents, *, program, num_steps, most, is_plain):
     leaves, values = primals
     matrices = has_few(leaves, most[1])
     moves = [tangent is not None for tangent in tangents[1]]
@@ -70,7 +78,7 @@ def _(primals, tangents, *, program, num_steps, most):
     if sum(n for n, is_one in zip(pieces, moves, strict=True) if is_one) > _MAX_TRAVELLERS:
         moves = [False] * len(moves)
     return eqx.filter_jvp(
-        lambda leaves, values: _scan(program, num_steps, leaves, values, matrices, moves),
+        lambda leaves, values: _scan(program, num_steps, leaves, values, matrices, moves, is_plain),
         primals,
         tangents,
     )
@@ -83,6 +91,7 @@ def _scan(
     values: list[Array],
     matrices: bool,
     moves: Sequence[bool],
+    is_plain: bool,
 ) -> list[Array]:
     """The loop, where values travel that are in components, if they move."""
     leaves, structure = jtu.tree_flatten(split(leaves, matrices))
@@ -96,25 +105,27 @@ def _scan(
     values, value_structure = jtu.tree_flatten(split(values, matrices))
     known, others = _part(values, travels)
 
-    @jax.checkpoint
-    def step(leaves: list[Array], values: list[Array]) -> list[Array]:
-        return jtu.tree_leaves(
-            program(
-                jtu.tree_unflatten(structure, leaves),
-                jtu.tree_unflatten(value_structure, values),
-                matrices,
-            )
-        )
-
-    def body(carry: tuple[Array | None, list[Array]], _: None) -> tuple[Any, None]:
-        vector, rest = carry
-        entries = [] if vector is None else unpack(vector)
+    def step(entries: list[Array], rest: list[Array], known: Any, others: Any) -> Any:
         numbers, travellers = entries[: sum(packed)], entries[sum(packed) :]
         values = _join(
             [_borrow(*pair) for pair in zip(known, travellers, strict=True)], others, travels
         )
-        numbers, rest = _part(step(_join(numbers, rest, packed), values), packed)
-        return (pack([*numbers, *travellers]) if numbers else None, rest), None
+        leaves = jtu.tree_leaves(
+            program(
+                jtu.tree_unflatten(structure, _join(numbers, rest, packed)),
+                jtu.tree_unflatten(value_structure, values),
+                matrices,
+            )
+        )
+        numbers, rest = _part(leaves, packed)
+        return pack([*numbers, *travellers]) if numbers else None, rest
+
+    def body(carry: tuple[Array | None, list[Array]], _: None) -> tuple[Any, None]:
+        vector, rest = carry
+        entries = [] if vector is None else unpack(vector)
+        if is_plain and not any(map(jnp.ndim, leaves)):
+            return as_operation(step, entries, rest, known, others), None
+        return jax.checkpoint(step)(entries, rest, known, others), None
 
     vector = pack([*numbers, *known]) if numbers else None
     if isinstance(num_steps, int):

@@ -73,13 +73,16 @@ def stumpff_1_2_apart(s: Float[Array, "*batch"]) -> tuple[Float[Array, "*batch"]
 def _(primals, tangents):
     (s,), (s_dot,) = primals, tangents
     near, d1, d2 = stumpff_1_2_apart(s)
-    _, c2, c3, c4 = _stumpff_1_to_4(s)
+    _, c2, c3, c4 = _stumpff_1_to(4, s)
     return (near, d1, d2), (jnp.zeros_like(s), (c3 - c2) / 2 * s_dot, (c4 - c3 / 2) * s_dot)
 
 
-@jax.custom_jvp
-def _stumpff_1_to_4(s: Float[Array, "*batch"]) -> tuple[Float[Array, "*batch"], ...]:
-    """Without the branches and divisions of `stumpff`, which a loop of small steps would feel."""
+@functools.partial(jax.custom_jvp, nondiff_argnums=(0,))
+def _stumpff_1_to(n: int, s: Float[Array, "*batch"]) -> tuple[Float[Array, "*batch"], ...]:
+    """`c_1` to `c_n`, for an even `n >= 4`, without the branches and divisions of `stumpff`.
+
+    A loop of small steps would feel these, and a derivative of high order needs all of them.
+    """
     constants = _DOUBLE if s.dtype == jnp.float64 else _SINGLE
     turns, inverse = _turns(s, constants)
     # Without a full turn `inverse` may be too large to be squared.
@@ -94,16 +97,21 @@ def _stumpff_1_to_4(s: Float[Array, "*batch"]) -> tuple[Float[Array, "*batch"], 
     inverse = inverse * inverse
     c3 = scale * (square * c3) + excess * inverse
     c4 = square * (square * c4) + (excess * (1 + scale)) * (inverse / 2)
-    return scale * c1, square * c2, c3, c4
+    c = [scale * c1, square * c2, c3, c4]
+    for k in range(5, n + 1):
+        # Up to half a turn the series, whose terms fall below the rounding; beyond, the recursion
+        # loses no digits.
+        series = polynomial([(-1) ** j / factorial(k + 2 * j) for j in range(13)], z)
+        recursion = (1 / factorial(k - 2) - c[k - 3]) * inverse
+        c.append(jnp.where(turns == 0, series, recursion))
+    return tuple(c)
 
 
-@_stumpff_1_to_4.defjvp
-def _(primals, tangents):
+@_stumpff_1_to.defjvp
+def _(n, primals, tangents):
     (s,), (s_dot,) = primals, tangents
-    c1, c2, c3, c4 = _stumpff_1_to_4(s)
-    c5, c6 = stumpff(5, s), stumpff(6, s)
-    slopes = ((c3 - c2) / 2, c4 - c3 / 2, (3 * c5 - c4) / 2, 2 * c6 - c5 / 2)
-    return (c1, c2, c3, c4), tuple(slope * s_dot for slope in slopes)
+    c = _stumpff_1_to(n + 2, s)
+    return c[:n], tuple((k * c[k + 1] - c[k]) / 2 * s_dot for k in range(1, n + 1))
 
 
 class _Constants(NamedTuple):

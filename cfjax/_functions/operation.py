@@ -1,0 +1,484 @@
+"""A program as one operation of JAX, whose derivatives are such operations too.
+
+A derivative of a program of scalars has several times its operations, and a second derivative
+several times more. Each of them becomes a program of its own here, so that when it is compiled its
+length is known, and it goes through memory at as many places as that length needs.
+"""
+
+import functools
+import itertools
+import math
+from collections.abc import Callable, Iterable, Sequence
+from typing import Any, NamedTuple
+
+import jax
+import jax.numpy as jnp
+import jax.tree_util as jtu
+import numpy as np
+from jax import lax
+from jax.extend.core import (
+    ClosedJaxpr,
+    DropVar,
+    Jaxpr,
+    JaxprEqn,
+    Literal,
+    Primitive,
+    jaxpr_as_fun,
+)
+from jax.interpreters import ad, batching, mlir
+from jaxtyping import Array
+
+from .held import held
+from .pack import pack_p, unpack_p
+
+# Into one function XLA on CPU puts some 2000 operations, not counted twice where they are the same,
+# and less if there are many results. What two of its functions need, both compute: in long programs
+# exponentially often.
+_WHOLE = 3000
+_GROUP = 1500
+# A second derivative has up to five times the operations, and should fit.
+_PIECE = 500
+# Of so many directions each is computed on its own.
+_FEW = 16
+
+_FREE = frozenset(
+    "broadcast_in_dim reshape squeeze slice transpose copy convert_element_type".split()
+)
+
+
+def operation(fun: Callable[..., Sequence[Array]], *operands: Array) -> list[Array]:
+    """`fun(*operands)`, as one operation.
+
+    `fun` may close over traced values, and has no effects. Reverse mode keeps the operands and
+    computes everything again, as with `jax.checkpoint`.
+    """
+    program = jax.make_jaxpr(fun)(*operands)
+    jaxpr = without_dead_code(program.jaxpr)
+    code = jaxpr.replace(
+        constvars=[],
+        invars=[*jaxpr.constvars, *jaxpr.invars],
+        debug_info=jaxpr.debug_info.with_unknown_names(),
+    )
+    operands = *program.consts, *operands
+    program = ClosedJaxpr(code, [])
+    ends = _places(code)
+    if len(ends) > 2:
+        program = _program(functools.partial(_in_pieces, program, ends), *_structs(code.invars))
+    return operation_p.bind(*operands, program=program, kind=_Kind())
+
+
+def _places(jaxpr: Jaxpr) -> list[int]:
+    """The ends of pieces of a program, where few values are on their way."""
+    n = len(jaxpr.eqns)
+    last = dict.fromkeys(variables(jaxpr.outvars), n)
+    for k, eqn in reversed(list(enumerate(jaxpr.eqns))):
+        for v in variables(eqn.invars):
+            last.setdefault(v, k)
+    change = np.zeros(n + 2, int)
+    for k, eqn in enumerate(jaxpr.eqns):
+        for v in eqn.outvars:
+            if v in last:
+                change[k + 1] += 1
+                change[last[v] + 1] -= 1
+    live = np.cumsum(change)[:n]
+    progress = np.cumsum([0, *map(_length, jaxpr.eqns)])
+    parts = math.ceil(progress[-1] / _PIECE)
+    length = progress[-1] / max(parts, 1)
+    ends = [0]
+    for k in range(1, parts):
+        near = np.flatnonzero(np.abs(progress[:n] - k * length) < 0.4 * length)
+        near = near[near > ends[-1]]
+        if near.size:
+            distance = np.abs(progress[near] - k * length)
+            ends.append(int(near[np.lexsort((distance, live[near]))[0]]))
+    return [*ends, n]
+
+
+def _length(eqn: JaxprEqn) -> int:
+    """How many operations on numbers or whole arrays."""
+    if eqn.primitive.name in _CALLS:
+        return sum(_length(inner) for program in programs(eqn)[:1] for inner in program.eqns)
+    return 0 if eqn.primitive.name in _FREE or eqn.primitive in (pack_p, unpack_p) else 1
+
+
+def _in_pieces(program: ClosedJaxpr, ends: Sequence[int], *operands: Array) -> list[Array]:
+    jaxpr = program.jaxpr
+    env = dict(zip(jaxpr.invars, operands, strict=True))
+    for start, stop in itertools.pairwise(ends):
+        part, taken, given = _part(jaxpr, start, stop)
+        outs = operation_p.bind(*(env[v] for v in taken), program=part, kind=_Kind())
+        env.update(zip(given, outs, strict=True))
+    return _results(jaxpr, env)
+
+
+def _part(jaxpr: Jaxpr, start: int, stop: int) -> tuple[ClosedJaxpr, list[Any], list[Any]]:
+    """Some operations of a program, what they take from those before, and give to those after."""
+    eqns = jaxpr.eqns[start:stop]
+    made = {v for e in eqns for v in e.outvars}
+    taken = dict.fromkeys(v for e in eqns for v in variables(e.invars) if v not in made)
+    later = [v for e in jaxpr.eqns[stop:] for v in variables(e.invars)]
+    given = dict.fromkeys(v for v in (*later, *variables(jaxpr.outvars)) if v in made)
+    part = jaxpr.replace(
+        eqns=eqns,
+        constvars=[],
+        invars=list(taken),
+        outvars=list(given),
+        debug_info=jaxpr.debug_info.with_unknown_names(),
+    )
+    return ClosedJaxpr(part, []), list(taken), list(given)
+
+
+def _results(jaxpr: Jaxpr, env: dict[Any, Any]) -> list[Any]:
+    return [
+        jnp.asarray(v.val, v.aval.dtype) if isinstance(v, Literal) else env[v]
+        for v in jaxpr.outvars
+    ]
+
+
+def without_dead_code(jaxpr: Jaxpr) -> Jaxpr:
+    """Only what the results need."""
+    wanted = set(variables(jaxpr.outvars))
+    kept = []
+    for eqn in reversed(jaxpr.eqns):
+        if eqn.effects or not wanted.isdisjoint(eqn.outvars):
+            if eqn.primitive is operation_p:
+                eqn = _pruned(eqn, wanted)
+            kept.append(eqn)
+            wanted.update(variables(eqn.invars))
+    return jaxpr.replace(eqns=kept[::-1])
+
+
+def _pruned(eqn: JaxprEqn, wanted: set[Any]) -> JaxprEqn:
+    """An operation that gives only what is wanted."""
+    gives = [k for k, v in enumerate(eqn.outvars) if v in wanted]
+    kind, size = eqn.params["kind"], len(eqn.invars)
+    program, takes = _narrowed(eqn.params["program"], gives)
+    linear = sum(k >= size - kind.linear for k in takes)
+    return eqn.replace(
+        invars=[eqn.invars[k] for k in takes],
+        outvars=[eqn.outvars[k] for k in gives],
+        params={"program": program, "kind": kind._replace(linear=linear)},
+    )
+
+
+def _narrowed(program: ClosedJaxpr, gives: Sequence[int]) -> tuple[ClosedJaxpr, list[int]]:
+    """A program for some of the results, and the operands that it needs for that."""
+    jaxpr = program.jaxpr
+    names = jaxpr.debug_info.with_unknown_names()
+    code = without_dead_code(
+        jaxpr.replace(outvars=[jaxpr.outvars[k] for k in gives], debug_info=names)
+    )
+    used = {v for e in code.eqns for v in variables(e.invars)} | set(variables(code.outvars))
+    takes = [k for k, v in enumerate(code.invars) if v in used]
+    code = code.replace(invars=[code.invars[k] for k in takes], debug_info=names)
+    return ClosedJaxpr(code, program.consts), takes
+
+
+def variables(atoms: Iterable[Any]) -> list[Any]:
+    return [v for v in atoms if not isinstance(v, Literal)]
+
+
+class _Kind(NamedTuple):
+    """How many of the last operands the program is linear in, and which derivative it is."""
+
+    linear: int = 0
+    order: int = 0
+
+
+operation_p = Primitive("cfjax_operation")
+operation_p.multiple_results = True
+
+
+@operation_p.def_impl
+def _run(*operands, program, kind):
+    groups = _groups(program)
+    if len(groups) == 1 and kind.order < 2:
+        return _flattened(program, *operands)
+    jaxpr = program.jaxpr
+    env = dict(zip((*jaxpr.constvars, *jaxpr.invars), (*program.consts, *operands), strict=True))
+    # Together with the operands, so that no other operation shares what is computed from them.
+    smooth = [v for v in jaxpr.invars if _is_inexact(env[v])]
+    env.update(zip(smooth, held([env[v] for v in smooth], in_batches=True), strict=True))
+    for start, stop in groups:
+        part, taken, given = _part(jaxpr, start, stop)
+        outs = _flattened(part, *(env[v] for v in taken))
+        smooth = [k for k, x in enumerate(outs) if _is_inexact(x)]
+        if smooth and stop < len(jaxpr.eqns):
+            for k, x in zip(smooth, held([outs[k] for k in smooth], in_batches=True), strict=True):
+                outs[k] = x
+        env.update(zip(given, outs, strict=True))
+    return _results(jaxpr, env)
+
+
+def _groups(program: ClosedJaxpr) -> list[tuple[int, int]]:
+    """Pieces that are compiled together, by their ends."""
+    eqns = program.jaxpr.eqns
+    n = len(eqns)
+    if not any(e.primitive is operation_p for e in eqns) or sum(map(_length, eqns)) <= _WHOLE:
+        return [(0, n)]
+    ends, size = [0], 0
+    for k, e in enumerate(eqns):
+        more = _length(e)
+        if size and size + more > _GROUP:
+            ends.append(k)
+            size = 0
+        size += more
+    return list(itertools.pairwise([*ends, n]))
+
+
+# Nothing is differentiated any more, so rules for that are not needed either.
+_CALLS = {
+    "cfjax_operation": "program",
+    "closed_call": "call_jaxpr",
+    "custom_jvp_call": "call_jaxpr",
+    "custom_vmap_call": "call",
+    "jit": "jaxpr",
+    "pjit": "jaxpr",
+}
+
+
+def _flattened(program: ClosedJaxpr, *operands: Array) -> list[Array]:
+    """The program without calls, and with everything once that is computed alike."""
+    known: dict[Any, list[Any]] = {}
+
+    def run(program: ClosedJaxpr, operands: Sequence[Any]) -> list[Any]:
+        jaxpr = program.jaxpr
+        variables_ = (*jaxpr.constvars, *jaxpr.invars)
+        env = dict(zip(variables_, (*program.consts, *operands), strict=True))
+
+        def read(v):
+            return jnp.asarray(v.val, v.aval.dtype) if isinstance(v, Literal) else env[v]
+
+        for eqn in jaxpr.eqns:
+            name = eqn.primitive.name
+            if name in _CALLS:
+                outs = run(eqn.params[_CALLS[name]], list(map(read, eqn.invars)))
+            else:
+                keys = (
+                    (str(v.aval), repr(v.val)) if isinstance(v, Literal) else id(env[v])
+                    for v in eqn.invars
+                )
+                dropped = [isinstance(v, DropVar) for v in eqn.outvars]
+                key = eqn.primitive, *keys, *dropped, *_parameters(eqn)
+                if key not in known:
+                    values = list(map(read, eqn.invars))
+                    known[key] = values, _evaluate(jaxpr, eqn, values)
+                _, outs = known[key]
+            env.update(zip(eqn.outvars, outs, strict=True))
+        return list(map(read, jaxpr.outvars))
+
+    return run(program, operands)
+
+
+def _parameters(eqn: JaxprEqn) -> tuple[Any, ...]:
+    parameters = tuple(sorted(eqn.params.items(), key=lambda item: item[0]))
+    try:
+        hash(parameters)
+    except TypeError:
+        return (object(),)  # Equal to no other.
+    return parameters
+
+
+def evaluate(jaxpr: Jaxpr, eqn: JaxprEqn, values: Sequence[Any]) -> Sequence[Any]:
+    """The results of one operation of a program; None for those that are dropped."""
+    known = {v: x for v, x in zip(eqn.invars, values, strict=True) if not isinstance(v, Literal)}
+    # JAX's own evaluator knows how every operation is called, in every version of JAX.
+    alone = jaxpr.replace(
+        constvars=[],
+        invars=list(known),
+        outvars=[v for v in eqn.outvars if not isinstance(v, DropVar)],
+        eqns=[eqn],
+        debug_info=jaxpr.debug_info.with_unknown_names(),
+    )
+    outs = iter(jaxpr_as_fun(ClosedJaxpr(alone, []))(*known.values()))
+    return [None if isinstance(v, DropVar) else next(outs) for v in eqn.outvars]
+
+
+def _evaluate(jaxpr: Jaxpr, eqn: JaxprEqn, values: Sequence[Any]) -> Sequence[Any]:
+    # Most are of this kind, and the other way takes its time.
+    if not eqn.primitive.multiple_results and not programs(eqn):
+        return [eqn.primitive.bind(*values, **eqn.params)]
+    return evaluate(jaxpr, eqn, values)
+
+
+def programs(eqn: JaxprEqn) -> list[Jaxpr]:
+    """The programs that an operation stands for, or may run."""
+    is_program = lambda x: isinstance(x, Jaxpr | ClosedJaxpr)  # noqa: E731
+    leaves = jtu.tree_leaves(list(eqn.params.values()), is_leaf=is_program)
+    return [p if isinstance(p, Jaxpr) else p.jaxpr for p in leaves if is_program(p)]
+
+
+def _is_inexact(x: Array) -> bool:
+    return jnp.issubdtype(x.dtype, jnp.inexact)
+
+
+@operation_p.def_abstract_eval
+def _(*operands, program, kind):
+    return [v.aval for v in program.jaxpr.outvars]
+
+
+def _jvp(primals, tangents, *, program, kind):
+    outs = operation_p.bind(*primals, program=program, kind=kind)
+    moving = [
+        k
+        for k, (x, tangent) in enumerate(zip(primals, tangents, strict=True))
+        if type(tangent) is not ad.Zero and _is_inexact(x)
+    ]
+    smooth = [k for k, x in enumerate(outs) if _is_inexact(x)]
+    out_tangents: list[Any] = [ad.Zero(v.aval.to_tangent_aval()) for v in program.jaxpr.outvars]
+    if moving and smooth:
+        derivative = _tangent(program, tuple(moving), tuple(smooth))
+        moved = (tangents[k] for k in moving)
+        new = derivative.bind([*primals, *moved], kind.order + 1)
+        for k, tangent in zip(derivative.gives, new, strict=True):
+            out_tangents[k] = tangent
+    return outs, out_tangents
+
+
+@functools.lru_cache(maxsize=256)
+def _tangent(program: ClosedJaxpr, moving: Sequence[int], smooth: Sequence[int]) -> "_Linear":
+    n = len(program.jaxpr.invars)
+
+    def tangent(*values):
+        primals = values[:n]
+
+        def along(*some):
+            all_of_them = list(primals)
+            for k, x in zip(moving, some, strict=True):
+                all_of_them[k] = x
+            outs = jaxpr_as_fun(program)(*all_of_them)
+            return [outs[k] for k in smooth]
+
+        return jax.jvp(along, tuple(primals[k] for k in moving), values[n:])[1]
+
+    operands = _structs(program.jaxpr.invars)
+    made = _program(tangent, *operands, *(operands[k] for k in moving))
+    return _linear(made, n, smooth)
+
+
+def _transpose(cotangents, *operands, program, kind):
+    unknown = tuple(k for k, x in enumerate(operands) if ad.is_undefined_primal(x))
+    coming = tuple(k for k, x in enumerate(cotangents) if type(x) is not ad.Zero)
+    results: list[Any] = [None] * len(operands)
+    if coming:
+        transposed = _transposed(program, unknown, coming)
+        fixed = (x for k, x in enumerate(operands) if k not in unknown)
+        come = (cotangents[k] for k in coming)
+        new = transposed.bind([*fixed, *come], kind.order)
+        for k, x in zip(transposed.gives, new, strict=True):
+            results[k] = x
+    return results
+
+
+@functools.lru_cache(maxsize=256)
+def _transposed(program: ClosedJaxpr, linear: Sequence[int], coming: Sequence[int]) -> "_Linear":
+    structs = _structs(program.jaxpr.invars)
+    fixed = [k for k in range(len(structs)) if k not in linear]
+
+    def transposed(*values):
+        known = dict(zip(fixed, values, strict=False))
+
+        def forward(*some):
+            operands = known | dict(zip(linear, some, strict=True))
+            outs = jaxpr_as_fun(program)(*(operands[k] for k in range(len(structs))))
+            return [outs[k] for k in coming]
+
+        back = jax.linear_transpose(forward, *(structs[k] for k in linear))
+        return back(list(values[len(fixed) :]))
+
+    cotangents = _structs([program.jaxpr.outvars[k] for k in coming])
+    made = _program(transposed, *(structs[k] for k in fixed), *cotangents)
+    return _linear(made, len(fixed), linear)
+
+
+class _Linear(NamedTuple):
+    """A program that is linear in its last operands."""
+
+    program: ClosedJaxpr
+    takes: list[int]
+    linear: int
+    gives: list[int]
+
+    def bind(self, operands: Sequence[Any], order: int) -> list[Any]:
+        taken = (operands[k] for k in self.takes)
+        return operation_p.bind(*taken, program=self.program, kind=_Kind(self.linear, order))
+
+
+def _linear(program: ClosedJaxpr, first: int, places: Sequence[int]) -> _Linear:
+    """A program that is linear in its operands from `first` on, without what is always zero."""
+    jaxpr = program.jaxpr
+    reached = _reached(jaxpr, jaxpr.invars[first:])
+    outs = enumerate(jaxpr.outvars)
+    gives = [k for k, v in outs if not isinstance(v, Literal) and v in reached]
+    program, takes = _narrowed(program, gives)
+    return _Linear(program, takes, sum(k >= first for k in takes), [places[k] for k in gives])
+
+
+def _reached(jaxpr: Jaxpr, sources: Iterable[Any]) -> set[Any]:
+    """The variables whose values may depend on some of the operands."""
+    reached = set(sources)
+    for eqn in jaxpr.eqns:
+        if eqn.primitive is operation_p:
+            inner = eqn.params["program"].jaxpr
+            pairs = zip(inner.invars, eqn.invars, strict=True)
+            given = [v for v, x in pairs if not isinstance(x, Literal) and x in reached]
+            within = _reached(inner, given)
+            pairs = zip(eqn.outvars, inner.outvars, strict=True)
+            reached.update(v for v, x in pairs if not isinstance(x, Literal) and x in within)
+        elif not reached.isdisjoint(variables(eqn.invars)):
+            reached.update(eqn.outvars)
+    return reached
+
+
+def _batch(operands, dims, *, program, kind):
+    size = next(x.shape[d] for x, d in zip(operands, dims, strict=True) if d is not None)
+    fixed = len(operands) - kind.linear
+    if size <= _FEW and all(d is None for d in dims[:fixed]):
+        # As for a Jacobian: in a program for all of them single numbers meet arrays, and XLA would
+        # compute the former anew for every use.
+        moving = [k for k, d in enumerate(dims) if d is not None]
+
+        def one(some):
+            given = dict(enumerate(operands)) | dict(zip(moving, some, strict=True))
+            values = (given[k] for k in range(len(operands)))
+            return operation_p.bind(*values, program=program, kind=kind)
+
+        outs = lax.map(one, [jnp.moveaxis(operands[k], dims[k], 0) for k in moving])
+        out_dims = [0] * len(outs)
+    else:
+        batched, out_dims = _batched(program, tuple(dims), size)
+        outs = operation_p.bind(*operands, program=batched, kind=kind)
+    return outs, out_dims
+
+
+@functools.lru_cache(maxsize=256)
+def _batched(
+    program: ClosedJaxpr, dims: tuple[int | None, ...], size: int
+) -> tuple[ClosedJaxpr, list[int | None]]:
+    structs = [
+        x if d is None else jax.ShapeDtypeStruct((*x.shape[:d], size, *x.shape[d:]), x.dtype)
+        for x, d in zip(_structs(program.jaxpr.invars), dims, strict=True)
+    ]
+    jaxpr = program.jaxpr
+    moving = (v for v, d in zip(jaxpr.invars, dims, strict=True) if d is not None)
+    reached = _reached(jaxpr, moving)
+    out_dims = [0 if not isinstance(v, Literal) and v in reached else None for v in jaxpr.outvars]
+    batched = jax.vmap(jaxpr_as_fun(program), in_axes=dims, out_axes=out_dims)
+    return _program(batched, *structs), out_dims
+
+
+def _program(fun: Callable[..., Sequence[Array]], *structs: Any) -> ClosedJaxpr:
+    made = jax.make_jaxpr(fun)(*structs)
+    jaxpr = without_dead_code(made.jaxpr)
+    # What is known before the program runs.
+    return ClosedJaxpr(jaxpr, made.consts)
+
+
+def _structs(atoms: Sequence[Any]) -> list[jax.ShapeDtypeStruct]:
+    return [jax.ShapeDtypeStruct(v.aval.shape, v.aval.dtype) for v in atoms]
+
+
+ad.primitive_jvps[operation_p] = _jvp
+ad.primitive_transposes[operation_p] = _transpose
+batching.primitive_batchers[operation_p] = _batch
+mlir.register_lowering(operation_p, mlir.lower_fun(_run, multiple_results=True))
