@@ -2,7 +2,9 @@
 
 A derivative of a program of scalars has several times its operations, and a second derivative
 several times more. Each of them becomes a program of its own here, so that when it is compiled its
-length is known, and it goes through memory at as many places as that length needs.
+length is known. A long program is a sequence of pieces, between which few values are on their way,
+and its derivatives are sequences of derivatives of the pieces. What is too long for one of XLA's
+functions is compiled as several, with these values sent through memory.
 """
 
 import functools
@@ -129,10 +131,12 @@ def _part(jaxpr: Jaxpr, start: int, stop: int) -> tuple[ClosedJaxpr, list[Any], 
 
 
 def _results(jaxpr: Jaxpr, env: dict[Any, Any]) -> list[Any]:
-    return [
-        jnp.asarray(v.val, v.aval.dtype) if isinstance(v, Literal) else env[v]
-        for v in jaxpr.outvars
-    ]
+    return [_read(v, env) for v in jaxpr.outvars]
+
+
+def _read(v: Any, env: dict[Any, Any]) -> Any:
+    aval: Any = v.aval
+    return jnp.asarray(v.val, aval.dtype) if isinstance(v, Literal) else env[v]
 
 
 def without_dead_code(jaxpr: Jaxpr) -> Jaxpr:
@@ -239,20 +243,17 @@ _CALLS = {
 
 def _flattened(program: ClosedJaxpr, *operands: Array) -> list[Array]:
     """The program without calls, and with everything once that is computed alike."""
-    known: dict[Any, list[Any]] = {}
+    # With the operands, so that none of them is forgotten and its identity used again.
+    known: dict[Any, tuple[list[Any], Sequence[Any]]] = {}
 
     def run(program: ClosedJaxpr, operands: Sequence[Any]) -> list[Any]:
         jaxpr = program.jaxpr
-        variables_ = (*jaxpr.constvars, *jaxpr.invars)
-        env = dict(zip(variables_, (*program.consts, *operands), strict=True))
-
-        def read(v):
-            return jnp.asarray(v.val, v.aval.dtype) if isinstance(v, Literal) else env[v]
-
+        names = *jaxpr.constvars, *jaxpr.invars
+        env = dict(zip(names, (*program.consts, *operands), strict=True))
         for eqn in jaxpr.eqns:
             name = eqn.primitive.name
             if name in _CALLS:
-                outs = run(eqn.params[_CALLS[name]], list(map(read, eqn.invars)))
+                outs = run(eqn.params[_CALLS[name]], [_read(v, env) for v in eqn.invars])
             else:
                 keys = (
                     (str(v.aval), repr(v.val)) if isinstance(v, Literal) else id(env[v])
@@ -261,11 +262,11 @@ def _flattened(program: ClosedJaxpr, *operands: Array) -> list[Array]:
                 dropped = [isinstance(v, DropVar) for v in eqn.outvars]
                 key = eqn.primitive, *keys, *dropped, *_parameters(eqn)
                 if key not in known:
-                    values = list(map(read, eqn.invars))
+                    values = [_read(v, env) for v in eqn.invars]
                     known[key] = values, _evaluate(jaxpr, eqn, values)
                 _, outs = known[key]
             env.update(zip(eqn.outvars, outs, strict=True))
-        return list(map(read, jaxpr.outvars))
+        return _results(jaxpr, env)
 
     return run(program, operands)
 
@@ -469,9 +470,7 @@ def _batched(
 
 def _program(fun: Callable[..., Sequence[Array]], *structs: Any) -> ClosedJaxpr:
     made = jax.make_jaxpr(fun)(*structs)
-    jaxpr = without_dead_code(made.jaxpr)
-    # What is known before the program runs.
-    return ClosedJaxpr(jaxpr, made.consts)
+    return ClosedJaxpr(without_dead_code(made.jaxpr), made.consts)
 
 
 def _structs(atoms: Sequence[Any]) -> list[jax.ShapeDtypeStruct]:
