@@ -33,10 +33,11 @@ from jaxtyping import Array
 from .held import held
 from .pack import pack_p, unpack_p
 
-# Into one function XLA on CPU puts some 2000 operations, not counted twice where they are the same,
-# and less if there are many results. What two of its functions need, both compute: in long programs
-# exponentially often.
-_WHOLE = 3000
+# What two of its functions need, XLA computes in both, and into one it puts some 2000 operations.
+# In long programs it then computes single ones exponentially often: in values never as measured, in
+# first derivatives from some 8000 operations on, counted as they are written, and in second ones
+# earlier. Those are compiled as several, though to send what they share through memory takes time.
+_WHOLE = math.inf, 6000, 3000
 _GROUP = 1500
 # A second derivative has up to five times the operations, and should fit.
 _PIECE = 500
@@ -195,7 +196,8 @@ operation_p.multiple_results = True
 
 @operation_p.def_impl
 def _run(*operands, program, kind):
-    groups = _groups(program)
+    groups = _groups(program, _WHOLE[min(kind.order, 2)])
+    # Of a second derivative there are several in one loop.
     if len(groups) == 1 and kind.order < 2:
         return _flattened(program, *operands)
     jaxpr = program.jaxpr
@@ -214,11 +216,11 @@ def _run(*operands, program, kind):
     return _results(jaxpr, env)
 
 
-def _groups(program: ClosedJaxpr) -> list[tuple[int, int]]:
+def _groups(program: ClosedJaxpr, most: int | float) -> list[tuple[int, int]]:
     """Pieces that are compiled together, by their ends."""
     eqns = program.jaxpr.eqns
     n = len(eqns)
-    if not any(e.primitive is operation_p for e in eqns) or sum(map(_length, eqns)) <= _WHOLE:
+    if not any(e.primitive is operation_p for e in eqns) or sum(map(_length, eqns)) <= most:
         return [(0, n)]
     ends, size = [0], 0
     for k, e in enumerate(eqns):

@@ -39,7 +39,7 @@ def lengths(request, monkeypatch):
     """Compiled as they are, and in pieces."""
     if request.param == "several":
         monkeypatch.setattr(module, "_PIECE", 12)
-        monkeypatch.setattr(module, "_WHOLE", 0)
+        monkeypatch.setattr(module, "_WHOLE", (0, 0, 0))
         monkeypatch.setattr(module, "_GROUP", 30)
 
 
