@@ -60,6 +60,7 @@ def integrate(
     acts on, if a time is NaN, or if the solver reports a failure.
     """
     check_term_and_solver(term, solver)
+    check_own_tolerances(solver)
     y0 = as_state(y0)
     solver = without_estimate(solver)
     num_steps = count("num_steps", num_steps)
@@ -206,6 +207,10 @@ def check_term_and_solver(term: Any, solver: Any) -> None:
             f"{type(solver).__name__} takes a term of the form {solver.term_structure}, got "
             f"{eqx.tree_pformat(term)}."
         )
+
+
+def check_own_tolerances(solver: Any) -> None:
+    """An implicit solver cannot have those of a step size controller where there is none."""
     if isinstance(solver, diffrax.AbstractImplicitSolver):
         finder = solver.root_finder
         # By default a marker: they are to be those of the step size controller.

@@ -22,6 +22,7 @@ from ._flops import count_flops
 from ._frozen_field import AbstractAlgebraElement, bracket, combine, flow, is_field, tangent
 from ._integrate import (
     as_state,
+    check_own_tolerances,
     check_term_and_solver,
     count,
     equal_steps,
@@ -242,7 +243,8 @@ def work_precision(
     traced, with its name added.
     """
     settings = _checked_settings(num_steps, tolerances)
-    solvers = _checked_methods(methods, term)
+    is_adaptive = tolerances is not None
+    solvers = _checked_methods(methods, term, is_adaptive)
     repeats, max_steps = count("repeats", repeats), count("max_steps", max_steps)
     if not isinstance(budget, int | float | np.number) or not budget > 0:
         raise ValueError(f"budget must be a positive number of seconds, got {budget!r}.")
@@ -251,7 +253,6 @@ def work_precision(
             raise TypeError(f"{name} must be a function, got {function!r}.")
     y0 = as_state(y0)
     _check_reference(reference, y0)
-    is_adaptive = tolerances is not None
     dtype = time_dtype(y0)
     t0, t1 = time_scalar("t0", t0, dtype), time_scalar("t1", t1, dtype)
     if dt0 is None:
@@ -578,7 +579,9 @@ def _checked_settings(num_steps: Any, tolerances: Any) -> list[Any]:
     return [float(x) for x in settings]
 
 
-def _checked_methods(methods: Any, term: PyTree) -> dict[str, tuple[PyTree, Any]]:
+def _checked_methods(
+    methods: Any, term: PyTree, is_adaptive: bool
+) -> dict[str, tuple[PyTree, Any]]:
     """A term and a solver for each name."""
     if not isinstance(methods, Mapping) or not all(isinstance(name, str) for name in methods):
         raise TypeError(f"methods must be a dict of solvers by name, got {methods!r}.")
@@ -590,6 +593,8 @@ def _checked_methods(methods: Any, term: PyTree) -> dict[str, tuple[PyTree, Any]
         found[name] = method if is_pair else (term, method)
         with _about(name):
             check_term_and_solver(*found[name])
+            if not is_adaptive:
+                check_own_tolerances(found[name][1])
     return found
 
 

@@ -537,3 +537,21 @@ def test_a_mistake_names_its_method():
             num_steps=[2],
         )
     assert info.value.__notes__[-1] == "This is about methods['wrong']."
+
+
+def test_an_implicit_solver_takes_the_tolerances_that_there_are():
+    def measure(**settings):
+        return cfjax.work_precision(
+            diffrax.ODETerm(lambda t, y, args: -y),
+            0.0,
+            1.0,
+            jnp.ones(2),
+            methods={"implicit": diffrax.Kvaerno3()},
+            reference=np.full(2, np.exp(-1.0)),
+            **settings,
+            **QUICK,
+        )
+
+    assert measure(tolerances=[1e-6]).error[0] < 1e-5
+    with pytest.raises(ValueError, match="solver must have tolerances of its own"):
+        measure(num_steps=[8])
