@@ -19,11 +19,18 @@ import numpy as np
 from jax import lax
 from jax.core import Tracer
 from jax.custom_batching import custom_vmap
-from jax.extend.core import ClosedJaxpr, Jaxpr, JaxprEqn, Literal, jaxpr_as_fun
+from jax.extend.core import (
+    ClosedJaxpr,
+    Jaxpr,
+    JaxprEqn,
+    Literal,
+    jaxpr_as_fun,
+    jaxprs_in_params,
+)
 from jaxtyping import Array, PyTree
 
 from ._functions.held import held, held_p
-from ._functions.operation import evaluate, operation, programs, variables, without_dead_code
+from ._functions.operation import evaluate, operation, variables, without_dead_code
 from ._functions.pack import pack, pack_p, unpack, unpack_p
 
 # Larger arrays fuse well as they are, and the program grows with the number of components. With
@@ -36,7 +43,8 @@ _MAX_PRODUCT = 36
 # one function XLA on CPU puts at most 2000 operations. Beyond, and wherever entries of one array
 # are used apart, it computes anew what two later results share: in long programs exponentially
 # often. Its operations are some 1.7 times ours, and a derivative has three or four times as many.
-_MAX_OPERATIONS = 500, 850
+# A step of CF4 for one vector, with its estimate, has 512 and is better whole.
+_MAX_OPERATIONS = 550, 850
 # Every so many cuts there is one for values too; the others are for derivatives alone.
 _CUTS_OF_VALUES = 2
 
@@ -133,7 +141,7 @@ def by_components(fun: Callable[[PyTree], PyTree], y: PyTree, *, has_extra: bool
     # The derivative of an adaptive loop computes a step at one place and uses its derivative at
     # another. What that needs of the step is many scalars: to compute them again is cheaper than to
     # send them there through memory.
-    out = as_operation(step, y, parameters) if _is_split(y) and is_plain else step(y, parameters)
+    out = operation(step, y, parameters) if _is_split(y) and is_plain else step(y, parameters)
     # What is known before the program runs may come out as NumPy's.
     out = jtu.tree_map(jnp.asarray, out)
     # One by one: what nobody uses is not computed.
@@ -200,24 +208,9 @@ def _is_straight(jaxpr: Jaxpr) -> bool:
 def _has_jvp(jaxpr: Jaxpr) -> bool:
     """Whether no function in it has a rule for reverse mode alone."""
     return all(
-        "custom_vjp" not in eqn.primitive.name and all(map(_has_jvp, programs(eqn)))
+        "custom_vjp" not in eqn.primitive.name and all(map(_has_jvp, jaxprs_in_params(eqn.params)))
         for eqn in jaxpr.eqns
     )
-
-
-def as_operation(fun: Callable[..., PyTree], *args: PyTree) -> PyTree:
-    """`fun(*args)` as one operation."""
-    leaves, structure = jtu.tree_flatten(args)
-    out_structure: Any = None
-
-    def of_leaves(*leaves):
-        nonlocal out_structure
-        out = jtu.tree_map(jnp.asarray, fun(*jtu.tree_unflatten(structure, leaves)))
-        out, out_structure = jtu.tree_flatten(out)
-        return out
-
-    outs = operation(of_leaves, *map(jnp.asarray, leaves))
-    return jtu.tree_unflatten(out_structure, outs)
 
 
 class _Rules(NamedTuple):

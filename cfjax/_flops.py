@@ -12,8 +12,10 @@ import jax
 import jax.numpy as jnp
 import jax.tree_util as jtu
 import numpy as np
-from jax.extend.core import ClosedJaxpr, Jaxpr, JaxprEqn, Literal
+from jax.extend.core import ClosedJaxpr, Jaxpr, JaxprEqn, Literal, jaxprs_in_params
 from jaxtyping import PyTree
+
+from ._functions.operation import parameters
 
 
 def count_flops(fun: Callable[..., PyTree], *args: PyTree) -> int:
@@ -80,14 +82,9 @@ def _count(jaxpr: Jaxpr | ClosedJaxpr, arguments: Sequence[Any] | None = None) -
 
 def _has_branches(jaxpr: Jaxpr | ClosedJaxpr) -> bool:
     return any(
-        eqn.primitive.name == "cond" or any(map(_has_branches, _programs(eqn)))
+        eqn.primitive.name == "cond" or any(map(_has_branches, jaxprs_in_params(eqn.params)))
         for eqn in _open(jaxpr).eqns
     )
-
-
-def _programs(eqn: JaxprEqn) -> list[Any]:
-    is_program = lambda x: isinstance(x, Jaxpr | ClosedJaxpr)  # noqa: E731
-    return [p for p in jtu.tree_leaves(list(eqn.params.values()), is_program) if is_program(p)]
 
 
 def _flatten(
@@ -117,7 +114,7 @@ def _flatten(
         operands = [name(v) for v in eqn.invars]
         results = _inlined(eqn, operands, program)
         if results is None:
-            key = (eqn.primitive, tuple(operands), _parameters(eqn))
+            key = (eqn.primitive, tuple(operands), parameters(eqn))
             if key not in program.operations:
                 results = [object() for _ in eqn.outvars]
                 program.operations[key] = _Operation(_cost(eqn), operands, results)
@@ -193,15 +190,6 @@ def _evaluate(eqn: JaxprEqn, operands: Sequence[Hashable], program: _Program) ->
 
 def _open(jaxpr: Jaxpr | ClosedJaxpr) -> Jaxpr:
     return jaxpr.jaxpr if isinstance(jaxpr, ClosedJaxpr) else jaxpr
-
-
-def _parameters(eqn: JaxprEqn) -> Hashable:
-    parameters = tuple(sorted(eqn.params.items(), key=lambda item: item[0]))
-    try:
-        hash(parameters)
-    except TypeError:
-        return object()  # Equal to no other, so such operations are never merged.
-    return parameters
 
 
 def _cost(eqn: JaxprEqn) -> int:

@@ -10,7 +10,8 @@ import jax.tree_util as jtu
 from jax import lax
 from jaxtyping import Array, Int, PyTree
 
-from ._components import as_operation, has_few, join, split, trace
+from ._components import has_few, join, split, trace
+from ._functions.operation import operation
 from ._functions.pack import pack, unpack
 
 # Beyond, the derivative gains less than copying them costs.
@@ -124,7 +125,7 @@ def _scan(
         vector, rest = carry
         entries = [] if vector is None else unpack(vector)
         if is_plain and not any(map(jnp.ndim, leaves)):
-            return as_operation(step, entries, rest, known, others), None
+            return operation(step, entries, rest, known, others), None
         return jax.checkpoint(step)(entries, rest, known, others), None
 
     vector = pack([*numbers, *known]) if numbers else None

@@ -10,7 +10,7 @@ functions is compiled as several, with these values sent through memory.
 import functools
 import itertools
 import math
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Callable, Hashable, Iterable, Sequence
 from typing import Any, NamedTuple
 
 import jax
@@ -26,9 +26,10 @@ from jax.extend.core import (
     Literal,
     Primitive,
     jaxpr_as_fun,
+    jaxprs_in_params,
 )
 from jax.interpreters import ad, batching, mlir
-from jaxtyping import Array
+from jaxtyping import Array, PyTree
 
 from .held import held
 from .pack import pack_p, unpack_p
@@ -49,25 +50,35 @@ _FREE = frozenset(
 )
 
 
-def operation(fun: Callable[..., Sequence[Array]], *operands: Array) -> list[Array]:
-    """`fun(*operands)`, as one operation.
+def operation(fun: Callable[..., PyTree], *args: PyTree) -> PyTree:
+    """`fun(*args)`, as one operation.
 
-    `fun` may close over traced values, and has no effects. Reverse mode keeps the operands and
+    `fun` may close over traced values, and has no effects. Reverse mode keeps the arguments and
     computes everything again, as with `jax.checkpoint`.
     """
-    program = jax.make_jaxpr(fun)(*operands)
-    jaxpr = without_dead_code(program.jaxpr)
+    leaves, structure = jtu.tree_flatten(args)
+    leaves = list(map(jnp.asarray, leaves))
+    out_structure: Any = None
+
+    def of_leaves(*leaves):
+        nonlocal out_structure
+        out = fun(*jtu.tree_unflatten(structure, leaves))
+        out, out_structure = jtu.tree_flatten(jtu.tree_map(jnp.asarray, out))
+        return out
+
+    made = jax.make_jaxpr(of_leaves)(*leaves)
+    jaxpr = without_dead_code(made.jaxpr)
     code = jaxpr.replace(
         constvars=[],
         invars=[*jaxpr.constvars, *jaxpr.invars],
         debug_info=jaxpr.debug_info.with_unknown_names(),
     )
-    operands = *program.consts, *operands
     program = ClosedJaxpr(code, [])
     ends = _places(code)
     if len(ends) > 2:
         program = _program(functools.partial(_in_pieces, program, ends), *_structs(code.invars))
-    return operation_p.bind(*operands, program=program, kind=_Kind())
+    outs = operation_p.bind(*made.consts, *leaves, program=program, kind=_Kind())
+    return jtu.tree_unflatten(out_structure, outs)
 
 
 def _places(jaxpr: Jaxpr) -> list[int]:
@@ -100,7 +111,7 @@ def _places(jaxpr: Jaxpr) -> list[int]:
 def _length(eqn: JaxprEqn) -> int:
     """How many operations on numbers or whole arrays."""
     if eqn.primitive.name in _CALLS:
-        return sum(_length(inner) for program in programs(eqn)[:1] for inner in program.eqns)
+        return sum(map(_length, eqn.params[_CALLS[eqn.primitive.name]].eqns))
     return 0 if eqn.primitive.name in _FREE or eqn.primitive in (pack_p, unpack_p) else 1
 
 
@@ -262,7 +273,7 @@ def _flattened(program: ClosedJaxpr, *operands: Array) -> list[Array]:
                     for v in eqn.invars
                 )
                 dropped = [isinstance(v, DropVar) for v in eqn.outvars]
-                key = eqn.primitive, *keys, *dropped, *_parameters(eqn)
+                key = eqn.primitive, *keys, *dropped, parameters(eqn)
                 if key not in known:
                     values = [_read(v, env) for v in eqn.invars]
                     known[key] = values, _evaluate(jaxpr, eqn, values)
@@ -273,13 +284,14 @@ def _flattened(program: ClosedJaxpr, *operands: Array) -> list[Array]:
     return run(program, operands)
 
 
-def _parameters(eqn: JaxprEqn) -> tuple[Any, ...]:
-    parameters = tuple(sorted(eqn.params.items(), key=lambda item: item[0]))
+def parameters(eqn: JaxprEqn) -> Hashable:
+    """What tells the operation from others on the same operands."""
+    values = tuple(sorted(eqn.params.items(), key=lambda item: item[0]))
     try:
-        hash(parameters)
+        hash(values)
     except TypeError:
-        return (object(),)  # Equal to no other.
-    return parameters
+        return object()  # Equal to no other, so such operations are never merged.
+    return values
 
 
 def evaluate(jaxpr: Jaxpr, eqn: JaxprEqn, values: Sequence[Any]) -> Sequence[Any]:
@@ -299,16 +311,9 @@ def evaluate(jaxpr: Jaxpr, eqn: JaxprEqn, values: Sequence[Any]) -> Sequence[Any
 
 def _evaluate(jaxpr: Jaxpr, eqn: JaxprEqn, values: Sequence[Any]) -> Sequence[Any]:
     # Most are of this kind, and the other way takes its time.
-    if not eqn.primitive.multiple_results and not programs(eqn):
+    if not eqn.primitive.multiple_results and not any(jaxprs_in_params(eqn.params)):
         return [eqn.primitive.bind(*values, **eqn.params)]
     return evaluate(jaxpr, eqn, values)
-
-
-def programs(eqn: JaxprEqn) -> list[Jaxpr]:
-    """The programs that an operation stands for, or may run."""
-    is_program = lambda x: isinstance(x, Jaxpr | ClosedJaxpr)  # noqa: E731
-    leaves = jtu.tree_leaves(list(eqn.params.values()), is_leaf=is_program)
-    return [p if isinstance(p, Jaxpr) else p.jaxpr for p in leaves if is_program(p)]
 
 
 def _is_inexact(x: Array) -> bool:
