@@ -23,8 +23,9 @@ from rich.console import Console
 from rich.table import Table
 
 import cfjax
-from cfjax import _batch, _report
-from cfjax._work_precision import take_turns
+from cfjax._integrate import batch as _batch
+from cfjax._measure import style as _style
+from cfjax._measure.work_precision import take_turns
 from cfjax.scenes import rigid_body
 
 STEPS, END = 100, 10.0
@@ -192,7 +193,7 @@ def _add_row(table: Table, first: str, name: str, times: np.ndarray, program: Pr
 
 
 def _chart(found: dict[str, dict[int, np.ndarray]], device: str) -> matplotlib.figure.Figure:
-    figure = _report.new_figure(
+    figure = _style.new_figure(
         (6.5, 4.2),
         f"The rigid body, {STEPS} steps of CF4 a trajectory, in float64 on {device}. Median of "
         "runs in turns; bars reach from the lower to the upper quartile. Without compilation.",
@@ -205,8 +206,8 @@ def _chart(found: dict[str, dict[int, np.ndarray]], device: str) -> matplotlib.f
         axes.errorbar(list(rows), rates[:, 1], spread, label=name, capsize=2, markersize=5, **style)
     axes.set(ylabel="trajectories per second", ylim=(0, None))
     axes.yaxis.set_major_formatter(EngFormatter())
-    _report.logarithmic(axes, "members of the batch")
-    _report.finish(figure, columns=2)
+    _style.logarithmic(axes, "members of the batch")
+    _style.finish(figure, columns=2)
     return figure
 
 

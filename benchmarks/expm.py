@@ -20,8 +20,8 @@ from rich.console import Console
 from rich.table import Table
 
 import cfjax
-from cfjax._functions.expm import expm
-from cfjax._functions.rotate import rotate
+from cfjax._numerics.expm import expm
+from cfjax._numerics.rotate import rotate
 
 SIZES = (3, 8, 32)
 BATCHES = (1, 100, 1000)

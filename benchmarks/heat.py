@@ -19,7 +19,7 @@ from rich.console import Console
 from rich.table import Table
 
 import cfjax
-from cfjax._work_precision import take_turns
+from cfjax._measure.work_precision import take_turns
 from cfjax.scenes import heat
 
 SIZES = (100, 1000, 10_000)

@@ -22,7 +22,7 @@ from rich.console import Console
 from rich.table import Table
 
 import cfjax
-from cfjax._work_precision import take_turns
+from cfjax._measure.work_precision import take_turns
 from cfjax.scenes import rigid_body
 
 STEP = 0.1

@@ -24,7 +24,7 @@ from rich.table import Table
 from scipy.integrate import solve_ivp
 
 import cfjax
-from cfjax._work_precision import take_turns
+from cfjax._measure.work_precision import take_turns
 from cfjax.scenes import rigid_body
 
 END = 10.0

@@ -1,37 +1,41 @@
 """Commutator-free Lie group integrators for JAX."""
 
+import importlib
+from typing import TYPE_CHECKING, Any
+
 from . import _signals
 
 if _signals.is_command():
     # Before the imports below, which take seconds.
     _signals.end_the_command()
 
-from . import scenes as scenes
-from ._batch import BatchResult as BatchResult
-from ._batch import map_batch as map_batch
-from ._error_control import ErrorNorm as ErrorNorm
-from ._error_control import starting_step as starting_step
+from ._field import AbstractAlgebraElement as AbstractAlgebraElement
+from ._field import AbstractFrozenField as AbstractFrozenField
+from ._field import bracket as bracket
+from ._field import combine as combine
+from ._field import flow as flow
+from ._field import tangent as tangent
 from ._fields.affine import Affine as Affine
 from ._fields.low_rank import BorderedSkew as BorderedSkew
 from ._fields.low_rank import LowRankSkew as LowRankSkew
 from ._fields.matrix import LeftMatrix as LeftMatrix
 from ._fields.matrix import RightMatrix as RightMatrix
 from ._fields.rotation import Rotation as Rotation
-from ._frozen_field import AbstractAlgebraElement as AbstractAlgebraElement
-from ._frozen_field import AbstractFrozenField as AbstractFrozenField
-from ._frozen_field import bracket as bracket
-from ._frozen_field import combine as combine
-from ._frozen_field import flow as flow
-from ._frozen_field import tangent as tangent
-from ._functions.transforms import AbstractTransform as AbstractTransform
-from ._functions.transforms import CosineTransform as CosineTransform
-from ._functions.transforms import FourierTransform as FourierTransform
-from ._functions.transforms import RealFourierTransform as RealFourierTransform
-from ._functions.transforms import SineTransform as SineTransform
-from ._functions.transforms import TensorTransform as TensorTransform
-from ._integrate import integrate as integrate
-from ._order_conditions import error_constant as error_constant
-from ._order_conditions import order as order
+from ._integrate.batch import BatchResult as BatchResult
+from ._integrate.batch import map_batch as map_batch
+from ._integrate.integrate import integrate as integrate
+from ._methods.order_conditions import error_constant as error_constant
+from ._methods.order_conditions import order as order
+from ._methods.stability import stability_function as stability_function
+from ._methods.tableau import Tableau as Tableau
+from ._methods.tableau import third_order_a as third_order_a
+from ._methods.tableau import third_order_b as third_order_b
+from ._numerics.transforms import AbstractTransform as AbstractTransform
+from ._numerics.transforms import CosineTransform as CosineTransform
+from ._numerics.transforms import FourierTransform as FourierTransform
+from ._numerics.transforms import RealFourierTransform as RealFourierTransform
+from ._numerics.transforms import SineTransform as SineTransform
+from ._numerics.transforms import TensorTransform as TensorTransform
 from ._solvers.commutator_free import CF2 as CF2
 from ._solvers.commutator_free import CF3 as CF3
 from ._solvers.commutator_free import CF4 as CF4
@@ -42,6 +46,8 @@ from ._solvers.commutator_free import CG4 as CG4
 from ._solvers.commutator_free import CG5 as CG5
 from ._solvers.commutator_free import CommutatorFree as CommutatorFree
 from ._solvers.commutator_free import LieEuler as LieEuler
+from ._solvers.error_control import ErrorNorm as ErrorNorm
+from ._solvers.error_control import starting_step as starting_step
 from ._solvers.low_storage import BWRRK33 as BWRRK33
 from ._solvers.low_storage import BWRRK53 as BWRRK53
 from ._solvers.low_storage import CFEES25 as CFEES25
@@ -56,12 +62,31 @@ from ._solvers.munthe_kaas import RKMK3 as RKMK3
 from ._solvers.munthe_kaas import RKMK4 as RKMK4
 from ._solvers.retraction import CayleyRK4 as CayleyRK4
 from ._solvers.richardson import Richardson as Richardson
-from ._stability import stability_function as stability_function
-from ._tableau import Tableau as Tableau
-from ._tableau import third_order_a as third_order_a
-from ._tableau import third_order_b as third_order_b
 from ._term import LieTerm as LieTerm
-from ._work_precision import WorkPrecision as WorkPrecision
-from ._work_precision import work_precision as work_precision
+
+if TYPE_CHECKING:
+    from . import scenes as scenes
+    from ._measure.work_precision import WorkPrecision as WorkPrecision
+    from ._measure.work_precision import work_precision as work_precision
 
 __version__ = "0.1.0"
+
+# What measures, and the problems to measure on: nobody who solves should wait for their import.
+_LATER = {
+    "WorkPrecision": "._measure.work_precision",
+    "scenes": ".scenes",
+    "work_precision": "._measure.work_precision",
+}
+
+
+def __getattr__(name: str) -> Any:
+    if name not in _LATER:
+        raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
+    module = importlib.import_module(_LATER[name], __name__)
+    value = module if name == "scenes" else getattr(module, name)
+    globals()[name] = value
+    return value
+
+
+def __dir__() -> list[str]:
+    return sorted(globals().keys() | _LATER.keys())

@@ -11,7 +11,7 @@ from typing import NoReturn
 import jax
 
 from . import scenes
-from ._extra import paper_extra
+from ._measure.extra import paper_extra
 
 # A scene may have several charts: `scenes.stiefel.chart_first` is that of stiefel_first.
 _SCENES = {
@@ -77,7 +77,8 @@ def main(argv: Sequence[str] | None = None) -> int:
     command = {"paper": paper, "chart": chart}[arguments.command]
     try:
         with paper_extra():
-            from . import _paper, _report
+            from . import _paper
+            from ._measure import report as _report
     except ModuleNotFoundError as error:
         command.error(str(error))
     jax.config.update("jax_enable_x64", True)

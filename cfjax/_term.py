@@ -11,7 +11,7 @@ import jax.tree_util as jtu
 import numpy as np
 from jaxtyping import Array, PyTree, Real
 
-from ._frozen_field import combine, describe, is_field, struct, tangent
+from ._field import combine, describe, is_field, struct, tangent
 
 _ARRAY_TYPES = jax.Array | np.ndarray | np.generic | int | float | complex
 

@@ -9,8 +9,9 @@ import sys
 import pytest
 from rich.progress import Progress
 
-from cfjax import __main__, _report, scenes
+from cfjax import __main__, scenes
 from cfjax.__main__ import main
+from cfjax._measure import report as _report
 
 
 @pytest.fixture
@@ -205,7 +206,8 @@ def test_files_are_written_whole_or_not_at_all(start, tmp_path):
     code = """
 import sys, time
 from pathlib import Path
-from cfjax import _report, _signals
+from cfjax import _signals
+from cfjax._measure import report as _report
 
 class Figure:
     def savefig(self, path, dpi):

@@ -48,8 +48,10 @@ PROMISED = [
 SOLVERS = [*PROMISED[PROMISED.index("LieEuler") : PROMISED.index("RKMK")], "CayleyRK4"]
 PUBLIC = [
     name
-    for name, value in vars(cfjax).items()
-    if not name.startswith("_") and not inspect.ismodule(value)
+    for name in dir(cfjax)
+    if not name.startswith("_")
+    and name not in ("Any", "TYPE_CHECKING")
+    and not inspect.ismodule(getattr(cfjax, name))
 ]
 
 

@@ -9,9 +9,9 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Inexact
 
-from .._frozen_field import AbstractAlgebraElement, Weight, combine, describe, struct
-from .._functions.phi import phi_1
-from .._functions.transforms import DTYPES, AbstractTransform, TensorTransform
+from .._field import AbstractAlgebraElement, Weight, combine, describe, struct
+from .._numerics.phi import phi_1
+from .._numerics.transforms import DTYPES, AbstractTransform, TensorTransform
 
 
 class Affine(AbstractAlgebraElement):

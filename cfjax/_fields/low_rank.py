@@ -10,9 +10,9 @@ import numpy as np
 from jax import lax
 from jaxtyping import Array, Float
 
-from .._frozen_field import AbstractAlgebraElement, AbstractFrozenField, Weight, combine
-from .._functions.expm_action import phi_1_action
-from .._functions.matmul import matmul
+from .._field import AbstractAlgebraElement, AbstractFrozenField, Weight, combine
+from .._numerics.expm_action import phi_1_action
+from .._numerics.matmul import matmul
 
 
 class AbstractSkew(AbstractFrozenField):

@@ -8,10 +8,10 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Inexact
 
-from .._frozen_field import AbstractAlgebraElement
-from .._functions.expm import expm_parts, one_norm
-from .._functions.expm_times import expm_minus_one_times
-from .._functions.matmul import matmul
+from .._field import AbstractAlgebraElement
+from .._numerics.expm import expm_parts, one_norm
+from .._numerics.expm_times import expm_minus_one_times
+from .._numerics.matmul import matmul
 
 
 class LeftMatrix(AbstractAlgebraElement):

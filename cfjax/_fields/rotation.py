@@ -6,8 +6,8 @@ import equinox as eqx
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
-from .._frozen_field import AbstractAlgebraElement
-from .._functions.rotate import cross, displacement, rotate
+from .._field import AbstractAlgebraElement
+from .._numerics.rotate import cross, displacement, rotate
 
 
 class Rotation(AbstractAlgebraElement):

@@ -8,7 +8,7 @@ from collections.abc import Callable, Sequence
 
 from rich.progress import Progress
 
-from .._report import Report
+from .._measure.report import Report
 from . import complexity, heat, rigid_body, stiefel
 
 EXPERIMENTS: Sequence[Callable[[Progress], Report]] = (

@@ -8,12 +8,9 @@ import jax.numpy as jnp
 from rich.progress import Progress
 from rich.table import Table
 
-from .._frozen_field import AbstractAlgebraElement
-from .._integrate import without_estimate
-from .._report import Report
-from .._solvers.commutator_free import CF3, CF4, CG3, CG4, CG5
-from .._solvers.munthe_kaas import RKMK, RKMK3, RKMK4
-from .._term import LieTerm
+from .. import CF3, CF4, CG3, CG4, CG5, RKMK, RKMK3, RKMK4, AbstractAlgebraElement, LieTerm
+from .._integrate.integrate import without_estimate
+from .._measure.report import Report
 
 # Exponentials and commutators for each order as printed. The paper's 45 is an estimate.
 PRINTED = {"RKMK": {3: (3, 1), 4: (4, 2), 5: (6, 12)}, "C-G": {3: (6, 0), 4: (15, 0), 5: (45, 0)}}

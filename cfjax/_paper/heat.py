@@ -17,11 +17,9 @@ from matplotlib.figure import Figure
 from rich.progress import Progress
 from rich.table import Table
 
-from .._report import STYLES, Report, finish, new_figure
-from .._solvers.commutator_free import CF4
-from .._solvers.munthe_kaas import RKMK4
-from .._solvers.richardson import Richardson
-from .._term import LieTerm
+from .. import CF4, RKMK4, LieTerm, Richardson
+from .._measure.report import Report
+from .._measure.style import STYLES, finish, new_figure
 from ..scenes import heat
 
 TOLERANCES = tuple(10.0**-k for k in range(2, 8))

@@ -15,13 +15,11 @@ from matplotlib.figure import Figure
 from rich.progress import Progress
 from rich.table import Table
 
-from .._flops import count_flops
-from .._integrate import integrate, without_estimate
-from .._report import STYLES, Report, finish, new_figure, number
-from .._solvers.commutator_free import CF3, CF4
-from .._solvers.munthe_kaas import RKMK, RKMK3, RKMK4
-from .._term import LieTerm
-from .._work_precision import WorkPrecision, work_precision
+from .. import CF3, CF4, RKMK, RKMK3, RKMK4, LieTerm, WorkPrecision, integrate, work_precision
+from .._integrate.integrate import without_estimate
+from .._measure.flops import count_flops
+from .._measure.report import Report
+from .._measure.style import STYLES, finish, new_figure, number
 from ..scenes import rigid_body
 
 METHODS: dict[str, diffrax.AbstractSolver] = {

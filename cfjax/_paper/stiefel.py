@@ -17,14 +17,11 @@ from matplotlib.ticker import LogLocator, NullLocator
 from rich.progress import Progress
 from rich.table import Table
 
-from .._flops import count_flops
-from .._frozen_field import combine
-from .._report import STYLES, Report, finish, new_figure
-from .._solvers.commutator_free import CF4
-from .._solvers.munthe_kaas import RKMK4, AbstractMuntheKaas
-from .._solvers.retraction import CayleyRK4
-from .._term import LieTerm
-from .._work_precision import WorkPrecision, work_precision
+from .. import CF4, RKMK4, CayleyRK4, LieTerm, WorkPrecision, combine, work_precision
+from .._measure.flops import count_flops
+from .._measure.report import Report
+from .._measure.style import STYLES, finish, new_figure
+from .._solvers.munthe_kaas import AbstractMuntheKaas
 from ..scenes import stiefel
 from .rigid_body import cost_at_equal_error, series_in_full
 

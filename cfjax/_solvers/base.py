@@ -13,13 +13,13 @@ import numpy as np
 from jax import lax
 from jaxtyping import Array, Inexact, PyTree, Real
 
-from .._components import by_components, is_inside, is_short, is_small
-from .._dense import Interpolation, Path
-from .._failure import result_of
-from .._frozen_field import Displaced, flow, is_displaced, is_field, value
-from .._functions.held import held
-from .._functions.pack import pack, unpack
+from .._field import Displaced, flow, is_displaced, is_field, value
 from .._term import product
+from .._xla.components import by_components, is_inside, is_short, is_small
+from .._xla.held import held
+from .._xla.pack import pack, unpack
+from .dense import Interpolation, Path
+from .failure import result_of
 
 
 class _OfInstances(property):

@@ -10,10 +10,7 @@ import jax.tree_util as jtu
 from jax import lax
 from jaxtyping import Array, Inexact, PyTree
 
-from .. import _pairs, _tableau
-from .._dense import Path
-from .._extension import extension
-from .._frozen_field import (
+from .._field import (
     combine,
     enter,
     flow,
@@ -22,9 +19,13 @@ from .._frozen_field import (
     tangent,
     value,
 )
-from .._order_conditions import order
-from .._tableau import Product, Row, Tableau
+from .._methods import pairs as _pairs
+from .._methods import tableau as _tableau
+from .._methods.extension import extension
+from .._methods.order_conditions import order
+from .._methods.tableau import Product, Row, Tableau
 from .base import AbstractLieSolver, Move, held_entries
+from .dense import Path
 
 
 class AbstractCommutatorFree(AbstractLieSolver):

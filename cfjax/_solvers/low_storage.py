@@ -9,13 +9,13 @@ import jax.numpy as jnp
 import jax.tree_util as jtu
 from jax import lax
 
-from .._dense import Path
-from .._extension import extension
-from .._frozen_field import combine, enter, flow
-from .._frozen_field import value as value_of
-from .._tableau import Product, Row, Tableau
+from .._field import combine, enter, flow
+from .._field import value as value_of
+from .._methods.extension import extension
+from .._methods.tableau import Product, Row, Tableau
 from .base import Move
 from .commutator_free import AbstractCommutatorFree, minus, trimmed
+from .dense import Path
 
 # Unrolled stages cost compile time quadratically. And XLA keeps the fields of several of them, to
 # add them up at once: as many as fit in a cache may be.

@@ -12,9 +12,7 @@ import equinox as eqx
 import jax.tree_util as jtu
 from jaxtyping import PyTree
 
-from .._dense import Path
-from .._extension import runge_kutta_extension
-from .._frozen_field import (
+from .._field import (
     AbstractAlgebraElement,
     bracket,
     combine,
@@ -24,10 +22,12 @@ from .._frozen_field import (
     leave,
     without_bracket,
 )
-from .._frozen_field import value as value_of
-from .._order_conditions import runge_kutta_order
-from .._tableau import Extension, Row
+from .._field import value as value_of
+from .._methods.extension import runge_kutta_extension
+from .._methods.order_conditions import runge_kutta_order
+from .._methods.tableau import Extension, Row
 from .base import AbstractLieSolver, Move
+from .dense import Path
 
 
 class AbstractMuntheKaas(AbstractLieSolver):

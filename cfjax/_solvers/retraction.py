@@ -6,12 +6,12 @@ import jax.numpy as jnp
 import jax.tree_util as jtu
 from jaxtyping import Array, Float, PyTree
 
-from .._dense import Path
-from .._extension import runge_kutta_extension
+from .._field import combine, is_field, tangent
 from .._fields.low_rank import BorderedSkew, LowRankSkew
-from .._frozen_field import combine, is_field, tangent
-from .._functions.matmul import matmul
+from .._methods.extension import runge_kutta_extension
+from .._numerics.matmul import matmul
 from .base import AbstractLieSolver, Move
+from .dense import Path
 
 _EXTENSION = runge_kutta_extension(
     ((), (0.5,), (0.0, 0.5), (0.0, 0.0, 1.0)), (1 / 6, 1 / 3, 1 / 3, 1 / 6)

@@ -17,13 +17,17 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
-from .._fields.affine import Affine
-from .._functions.transforms import SineTransform
-from .._solvers.commutator_free import CF4, CF43
-from .._solvers.munthe_kaas import RKMK4
-from .._solvers.richardson import Richardson
-from .._term import LieTerm
-from .._work_precision import WorkPrecision, work_precision
+from .. import (
+    CF4,
+    CF43,
+    RKMK4,
+    Affine,
+    LieTerm,
+    Richardson,
+    SineTransform,
+    WorkPrecision,
+    work_precision,
+)
 
 t0, t1 = 0.0, 0.5
 

@@ -15,12 +15,8 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
-from .._fields.rotation import Rotation
-from .._functions.matmul import matmul
-from .._solvers.commutator_free import CF3, CF4, CF43
-from .._solvers.munthe_kaas import RKMK3, RKMK4
-from .._term import LieTerm
-from .._work_precision import WorkPrecision, work_precision
+from .. import CF3, CF4, CF43, RKMK3, RKMK4, LieTerm, Rotation, WorkPrecision, work_precision
+from .._numerics.matmul import matmul
 
 t0, t1 = 0.0, 100.0
 y0 = np.array([8 / 9, 4 / 9, 1 / 9])

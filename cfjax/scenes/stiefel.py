@@ -16,13 +16,18 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
-from .._fields.low_rank import BorderedSkew, LowRankSkew
-from .._frozen_field import tangent
-from .._solvers.commutator_free import CF3, CF4
-from .._solvers.munthe_kaas import RKMK4
-from .._solvers.retraction import CayleyRK4
-from .._term import LieTerm
-from .._work_precision import WorkPrecision, work_precision
+from .. import (
+    CF3,
+    CF4,
+    RKMK4,
+    BorderedSkew,
+    CayleyRK4,
+    LieTerm,
+    LowRankSkew,
+    WorkPrecision,
+    tangent,
+    work_precision,
+)
 
 t0, t1 = 0.0, 1.0
 

@@ -8,8 +8,8 @@ import pytest
 from matplotlib.backends.backend_agg import FigureCanvasAgg
 from rich.progress import Progress
 
-from cfjax import _report
 from cfjax.__main__ import main
+from cfjax._measure import report as _report
 from cfjax._paper import heat, rigid_body
 
 FILES = sorted(

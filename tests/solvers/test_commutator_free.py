@@ -15,7 +15,7 @@ import pytest
 import scipy.linalg
 
 import cfjax
-from cfjax._extension import extension
+from cfjax._methods.extension import extension
 
 METHODS: dict[str, cfjax.CommutatorFree] = {
     "LieEuler": cfjax.LieEuler(),

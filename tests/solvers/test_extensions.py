@@ -15,7 +15,7 @@ import pytest
 from scipy.integrate import solve_ivp
 
 import cfjax
-from cfjax._extension import extension
+from cfjax._methods.extension import extension
 
 # The uniform order of each: at most one below that of the method.
 FLOWS: dict[str, Any] = {

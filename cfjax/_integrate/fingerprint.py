@@ -1,0 +1,84 @@
+"""What tells one computation from another, in every process alike."""
+
+import functools
+import hashlib
+import itertools
+import re
+from collections.abc import Iterable, Iterator
+from typing import Any
+
+import jax
+import jaxlib.version
+import numpy as np
+from jax.extend.core import ClosedJaxpr, Jaxpr, Literal, jaxprs_in_params
+from jax.stages import Lowered, Traced
+from jaxtyping import Array, Shaped
+
+_SYMBOL = re.compile(r'@("[^"]*"|[\w.$-]+)')
+_FUNCTION = re.compile(rf"^  func\.func \w+ {_SYMBOL.pattern}", re.MULTILINE)
+# A function of the host whose result enters the program: on a CPU, on a GPU, on a TPU.
+_HOST_FUNCTION = re.compile(r"= stablehlo\.(custom_call @\w*python\w*callback|recv\b)")
+# All that the text has of one: a number, in the order in which they were met.
+_HOST_NUMBER = re.compile(r"(@\w*python\w*callback.*?)\{index = \d+ : ui64\}")
+# Within it equinox calls the host to raise an error, and takes no other value from there.
+_EQUINOX_CHECK = re.compile(r"branched_error_if_impl(_\d+)?")
+
+
+def fingerprint(traced: Traced, lowered: Lowered, devices: Iterable[Any]) -> bytes:
+    """A digest of all that decides the values of a program, given its inputs.
+
+    It is that of the text which is compiled. A jaxpr will not do: constants hide in nested ones, in
+    parameters of equations and in the static objects of others' primitives, from where lowering
+    alone takes them out. The text has each in full and to the last bit, and what settings there are
+    of precision, random numbers and sharding. Which calls share a function, and so the functions'
+    names and order, depends on what jax remembers from other programs: so a call counts as the
+    text that it calls.
+
+    To it come versions and kinds of device, as to which the same text may mean other arithmetic.
+    Flags of the compiler are no part of it.
+
+    **Raises** `ValueError` if the program takes values from a function of the host, of which it
+    knows nothing. A print gives no value, and of equinox's checks nothing is kept but success.
+    """
+    rest, *functions = _FUNCTION.split(_HOST_NUMBER.sub(r"\1", lowered.as_text()))
+    bodies: dict[str, str] = {}
+    for name, function in zip(functions[::2], functions[1::2], strict=True):
+        bodies[name], _, after = function.partition("\n  }\n")
+        rest += after
+        if _HOST_FUNCTION.search(function) and not _EQUINOX_CHECK.fullmatch(name):
+            raise ValueError(
+                "folder needs a solve whose values jax alone computes, got one that calls a "
+                "function of the host (jax.pure_callback, jax.experimental.io_callback, a progress "
+                "meter): a change of it would go unseen. Leave out folder or the call."
+            )
+
+    @functools.cache
+    def content(name: str) -> str:
+        inner = lambda symbol: content(symbol[1]) if symbol[1] in bodies else symbol[0]  # noqa: E731
+        return hashlib.sha256(_SYMBOL.sub(inner, bodies[name]).encode()).hexdigest()
+
+    kinds = sorted({f"{device.platform} {device.device_kind}" for device in devices})
+    from .. import __version__  # Here, as it is there last.
+
+    versions = [__version__, jax.__version__, jaxlib.version.__version__]
+    text = "\n".join([*versions, *kinds, rest, content("main")])
+    return digest([np.frombuffer(text.encode(), np.uint8), *_arrays(traced.jaxpr)])
+
+
+def digest(arrays: Iterable[Shaped[Array | np.ndarray, "..."]]) -> bytes:
+    result = hashlib.sha256()
+    for array in map(np.asarray, arrays):
+        result.update(f"{array.shape} {array.dtype};".encode())
+        result.update(np.ascontiguousarray(array).tobytes())
+    return result.digest()
+
+
+def _arrays(jaxpr: Jaxpr | ClosedJaxpr) -> Iterator[np.ndarray]:
+    """With jax_use_simplified_jaxpr_constants, the arrays that are inputs instead of text."""
+    inner = jaxpr.jaxpr if isinstance(jaxpr, ClosedJaxpr) else jaxpr
+    for atom in itertools.chain(*(eqn.invars for eqn in inner.eqns), inner.outvars):
+        if isinstance(atom, Literal) and np.ndim(atom.val):
+            yield np.asarray(atom.val)
+    for eqn in inner.eqns:
+        for nested in jaxprs_in_params(eqn.params):
+            yield from _arrays(nested)

@@ -1,0 +1,254 @@
+"""Integration with a fixed number of steps, as one compiled loop."""
+
+import typing
+from typing import Any
+
+import diffrax
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import jax.tree_util as jtu
+import numpy as np
+from jax import lax
+from jaxtyping import Array, Bool, Int, PyTree, Real
+
+from .._solvers.base import AbstractLieSolver, State
+from .._xla.loop import repeat
+
+
+def integrate(
+    term: PyTree[diffrax.AbstractTerm],
+    solver: diffrax.AbstractSolver,
+    t0: Any,
+    t1: Any,
+    y0: PyTree,
+    args: PyTree = None,
+    *,
+    num_steps: int | np.integer,
+    save_every: int | np.integer | None = None,
+    checkpoint_every: int | np.integer | None = None,
+    throw: bool = True,
+) -> diffrax.Solution:
+    """Integrates from `t0` to `t1` with `num_steps` equal steps of any diffrax solver.
+
+    A leaner loop than `diffrax.diffeqsolve` for the case that needs no more: one scan, constant
+    memory, one compilation for each shape of the arguments and each number of steps, none for new
+    values. Reverse mode keeps one state a step and computes every step again.
+
+    **Arguments:**
+
+    - `term`, `solver`, `t0`, `t1`, `y0`, `args`: as for `diffrax.diffeqsolve`. `t1 < t0`
+      integrates backwards. Times are real scalars and take the precision of `y0`. Parts of `y0` in
+      integers, booleans or half precision become the default floating dtype. (`diffeqsolve`
+      promotes them to the dtype of the times.) Python floats in `args` are traced; a Python int or
+      bool is part of the program, as in equinox.
+    - `num_steps`: how many steps, at least 1.
+    - `save_every`: saves the state after every so many steps; must divide `num_steps`. By default
+      only the final state is saved.
+    - `checkpoint_every`: for reverse mode with little memory. It then keeps one state in so many
+      steps and computes the steps between again, a second time. About `sqrt(num_steps)` is best,
+      and makes the memory proportional to `sqrt(num_steps)` states.
+    - `throw`: whether a failure is an error, as in diffrax. If not, `result` of the solution says
+      what happened. In a batch made by `jax.vmap` one failure is an error for all.
+
+    **Returns:** a `diffrax.Solution`. Its `ts` has shape `(num_saves,)`, and each leaf of `ys` has
+    one more axis of that length in front; the last entry is the state at `t1`. The initial state
+    is not repeated there.
+
+    **Raises:** `TypeError` or `ValueError` for arguments of wrong type or value. A runtime error if
+    `y0` or a saved state has an entry that is not finite, if `y0` is off the manifold that a field
+    acts on, if a time is NaN, or if the solver reports a failure.
+    """
+    check_term_and_solver(term, solver)
+    check_own_tolerances(solver)
+    y0 = as_state(y0)
+    solver = without_estimate(solver)
+    num_steps = count("num_steps", num_steps)
+    save_every = None if save_every is None else count("save_every", save_every)
+    if save_every is not None and num_steps % save_every:
+        raise ValueError(f"save_every must divide num_steps={num_steps}, got {save_every}.")
+    if checkpoint_every is not None:
+        checkpoint_every = count("checkpoint_every", checkpoint_every)
+    dtype = time_dtype(y0)
+    t0, t1 = time_scalar("t0", t0, dtype), time_scalar("t1", t1, dtype)
+    args = jtu.tree_map(lambda x: jnp.asarray(x) if isinstance(x, float | complex) else x, args)
+    return equal_steps(
+        term, solver, t0, t1, y0, args, num_steps, save_every, checkpoint_every, throw
+    )
+
+
+@eqx.filter_jit
+def equal_steps(
+    term: PyTree[diffrax.AbstractTerm],
+    solver: diffrax.AbstractSolver,
+    t0: Real[Array, ""],
+    t1: Real[Array, ""],
+    y0: PyTree,
+    args: PyTree,
+    num_steps: int | Int[Array, ""],
+    save_every: int | None,
+    checkpoint_every: int | None,
+    throw: bool,
+) -> diffrax.Solution:
+    """`integrate` of checked arguments.
+
+    `num_steps` may be traced where only the final state is saved. Then one program serves all
+    numbers of steps, forward only.
+    """
+    # A state may have no arrays, and then nothing can go wrong.
+    throw = throw and bool(jtu.tree_leaves(y0))
+    if throw:
+        message = "y0 must be finite, got an entry that is not."
+        y0 = eqx.error_if(y0, ~_is_finite(y0), message)
+
+    if isinstance(num_steps, int):
+        n, intervals = jnp.asarray(0, jnp.int32 if num_steps < 2**31 else int), num_steps
+    else:
+        n, intervals = jnp.zeros_like(num_steps), num_steps.astype(t0.dtype)
+
+    def time(n):
+        # From the step's number, so that rounding does not add up, and t1 is met exactly.
+        return jnp.where(n == num_steps, t1, t0 + n.astype(t0.dtype) * ((t1 - t0) / intervals))
+
+    def step(carry):
+        n, y, solver_state, result = carry
+        y, _, _, solver_state, step_result = solver.step(
+            term, time(n), time(n + 1), y, args, solver_state, made_jump=False
+        )
+        # Our own fail where the state is not finite, which the last one shows as well. A loop of
+        # small steps feels every operation.
+        if not is_ours and step_result is not diffrax.RESULTS.successful:
+            is_first = result == diffrax.RESULTS.successful
+            result = diffrax.RESULTS.where(is_first, step_result, result)
+        return (n + 1, y, solver_state, result)
+
+    is_ours = isinstance(solver, AbstractLieSolver)
+    solver_state = solver.init(term, t0, time(n + 1), y0, args)
+    if isinstance(solver_state, State):
+        y0, solver_state = solver_state.started(y0)
+    carry = (n, y0, solver_state, diffrax.RESULTS.successful)
+
+    def advance(carry, number):
+        if checkpoint_every is None:
+            return repeat(step, carry, number)
+        length, rest = checkpoint_every, number % checkpoint_every
+        block = jax.checkpoint(lambda carry, _: (repeat(step, carry, length), None))
+        carry, _ = lax.scan(block, carry, length=number // length)
+        return repeat(step, carry, rest)
+
+    def steps_and_save(carry, _):
+        carry = advance(carry, num_steps if save_every is None else save_every)
+        n, y, *_ = carry
+        return carry, (time(n), y)
+
+    num_saves: Any = 1 if save_every is None else num_steps // save_every
+    carry, (ts, ys) = lax.scan(steps_and_save, carry, length=num_saves)
+    result = carry[3]
+    # Of the saved states alone, outside the loop: sums and products keep infinity and NaN, so a
+    # blow-up shows in what is saved after it.
+    is_lost = (result == diffrax.RESULTS.successful) & ~_is_finite(ys)
+    nonfinite: Any = diffrax.RESULTS.nonfinite
+    result = diffrax.RESULTS.where(is_lost, nonfinite, result)
+    if throw:
+        ys = result.error_if(ys, result != diffrax.RESULTS.successful)
+    return diffrax.Solution(
+        t0=t0,
+        t1=t1,
+        ts=ts,
+        ys=ys,
+        interpolation=None,
+        stats={"num_steps": num_steps},
+        result=result,
+        solver_state=None,
+        controller_state=None,
+        made_jump=None,
+        event_mask=None,
+    )
+
+
+def without_estimate(solver: Any) -> diffrax.AbstractSolver:
+    """The same method for steps that nobody controls, where the solver offers it."""
+    # Not by the class: for diffrax a wrapped solver is an instance of what it wraps.
+    return solver.without_estimate() if hasattr(solver, "without_estimate") else solver
+
+
+def time_dtype(y0: PyTree) -> Any:
+    """The state's precision: times of another would promote it."""
+    leaves = jtu.tree_leaves(y0)
+    with jax.numpy_dtype_promotion("standard"):
+        return jnp.finfo(jnp.result_type(*leaves) if leaves else float).dtype
+
+
+def time_scalar(name: str, t: Any, dtype: Any) -> Real[Array, ""]:
+    is_number = isinstance(t, jax.Array | np.ndarray | np.generic | int | float)
+    kinds = jnp.integer, jnp.floating
+    is_real = is_number and any(jnp.issubdtype(jnp.result_type(t), kind) for kind in kinds)
+    if not is_real or jnp.shape(t):
+        raise TypeError(f"{name} must be a real scalar, got {eqx.tree_pformat(t)}.")
+    return jnp.asarray(t, dtype)
+
+
+def _is_finite(y: PyTree) -> Bool[Array, ""]:
+    return jnp.asarray([jnp.all(jnp.isfinite(leaf)) for leaf in jtu.tree_leaves(y)], bool).all()
+
+
+def check_term_and_solver(term: Any, solver: Any) -> None:
+    is_term = lambda x: isinstance(x, diffrax.AbstractTerm)  # noqa: E731
+    terms, structure = jtu.tree_flatten(term, is_leaf=is_term)
+    if not terms or not all(map(is_term, terms)):
+        raise TypeError(f"term must be a diffrax term, such as cfjax.LieTerm(field), got {term!r}.")
+    if not isinstance(solver, diffrax.AbstractSolver):
+        raise TypeError(f"solver must be a diffrax solver, such as cfjax.CF4(), got {solver!r}.")
+    # As `diffrax.diffeqsolve`, but for the types within a generic one.
+    expected, expected_structure = jtu.tree_flatten(solver.term_structure)
+    classes = [typing.get_origin(c) or c for c in expected]
+    if structure != expected_structure or not all(map(isinstance, terms, classes)):
+        raise TypeError(
+            f"{type(solver).__name__} takes a term of the form {solver.term_structure}, got "
+            f"{eqx.tree_pformat(term)}."
+        )
+
+
+def check_own_tolerances(solver: Any) -> None:
+    """An implicit solver cannot have those of a step size controller where there is none."""
+    if isinstance(solver, diffrax.AbstractImplicitSolver):
+        finder = solver.root_finder
+        # By default a marker: they are to be those of the step size controller.
+        own = [getattr(finder, name, None) for name in ("rtol", "atol")]
+        if not all(map(eqx.is_inexact_array_like, own)):
+            name = type(solver).__name__
+            raise ValueError(
+                "solver must have tolerances of its own, as equal steps have none to give it, got "
+                f"{name} without. Write diffrax.{name}(diffrax.VeryChord(rtol=1e-8, atol=1e-8, "
+                "norm=optimistix.rms_norm))."
+            )
+
+
+def as_state(y0: PyTree) -> PyTree:
+    """The state as arrays, in a precision in which one can integrate.
+
+    **Raises** `TypeError` for leaves that are no numbers.
+    """
+
+    def as_array(path: Any, leaf: Any) -> Array:
+        is_number = isinstance(leaf, jax.Array | np.ndarray | np.generic | int | float | complex)
+        if not is_number or not _has_numbers(getattr(leaf, "dtype", None) or np.result_type(leaf)):
+            raise TypeError(
+                f"y0{jtu.keystr(path)} must be an array of numbers, got {eqx.tree_pformat(leaf)}."
+            )
+        array = jnp.asarray(leaf)
+        # As diffrax promotes them. In half precision no error estimate is worth its name.
+        is_precise = jnp.issubdtype(array.dtype, jnp.inexact) and array.dtype.itemsize >= 4
+        return array if is_precise else array.astype(float)
+
+    return jtu.tree_map_with_path(as_array, y0)
+
+
+def _has_numbers(dtype: Any) -> bool:
+    return jnp.issubdtype(dtype, jnp.number) or jnp.issubdtype(dtype, jnp.bool_)
+
+
+def count(name: str, value: Any) -> int:
+    if isinstance(value, bool) or not isinstance(value, int | np.integer) or value < 1:
+        raise ValueError(f"{name} must be an integer of at least 1, got {value!r}.")
+    return int(value)

@@ -1,0 +1,629 @@
+"""Error against time, flops, evaluations and flows: the table and the chart."""
+
+import contextlib
+import csv
+import functools
+import os
+import time
+from collections import Counter
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from typing import TYPE_CHECKING, Any, ClassVar, NamedTuple
+
+import diffrax
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import jax.tree_util as jtu
+import numpy as np
+from jaxtyping import Array, Float, Int, PyTree
+
+from .._field import AbstractAlgebraElement, bracket, combine, flow, is_field, tangent
+from .._integrate.integrate import (
+    as_state,
+    check_own_tolerances,
+    check_term_and_solver,
+    count,
+    equal_steps,
+    time_dtype,
+    time_scalar,
+    without_estimate,
+)
+from .._integrate.progress import progress_bar
+from .extra import paper_extra
+from .flops import count_flops
+
+if TYPE_CHECKING:
+    import matplotlib.figure
+    import rich.progress
+    import rich.table
+
+Method = diffrax.AbstractSolver | tuple[PyTree, diffrax.AbstractSolver]
+
+
+class WorkPrecision(NamedTuple):
+    """What each method costs and how far it is off: one row for each method and setting.
+
+    NaN stands for what is not known. Rows of runs that failed have NaN as `error` and `seconds`.
+
+    **Fields:**
+
+    - `method`: the method's name.
+    - `tolerance`: of an adaptive run, else NaN.
+    - `error`: the distance of the final state from the reference.
+    - `num_steps`, `num_rejected`: attempted steps, and those among them that were rejected.
+    - `num_evaluations`: evaluations of the field, in all attempted steps. NaN for implicit
+      methods, where steps differ.
+    - `num_flows`: flows of frozen fields in all attempted steps. A state of several parts moves in
+      one flow; a translation is none.
+    - `flops`: floating-point operations of all attempted steps, as traced. NaN where a step has an
+      operation without a rule. The step size controller's own are not in it.
+    - `compile_seconds`: time to trace and compile the solve. One program serves all settings of a
+      method.
+    - `seconds`: the time of every repeated run, without the first. Its minimum is the figure to
+      compare.
+    - `note`: why a run failed, else empty.
+    """
+
+    method: tuple[str, ...]
+    tolerance: Float[np.ndarray, " rows"]
+    error: Float[np.ndarray, " rows"]
+    num_steps: Float[np.ndarray, " rows"]
+    num_rejected: Float[np.ndarray, " rows"]
+    num_evaluations: Float[np.ndarray, " rows"]
+    num_flows: Float[np.ndarray, " rows"]
+    flops: Float[np.ndarray, " rows"]
+    compile_seconds: Float[np.ndarray, " rows"]
+    seconds: Float[np.ndarray, "rows repeats"]
+    note: tuple[str, ...]
+
+    def select(self, method: str) -> "WorkPrecision":
+        """The rows of one method.
+
+        **Raises** `KeyError` if there are none.
+        """
+        if method not in self.method:
+            raise KeyError(f"method must be one of {list(dict.fromkeys(self.method))}: {method!r}")
+        rows = [i for i, name in enumerate(self.method) if name == method]
+        columns = self._asdict()
+        for name, column in columns.items():
+            is_array = isinstance(column, np.ndarray)
+            columns[name] = column[rows] if is_array else tuple(column[i] for i in rows)
+        return WorkPrecision(**columns)
+
+    def plot(self, figure: "matplotlib.figure.Figure | None" = None) -> "matplotlib.figure.Figure":
+        """The chart: error against time, and beside it against flops. Needs `cfjax[paper]`.
+
+        A mark is the fastest run; its bar reaches to the upper quartile. Where no flops are known
+        of any method, the second panel shows evaluations of the field. Draws into `figure` if there
+        is one.
+
+        **Raises** `ModuleNotFoundError` without matplotlib and rich, and `TypeError` if `figure` is
+        none.
+        """
+        with paper_extra():
+            from matplotlib.figure import FigureBase
+
+            from . import style as _style
+        if figure is not None and not isinstance(figure, FigureBase):
+            raise TypeError(f"figure must be a matplotlib figure, got {figure!r}.")
+        figure = _style.new_figure((7.0, 4.2)) if figure is None else figure
+        left, right = figure.subplots(1, 2, sharey=True)
+        counts_flops = bool(np.any(np.isfinite(self.flops)))
+        work = self.flops if counts_flops else self.num_evaluations
+        names = dict.fromkeys(self.method)
+        unknown = []
+        for name, style in _style.styles(names).items():
+            rows = np.array(self.method) == name
+            best, upper = np.percentile(self.seconds[rows], (0, 75), axis=-1)
+            spread = (np.zeros_like(best), upper - best)
+            left.errorbar(best, self.error[rows], xerr=spread, capsize=3, label=name, **style)
+            right.plot(work[rows], self.error[rows], **style)
+            if not np.any(np.isfinite(work[rows])):
+                unknown.append(name)
+        left.set(yscale="log", ylabel="error of the final state")
+        _style.logarithmic(left, "time", unit="s")
+        label = "flops" if counts_flops else "evaluations of the field"
+        _style.logarithmic(right, label + (f" (not known: {', '.join(unknown)})" * bool(unknown)))
+        figure.align_xlabels()
+        _style.finish(figure, 4)
+        return figure
+
+    def table(self) -> "rich.table.Table":
+        """The table for a terminal, with the notes below. Needs `cfjax[paper]`.
+
+        Beside the fastest run stands how much longer the upper quartile took.
+
+        **Raises** `ModuleNotFoundError` without rich.
+        """
+        with paper_extra():
+            from rich import box
+            from rich.table import Table
+
+        is_adaptive = bool(np.any(np.isfinite(self.tolerance)))
+        headings = ["error", "steps", "evals", "flows", "flops", "compile\n(s)", "time\n(ms)"]
+        if is_adaptive:
+            headings = ["tol", *headings[:2], "rejected", *headings[2:]]
+        failed = [i for i, note in enumerate(self.note) if note]
+        settings = self.tolerance if is_adaptive else self.num_steps
+        notes = [f"{self.method[i]}, {settings[i]:g}: {self.note[i]}" for i in failed]
+        table = Table(box=box.SIMPLE_HEAD, padding=0, caption="\n".join(notes) or None)
+        table.add_column("method", no_wrap=True)
+        for heading in headings:
+            table.add_column(heading, justify="right", no_wrap=True)
+        best, upper = np.percentile(self.seconds, (0, 75), axis=-1)
+        for i, name in enumerate(self.method):
+            cells = [f"{self.error[i]:.1e}", f"{self.num_steps[i]:.0f}"]
+            if is_adaptive:
+                cells = [f"{self.tolerance[i]:.0e}", *cells, f"{self.num_rejected[i]:.0f}"]
+            cells += [f"{count:.6g}" for count in (self.num_evaluations[i], self.num_flows[i])]
+            cells.append(f"{self.flops[i]:.2e}")
+            cells += [f"{self.compile_seconds[i]:.2f}", f"{1e3 * best[i]:.3g}"]
+            if not self.note[i]:
+                cells[-1] += f" +{upper[i] / best[i] - 1:.0%}"
+            last = i + 1 == len(self.method) or self.method[i + 1] != name
+            table.add_row(name, *cells, end_section=last)
+        return table
+
+    def to_csv(self, path: str | os.PathLike[str]) -> None:
+        """Writes the table as CSV. The times are the minimum and the three quartiles."""
+        names = [name for name in self._fields if name not in ("seconds", "note")]
+        times = np.percentile(self.seconds, (0, 25, 50, 75), axis=-1).T
+        quartiles = [f"seconds_{name}" for name in ("min", "quartile_1", "median", "quartile_3")]
+        with open(path, "w", newline="", encoding="utf-8") as file:
+            writer = csv.writer(file)
+            writer.writerow([*names, *quartiles, "note"])
+            for i, note in enumerate(self.note):
+                values = [getattr(self, name)[i] for name in names[1:]]
+                cells = [f"{value:.17g}" for value in (*values, *times[i])]
+                writer.writerow([self.method[i], *cells, note])
+
+
+def absolute_tolerance(tolerance: Float[Array, ""]) -> diffrax.AbstractStepSizeController:
+    """Control of the absolute error alone: that of a relative one depends on the frame."""
+    return diffrax.PIDController(rtol=0.0, atol=tolerance)
+
+
+def distance(y: PyTree, reference: PyTree) -> float:
+    """The 2-norm of the difference, all parts of the state together."""
+    parts = jtu.tree_map(lambda a, b: np.ravel(np.asarray(a) - np.asarray(b)), y, reference)
+    with np.errstate(over="ignore"):
+        return float(np.linalg.norm(np.concatenate(jtu.tree_leaves(parts))))
+
+
+def work_precision(
+    term: PyTree,
+    t0: Any,
+    t1: Any,
+    y0: PyTree,
+    args: PyTree = None,
+    *,
+    methods: Mapping[str, Method],
+    reference: PyTree,
+    num_steps: Sequence[int] | Int[Array | np.ndarray, " settings"] | None = None,
+    tolerances: Sequence[float] | Float[Array | np.ndarray, " settings"] | None = None,
+    controller: Callable[[Any], diffrax.AbstractStepSizeController] = absolute_tolerance,
+    dt0: Any = None,
+    max_steps: int = 100_000,
+    error: Callable[[PyTree, PyTree], float] = distance,
+    repeats: int = 100,
+    budget: int | float = 20,
+    progress: "bool | rich.progress.Progress" = True,
+) -> WorkPrecision:
+    """Measures what an error costs with each method.
+
+    Either with equal steps, those of `cfjax.integrate`, for each of `num_steps`, or with adaptive
+    steps, `diffrax.diffeqsolve` for each of `tolerances`. Compiles a program for each method, which
+    takes seconds, then runs all of them in turns, so that what else the machine does falls on all
+    alike.
+
+    **Arguments:**
+
+    - `term`, `t0`, `t1`, `y0`, `args`: the problem, as for `cfjax.integrate`.
+    - `methods`: by name, a diffrax solver, or a pair of a term of its own and a solver: diffrax's
+      own solvers take `diffrax.ODETerm` of the ambient field.
+    - `reference`: the state at `t1` that counts as exact; shaped like `y0`.
+    - `num_steps`, `tolerances`: one of the two.
+    - `controller`: makes the step size controller of a tolerance, which is a traced array. By
+      default the absolute error is controlled, with `rtol=0`: a relative one depends on the frame.
+    - `dt0`: the first of the adaptive steps; by default a hundredth of the interval.
+    - `max_steps`: a run that takes more adaptive steps has failed.
+    - `error`: the error of a final state, given it and the reference; by default the 2-norm of the
+      difference.
+    - `repeats`, `budget`: times are measured so many times, or until so many seconds have passed.
+      Every program runs once in any case, and once more to warm up.
+    - `progress`: whether to show what is being compiled and measured in progress bars, on a
+      terminal. Needs `rich`, and without it there are none. Or a `rich.progress.Progress` that
+      gets the bars.
+
+    **Returns:** a `cfjax.WorkPrecision`. A run that fails (infinity or NaN, or too many steps) has
+    a row of its own there, with NaN as its error and the reason as its note.
+
+    **Raises:** `TypeError` or `ValueError` for arguments of wrong type or value, for example a
+    solver without an error estimate where there are tolerances. What a method raises when it is
+    traced, with its name added.
+    """
+    settings = _checked_settings(num_steps, tolerances)
+    is_adaptive = tolerances is not None
+    solvers = _checked_methods(methods, term, is_adaptive)
+    repeats, max_steps = count("repeats", repeats), count("max_steps", max_steps)
+    if not isinstance(budget, int | float | np.number) or not budget > 0:
+        raise ValueError(f"budget must be a positive number of seconds, got {budget!r}.")
+    for name, function in (("controller", controller), ("error", error)):
+        if not callable(function):
+            raise TypeError(f"{name} must be a function, got {function!r}.")
+    y0 = as_state(y0)
+    _check_reference(reference, y0)
+    dtype = time_dtype(y0)
+    t0, t1 = time_scalar("t0", t0, dtype), time_scalar("t1", t1, dtype)
+    if dt0 is None:
+        dt0 = (t1 - t0) / (100 if is_adaptive else max(settings))
+    dt0 = time_scalar("dt0", dt0, dtype)
+    if not 0 < abs(t1 - t0) < np.inf:
+        raise ValueError(f"t0 and t1 must be finite and differ, got {t0} and {t1}.")
+    if not 0 < dt0 / (t1 - t0) < np.inf:
+        raise ValueError(f"dt0 must be a step from t0={t0} towards t1={t1}, got {dt0}.")
+    args = jtu.tree_map(lambda x: jnp.asarray(x) if eqx.is_inexact_array_like(x) else x, args)
+    # Arrays, so that one program serves them all.
+    counter = jnp.int32 if max(settings) < 2**31 else int
+    values = [jnp.asarray(x, dtype if is_adaptive else counter) for x in settings]
+    if is_adaptive:
+        _check_controller(controller, values[0])
+    solve = _adaptive_steps(controller, max_steps) if is_adaptive else _equal_steps
+
+    names, rows, notes, programs = [], [], [], []
+    with progress_bar(progress, "Compiling", len(solvers)) as update:
+        for name, (own_term, solver) in solvers.items():
+            update(description=f"Compiling {name}")
+            with _about(name):
+                solver = solver if is_adaptive else without_estimate(solver)
+                problem = _Problem(own_term, solver, t0, t1, dt0, y0, args)
+                cost = _cost(problem, is_adaptive)
+                executable, seconds = compiled(solve, problem, values[0])
+            update(description=f"Running {name}")
+            for setting, value in zip(settings, values, strict=True):
+                program = functools.partial(executable, eqx.filter((problem, value), eqx.is_array))
+                # The first run also warms up.
+                y, attempted, rejected, note = _first_run(program)
+                with _about(name):
+                    found = np.nan if note else _checked_error(error(y, reference))
+                if not note and not np.isfinite(found):
+                    found, note = np.nan, "The error is not finite."
+                if not is_adaptive:
+                    # Known also where the run broke off.
+                    attempted, rejected = float(setting), 0.0
+                tolerance = setting if is_adaptive else np.nan
+                rows.append((tolerance, found, attempted, rejected, *cost.of(attempted), seconds))
+                names.append(name)
+                notes.append(note)
+                programs.append(program)
+            update(advance=1)
+    runs = [i for i, note in enumerate(notes) if not note]
+    # Methods with one setting run one after the other: these are compared, and last about as long.
+    runs.sort(key=lambda i: i % len(settings))
+    measured = take_turns(
+        [programs[i] for i in runs], repeats=repeats, budget=budget, progress=progress
+    )
+    seconds = np.full((len(rows), measured.shape[1]), np.nan)
+    seconds[runs] = measured
+    columns = dict(zip(WorkPrecision._fields[1:9], np.array(rows).T, strict=True))
+    return WorkPrecision(method=tuple(names), **columns, seconds=seconds, note=tuple(notes))
+
+
+class _Problem(NamedTuple):
+    term: PyTree
+    solver: diffrax.AbstractSolver
+    t0: Array
+    t1: Array
+    dt0: Array
+    y0: PyTree
+    args: PyTree
+
+
+def compiled(fun: Callable[..., PyTree], *args: PyTree) -> tuple[Callable[[PyTree], PyTree], float]:
+    """`fun(*args)` as a program of the arrays in `args`, and the seconds to trace and compile it.
+
+    A program that takes nothing but arrays starts in microseconds.
+    """
+    arrays, static = eqx.partition(args, eqx.is_array)
+    start = time.perf_counter()
+    # A new function each time, or jax would remember the old program.
+    program = jax.jit(lambda arrays: fun(*eqx.combine(arrays, static))).lower(arrays).compile()
+    return program, time.perf_counter() - start
+
+
+def take_turns(
+    programs: Sequence[Callable[[], PyTree]],
+    *,
+    repeats: int,
+    budget: int | float = np.inf,
+    progress: "bool | rich.progress.Progress" = False,
+) -> Float[np.ndarray, "programs rounds"]:
+    """Seconds of each program in each round; in a round each runs once, in the order given.
+
+    So what else the machine does falls on all alike. There are `repeats` rounds, or as many as
+    begin within `budget` seconds, but at least one.
+    """
+    rounds: list[list[float]] = []
+    begin = time.perf_counter()
+    done = 0.0
+    with progress_bar(progress, "Measuring time", 1.0) as update:
+        while done < 1:
+            rounds.append([])
+            for program in programs:
+                start = time.perf_counter()
+                jax.block_until_ready(program())
+                rounds[-1].append(time.perf_counter() - start)
+            done = max(len(rounds) / repeats, (time.perf_counter() - begin) / budget)
+            update(completed=done)
+    return np.array(rounds).T
+
+
+def _equal_steps(problem: _Problem, num_steps: Int[Array, ""]) -> tuple:
+    term, solver, t0, t1, _, y0, args = problem
+    solution = equal_steps(term, solver, t0, t1, y0, args, num_steps, None, None, throw=False)
+    return _end(solution, num_steps, 0)
+
+
+def _adaptive_steps(controller: Callable, max_steps: int) -> Callable[..., tuple]:
+    def solve(problem, tolerance):
+        solution = diffrax.diffeqsolve(
+            *problem,
+            stepsize_controller=controller(tolerance),
+            max_steps=max_steps,
+            throw=False,
+        )
+        stats = solution.stats
+        return _end(solution, stats["num_steps"], stats["num_rejected_steps"])
+
+    return solve
+
+
+def _end(solution: diffrax.Solution, num_steps: Any, num_rejected: Any) -> tuple:
+    return jtu.tree_map(lambda y: y[-1], solution.ys), solution.result, num_steps, num_rejected
+
+
+def _first_run(program: Callable[[], tuple]) -> tuple[PyTree, float, float, str]:
+    """The final state, the numbers of steps, and why it failed, which is empty if it did not."""
+    try:
+        y, result, num_steps, num_rejected = jax.block_until_ready(program())
+    except jax.errors.JaxRuntimeError as failure:
+        # Of a check within the program; its message is among many lines of Python's.
+        _, _, message = str(failure).rpartition("RuntimeError: ")
+        return None, np.nan, np.nan, message.partition("\n")[0]
+    if result != diffrax.RESULTS.successful:
+        note = diffrax.RESULTS[result]
+    elif not all(bool(jnp.all(jnp.isfinite(leaf))) for leaf in jtu.tree_leaves(y)):
+        note = diffrax.RESULTS[diffrax.RESULTS.nonfinite]
+    else:
+        note = ""
+    return y, float(num_steps), float(num_rejected), note
+
+
+# What a step costs.
+
+
+class _Cost(NamedTuple):
+    """Evaluations, flows and flops: of the first step with what comes before it, of any other."""
+
+    first: Float[np.ndarray, "3"]
+    later: Float[np.ndarray, "3"]
+
+    def of(self, num_steps: float) -> Float[np.ndarray, "3"]:
+        return self.first + (num_steps - 1) * self.later
+
+
+def _cost(problem: _Problem, is_adaptive: bool) -> _Cost:
+    if _is_implicit(problem.solver):
+        # How often its steps repeat depends on a tolerance that the controller may give it.
+        unknown = np.full(3, np.nan)
+        return _Cost(unknown, unknown)
+    # First, because it refuses a solver before anything is compiled.
+    flops = _flops(problem, is_adaptive)
+    evaluations, flows = _calls(problem)
+    first, later = zip(evaluations, flows, flops, strict=True)
+    return _Cost(np.array(first, float), np.array(later, float))
+
+
+def _is_implicit(solver: diffrax.AbstractSolver) -> bool:
+    while isinstance(solver, diffrax.AbstractWrappedSolver):
+        solver = solver.solver
+    return isinstance(solver, diffrax.AbstractImplicitSolver)
+
+
+def _flops(problem: _Problem, is_adaptive: bool) -> tuple[float, float]:
+    """Of the first step with what comes before it, and of any other."""
+    arrays, static = eqx.partition(problem, eqx.is_array)
+
+    def init(arrays):
+        term, solver, t0, _, dt0, y0, args = eqx.combine(arrays, static)
+        return solver.init(term, t0, t0 + dt0, y0, args)
+
+    state = eqx.filter_eval_shape(init, arrays)
+    state, static_state = eqx.partition(state, lambda x: isinstance(x, jax.ShapeDtypeStruct))
+
+    def start(arrays):
+        return eqx.filter(init(arrays), eqx.is_array)
+
+    def step(arrays, t1, state):
+        term, solver, t0, _, _, y0, args = eqx.combine(arrays, static)
+        state = eqx.combine(state, static_state)
+        y, y_error, _, state, _ = solver.step(term, t0, t1, y0, args, state, made_jump=False)
+        if is_adaptive and y_error is None:
+            name = type(solver).__name__
+            raise ValueError(
+                f"tolerances need a solver with an error estimate, and {name} has none: use "
+                f"diffrax.HalfSolver({name}()), or give num_steps."
+            )
+        return y, y_error if is_adaptive else None, eqx.filter(state, eqx.is_array)
+
+    try:
+        later = float(count_flops(step, arrays, problem.t0 + problem.dt0, state))
+        return count_flops(start, arrays) + later, later
+    except NotImplementedError:
+        return np.nan, np.nan
+
+
+def _calls(problem: _Problem) -> tuple[tuple[float, float], tuple[float, float]]:
+    """Evaluations, and flows: of the first step with what comes before it, and of the second."""
+    try:
+        return _counted_steps(problem, sees_flows=True)
+    except (AttributeError, TypeError, ValueError):
+        # The solver asks more of a field than a flow and a bracket.
+        evaluations, _ = _counted_steps(problem, sees_flows=False)
+        return evaluations, (np.nan, np.nan)
+
+
+def _counted_steps(
+    problem: _Problem, sees_flows: bool
+) -> tuple[tuple[float, float], tuple[float, float]]:
+    """Counted while the steps run: what a loop repeats cannot be seen in its trace."""
+    term, solver, t0, _, dt0, y0, args = problem
+    tally = _Tally()
+
+    def is_term(x: Any) -> bool:
+        # A sum of terms must be seen as one: solvers add its frozen fields themselves.
+        return isinstance(x, diffrax.AbstractTerm) and not isinstance(x, diffrax.MultiTerm)
+
+    term = jtu.tree_map(lambda t: _CountingTerm(t, tally, sees_flows), term, is_leaf=is_term)
+    step = eqx.filter_jit(functools.partial(solver.step, made_jump=False))
+    t1, t2 = t0 + dt0, t0 + 2 * dt0
+    state = eqx.filter_jit(solver.init)(term, t0, t1, y0, args)
+    y, _, _, state, _ = step(term, t0, t1, y0, args, state)
+    first = tally.read()
+    step(term, t1, t2, y, args, state)
+    later = tally.read()
+    return (first[0], later[0]), (first[1], later[1])
+
+
+class _Tally:
+    """Counts what happens while a program runs."""
+
+    def __init__(self):
+        self.counts = Counter()
+
+    def add(self, what: str) -> None:
+        jax.debug.callback(lambda: self.counts.update([what]))
+
+    def read(self) -> tuple[float, float]:
+        """Evaluations and flows since the last time."""
+        jax.effects_barrier()
+        counts = float(self.counts["evaluation"]), float(self.counts["flow"])
+        self.counts.clear()
+        return counts
+
+
+class _CountingTerm(diffrax.AbstractTerm):
+    term: diffrax.AbstractTerm
+    tally: _Tally = eqx.field(static=True)
+    sees_flows: bool = eqx.field(static=True)
+
+    def vf(self, t, y, args):
+        self.tally.add("evaluation")
+        value = self.term.vf(t, y, args)
+        has_field = any(map(is_field, jtu.tree_leaves(value, is_leaf=is_field)))
+        return _CountedField(value, self.tally) if self.sees_flows and has_field else value
+
+    def contr(self, t0, t1, **kwargs):
+        return self.term.contr(t0, t1, **kwargs)
+
+    def prod(self, vf, control):
+        return self.term.prod(vf, control)
+
+    def vf_prod(self, t, y, args, control):
+        self.tally.add("evaluation")
+        return self.term.vf_prod(t, y, args, control)
+
+
+class _CountedField(AbstractAlgebraElement):
+    """The field of a whole state, all of whose parts move in one flow."""
+
+    field: PyTree
+    tally: _Tally = eqx.field(static=True)
+
+    acts_on_subtree: ClassVar[bool] = True
+
+    def flow(self, point):
+        self.tally.add("flow")
+        return flow(self.field, point)
+
+    def tangent(self, point):
+        return tangent(self.field, point)
+
+    @classmethod
+    def combine(cls, weights, fields):
+        return cls(combine(weights, [f.field for f in fields]), fields[0].tally)
+
+    def bracket(self, other):
+        return type(self)(bracket(self.field, other.field), self.tally)
+
+
+# What the caller gives.
+
+
+def _checked_settings(num_steps: Any, tolerances: Any) -> list[Any]:
+    if (num_steps is None) == (tolerances is None):
+        raise ValueError("Give one of num_steps and tolerances, and not the other.")
+    name, given = ("num_steps", num_steps) if tolerances is None else ("tolerances", tolerances)
+    if isinstance(given, np.ndarray | jax.Array) and given.ndim == 1:
+        given = given.tolist()
+    if not isinstance(given, Sequence) or isinstance(given, str):
+        raise TypeError(f"{name} must be a sequence of numbers, got {given!r}.")
+    settings = list(given)
+    if not settings:
+        raise ValueError(f"{name} must have at least one entry, got none.")
+    if tolerances is None:
+        return [count("num_steps", n) for n in settings]
+    is_number = [isinstance(x, int | float | np.number) for x in settings]
+    if not all(is_number) or not all(0 < x < np.inf for x in settings):
+        raise ValueError(f"tolerances must be positive and finite, got {settings}.")
+    return [float(x) for x in settings]
+
+
+def _checked_methods(
+    methods: Any, term: PyTree, is_adaptive: bool
+) -> dict[str, tuple[PyTree, Any]]:
+    """A term and a solver for each name."""
+    if not isinstance(methods, Mapping) or not all(isinstance(name, str) for name in methods):
+        raise TypeError(f"methods must be a dict of solvers by name, got {methods!r}.")
+    if not methods:
+        raise ValueError("methods must have at least one solver, got none.")
+    found = {}
+    for name, method in methods.items():
+        is_pair = isinstance(method, tuple) and len(method) == 2
+        found[name] = method if is_pair else (term, method)
+        with _about(name):
+            check_term_and_solver(*found[name])
+            if not is_adaptive:
+                check_own_tolerances(found[name][1])
+    return found
+
+
+def _check_controller(controller: Callable, tolerance: Float[Array, ""]) -> None:
+    found = eqx.filter_eval_shape(controller, tolerance)
+    if not isinstance(found, diffrax.AbstractStepSizeController):
+        raise TypeError(f"controller must return a diffrax step size controller, got {found!r}.")
+
+
+def _checked_error(found: Any) -> float:
+    is_real = isinstance(found, jax.Array | np.ndarray | np.generic | int | float)
+    if not is_real or np.ndim(found) or np.iscomplexobj(found):
+        raise TypeError(f"error must return a real number, got {eqx.tree_pformat(found)}.")
+    value = float(found)
+    if value < 0:
+        raise ValueError(f"error must return a number of at least 0, got {value}.")
+    return value
+
+
+def _check_reference(reference: PyTree, y0: PyTree) -> None:
+    found, expected = (jtu.tree_map(jnp.shape, y) for y in (reference, y0))
+    if found != expected:
+        raise ValueError(f"reference must be shaped like y0, {expected}, got {found}.")
+
+
+@contextlib.contextmanager
+def _about(name: str) -> Iterator[None]:
+    try:
+        yield
+    except Exception as mistake:
+        mistake.add_note(f"This is about methods[{name!r}].")
+        raise

@@ -1,0 +1,148 @@
+"""Output within the steps of any method: coefficients that the order conditions decide."""
+
+from collections.abc import Iterator
+from functools import lru_cache
+from math import factorial
+from typing import TypeAlias
+
+import numpy as np
+
+from .order_conditions import (
+    exact_tree_weight,
+    exact_weight,
+    order,
+    trees,
+    word_weights,
+    words,
+)
+from .tableau import Extension, Tableau
+
+# The conditions of one order: what they multiply the coefficients of one power of theta with, and
+# what the results must be, one column for each power.
+Conditions: TypeAlias = tuple[np.ndarray, np.ndarray]
+
+# Of words, the conditions of order 5 are no longer all linear.
+_MAX_ORDER = 4
+# The highest power of theta.
+_MAX_POWER = 8
+# What is zero but for rounding: for the methods here singular values are above 7e-6 or below 1e-14.
+_ROUNDING = 1e-9
+
+
+@lru_cache
+def extension(tableau: Tableau) -> Extension:
+    """The tableau's own, else one of uniform order p - 1 for a method of order p, but at most 4.
+
+    It uses the field at the end of the step only where the stages do not suffice.
+
+    With `B_j` the sum of row j of beta, flow j is given a sum of `theta B_j`. Then the conditions
+    are linear in the rest: in the weight of a word that has one letter besides single nodes, the
+    stages' fields occur in that letter only, and up to order 4 one word has two such letters, whose
+    weight is half the square of a letter's. Nor do the powers of theta mix.
+    """
+    if tableau.extension is not None:
+        return tableau.extension
+    found, reached = _solve(tableau.beta, _flow_conditions(tableau), _MAX_ORDER)
+    if reached < _MAX_ORDER and reached < order(tableau) - 1:
+        with_end = Tableau((*tableau.alpha, tableau.beta), tableau.beta)
+        found, _ = _solve(with_end.beta, _flow_conditions(with_end), _MAX_ORDER)
+    return found
+
+
+@lru_cache
+def runge_kutta_extension(a: tuple[tuple[float, ...], ...], b: tuple[float, ...]) -> Extension:
+    """That of a Runge-Kutta method in a linear space, from its stages alone.
+
+    `a[i]` and `b[i]` belong to stage i. Of methods of order p up to 5 with as few stages as diffrax
+    has, it is of uniform order p - 1; that of `diffrax.Dopri8` is of order 5.
+    """
+    found, _ = _solve((b,), _tree_conditions(a, len(b)), _MAX_POWER)
+    return found
+
+
+def _solve(end: tuple, conditions: Iterator[Conditions], max_order: int) -> tuple[Extension, int]:
+    """Coefficients by flow, power and stage that sum to `end`, and the order that they reach.
+
+    Order by order; the first that cannot be reached is missed by as little as possible. Of all
+    such coefficients these are the smallest.
+    """
+    shape = len(end), len(end[0])
+    total = np.array(end, float).ravel()
+    found = np.zeros((total.size, _MAX_POWER))
+    free = np.eye(total.size)
+    reached = 0
+    for matrix, values in conditions:
+        if np.abs(matrix @ total - values.sum(axis=1)).max() > _ROUNDING:
+            # The order of the method itself ends here.
+            break
+        left, sizes, right = np.linalg.svd(matrix @ free)
+        rank = int(np.sum(sizes > _ROUNDING))
+        error = left[:, :rank].T @ (values - matrix @ found)
+        found += free @ right[:rank].T @ (error / sizes[:rank, None])
+        if reached == max_order or np.abs(matrix @ found - values).max() > _ROUNDING:
+            break
+        free = free @ right[rank:].T
+        reached += 1
+    num_powers = min(reached + 1, _MAX_POWER)
+    found = found[:, :num_powers]
+    # What no condition decides, in equal parts; the conditions hold at the end of the step.
+    found += ((total - found.sum(axis=1)) / num_powers)[:, None]
+    coefficients = found.reshape(*shape, num_powers).swapaxes(1, 2).tolist()
+    return tuple(tuple(map(tuple, powers)) for powers in coefficients), reached
+
+
+def _flow_conditions(tableau: Tableau) -> Iterator[Conditions]:
+    rows = [[(k, float(a)) for k, a in enumerate(p[-1]) if a] for p in tableau.prefixes]
+    sums = np.array(tableau.beta, float).sum(axis=1)
+    before = np.concatenate([[0], np.cumsum(sums)])
+    num_flows, num_stages = len(sums), tableau.num_stages
+
+    def parts(left: int, right: int) -> np.ndarray:
+        """By flow, the weight of a word for a letter there, so many single nodes to its sides."""
+        weights = [
+            before[:-1] ** (left - i)
+            / factorial(left - i)
+            * (sums ** (i + j) / factorial(i + j + 1))
+            * (1 - before[1:]) ** (right - j)
+            / factorial(right - j)
+            for i in range(left + 1)
+            for j in range(right + 1)
+        ]
+        return np.sum(weights, axis=0)
+
+    # By order and tree, at each stage.
+    letters: list[dict] = [{(): np.ones(num_stages)}]
+    yield np.kron(np.eye(num_flows), letters[0][()]), _at_power(1, sums)
+    for n, (stages, _) in enumerate(word_weights(tableau, rows), 2):
+        letters.append(
+            {tree: np.array([w.get(tree, 0) for w in stages], float) for tree in words(n - 1)}
+        )
+        matrix, values = [], []
+        for size in range(2, n + 1):
+            for tree, letter in letters[size - 1].items():
+                for left in range(n - size + 1):
+                    right = n - size - left
+                    word = ((),) * left + (tree,) + ((),) * right
+                    matrix.append(np.kron(parts(left, right), letter))
+                    values.append(_at_power(size, [float(exact_weight(word))]))
+        yield np.array(matrix), np.concatenate(values)
+
+
+def _tree_conditions(a: tuple, num_stages: int) -> Iterator[Conditions]:
+    matrix = np.zeros((num_stages, num_stages))
+    for i, row in enumerate(a):
+        matrix[i, : len(row)] = row
+    values: dict = {}
+    for n in range(1, _MAX_POWER + 1):
+        for tree in trees(n):
+            values[tree] = np.prod([np.ones(num_stages)] + [matrix @ values[t] for t in tree], 0)
+        yield (
+            np.array([values[tree] for tree in trees(n)]),
+            _at_power(n, [float(exact_tree_weight(tree)) for tree in trees(n)]),
+        )
+
+
+def _at_power(power: int, values: np.ndarray | list[float]) -> np.ndarray:
+    columns = np.zeros((len(values), _MAX_POWER))
+    columns[:, power - 1] = values
+    return columns

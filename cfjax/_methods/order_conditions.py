@@ -1,0 +1,245 @@
+"""The order of a tableau, decided by its order conditions.
+
+An ordered rooted tree is the word of its children and a word is a tuple of trees, so both are
+nested tuples. A tree's order is one more than that of its children's word; a word's order is the
+sum over its trees. A commutator-free method has order q when every word up to order q has the
+weight that it has in the exact solution: Owren, J. Phys. A 39 (2006).
+"""
+
+import math
+from collections.abc import Callable, Iterable, Iterator, Sequence
+from fractions import Fraction
+from functools import cache, lru_cache
+from typing import Any, TypeAlias
+
+import numpy as np
+
+from .tableau import Product, Row, Tableau, uncertainty
+
+
+class _Rounded:
+    """A number that is computed from rounded coefficients.
+
+    `value` is exact for the coefficients as they are given, so no rounding happens here. Entry i
+    of `change` is how much the number changes to first order when float coefficient i moves by
+    its `uncertainty`.
+    """
+
+    def __init__(self, value: Fraction, change: np.ndarray) -> None:
+        self.value = value
+        self.change = change
+        self._float = float(value)
+
+    def __add__(self, other: "_Rounded | Fraction") -> "_Rounded":
+        if isinstance(other, Fraction):
+            return _Rounded(self.value + other, self.change)
+        return _Rounded(self.value + other.value, self.change + other.change)
+
+    def __mul__(self, other: "_Rounded | Fraction") -> "_Rounded":
+        if isinstance(other, Fraction):
+            return _Rounded(self.value * other, self.change * float(other))
+        change = other._float * self.change + self._float * other.change
+        return _Rounded(self.value * other.value, change)
+
+    def __truediv__(self, other: int) -> "_Rounded":
+        return _Rounded(self.value / other, self.change / other)
+
+    __radd__ = __add__
+    __rmul__ = __mul__
+
+
+# Of words again. Written without recursion, which run-time type checkers cannot follow.
+Word: TypeAlias = tuple[Any, ...]
+# A Fraction, a _Rounded, or a float where nothing is to be proved.
+Number: TypeAlias = Any
+Weights: TypeAlias = dict[Word, Number]
+# How far each weight of one order is off, and how far it may be.
+Defects: TypeAlias = list[tuple[Fraction, float]]
+
+
+@lru_cache
+def order(tableau: Tableau) -> int:
+    """The order of a commutator-free method, at least 1 as every tableau is consistent.
+
+    Exact tableaus are decided exactly. With floats, it is the order that a method may have of
+    which these are the rounded coefficients; see `_defects`.
+
+    **Raises:** `TypeError` if `tableau` is not a `Tableau`.
+    """
+    if not isinstance(tableau, Tableau):
+        raise TypeError(f"order: tableau must be a cfjax.Tableau, got {tableau!r}.")
+    return _largest_order(_defects(_end_weights(tableau), exact_weight), tableau)
+
+
+@lru_cache
+def error_constant(tableau: Tableau) -> float:
+    """The 2-norm of the defects over the words of order q + 1, for a method of order q."""
+    defects = _defects(_end_weights(tableau), exact_weight)
+    for _ in range(order(tableau)):
+        next(defects)
+    return math.hypot(*(float(defect) for defect, _ in next(defects)))
+
+
+def runge_kutta_order(a: Iterable[Iterable[Any]], b: Iterable[Any]) -> int:
+    """The classical order of an explicit Runge-Kutta method, which it has in a linear space.
+
+    `a` holds the rows of the stages after the first, `a[i]` with the coefficients of stages
+    0..i; `b` holds one weight for each stage. These are `a_lower` and `b_sol` of a
+    `diffrax.ButcherTableau`. Floats are treated as in `order`.
+
+    **Raises:** as `Tableau`, naming `alpha` for `a` and `beta` for `b`.
+
+    Source: Hairer, Norsett & Wanner, Solving Ordinary Differential Equations I, theorem II.2.13.
+    """
+    tableau = Tableau([[], *([row] for row in a)], [b])
+    return _largest_order(_defects(_tree_weights(tableau), exact_tree_weight), tableau)
+
+
+def _largest_order(defects: Iterator[Defects], tableau: Tableau) -> int:
+    # An explicit method with s stages has at most order s, so the search ends.
+    for q in range(tableau.num_stages):
+        # Not `any(... > ...)`: an overflow gives the tolerance nan, which must not be accepted.
+        if not all(abs(defect) <= tolerance for defect, tolerance in next(defects)):
+            return q
+    return tableau.num_stages
+
+
+def _defects(orders: Iterator[Weights], exact: Callable[[Word], Fraction]) -> Iterator[Defects]:
+    """The defects and their tolerances, order by order from 1.
+
+    Weights have no rounding errors of their own, so a tolerance has to cover only that of the
+    coefficients: to first order, the sum of the changes that each of them can make. It is zero
+    where they are fractions.
+    """
+    # Simpler would be to bound the weight by the same sums of absolute values. But where large
+    # coefficients cancel that is useless: 0.02 for Dopri8, whose defects are below 3e-16.
+    for weights in orders:
+        yield [
+            (weight.value - exact(word), float(np.abs(weight.change).sum()))
+            if isinstance(weight, _Rounded)
+            else (weight - exact(word), 0.0)
+            for word, weight in weights.items()
+        ]
+
+
+@cache
+def words(n: int) -> tuple[Word, ...]:
+    """All words of order n: 1, 1, 2, 5, 14, 42, 132 from n = 0."""
+    if n == 0:
+        return ((),)
+    return tuple(
+        (tree, *rest)
+        for first in range(1, n + 1)
+        for tree in words(first - 1)
+        for rest in words(n - first)
+    )
+
+
+@cache
+def trees(n: int) -> tuple[Word, ...]:
+    """All rooted trees of order n, children in any order: 1, 1, 2, 4, 9, 20, 48 from n = 1."""
+    return tuple(dict.fromkeys(map(_sorted, words(n - 1))))
+
+
+@cache
+def _sorted(tree: Word) -> Word:
+    return tuple(sorted(map(_sorted, tree)))
+
+
+@cache
+def _order_of(word: Word) -> int:
+    return sum(1 + _order_of(tree) for tree in word)
+
+
+@cache
+def exact_weight(word: Word) -> Fraction:
+    """The weight of a word in the exact solution."""
+    if not word:
+        return Fraction(1)
+    return exact_weight(word[:-1]) * exact_weight(word[-1]) / _order_of(word)
+
+
+@cache
+def exact_tree_weight(tree: Word) -> Fraction:
+    """The weight of a tree in the exact solution in a linear space, one over its density."""
+    return math.prod(map(exact_tree_weight, tree), start=Fraction(1, 1 + _order_of(tree)))
+
+
+def _end_weights(tableau: Tableau) -> Iterator[Weights]:
+    """The weights of all words at the end point, order by order from 1."""
+    rows = _nonzero([prefix[-1] for prefix in tableau.prefixes])
+    for n, (_, end) in enumerate(word_weights(tableau, rows), 1):
+        yield {word: end[word] for word in words(n)}
+
+
+def word_weights(
+    tableau: Tableau, rows: Iterable[Iterable[tuple[int, Any]]]
+) -> Iterator[tuple[list[Weights], Weights]]:
+    """The weights of all words at each stage and at the end point, up to order 1, 2, and so on.
+
+    `rows` holds the last row of each of the tableau's prefixes, as its nonzero coefficients with
+    their stages, in the arithmetic that is wanted.
+    """
+    # At each point on the way, by the flows that lead there. Before the first flow every word but
+    # the empty one has weight 0, and zeros are left out.
+    points: dict[Product, Weights] = {(): {(): Fraction(1)}}
+    flows = []
+    for prefix, row in zip(tableau.prefixes, rows, strict=True):
+        before, after = points[prefix[:-1]], points.setdefault(prefix, {(): Fraction(1)})
+        alone: Weights = {(): Fraction(1)}
+        letters: Weights = {}
+        flows.append((row, before, after, alone, letters))
+    stages = [points[product] for product in tableau.alpha]
+    end = points[tableau.beta]
+    n = 0
+    while True:
+        n += 1
+        for row, before, after, alone, letters in flows:
+            for tree in words(n - 1):
+                letters[tree] = _sum(a * stages[k][tree] for k, a in row if tree in stages[k])
+            for word in words(n):
+                # 1/m! times the product over the word's m letters: the flow by itself.
+                alone[word] = alone[word[:-1]] * letters[word[-1]] / len(word)
+            for word in words(n):
+                splits = ((word[:i], word[i:]) for i in range(len(word) + 1))
+                after[word] = _sum(before[u] * alone[v] for u, v in splits if u in before)
+        yield stages, end
+
+
+def _tree_weights(tableau: Tableau) -> Iterator[Weights]:
+    """The weights of all trees at the end point, order by order from 1, in a linear space.
+
+    There flows add up. For brevity each point must have at most one.
+    """
+    products = (*tableau.alpha, tableau.beta)
+    *rows, end = _nonzero([row[0] if row else () for row in products])
+    # At each stage: of the tree itself, and of its root's children multiplied.
+    grown: list[Weights] = [{} for _ in rows]
+    values: list[Weights] = [{} for _ in rows]
+    n = 0
+    while True:
+        n += 1
+        for tree in trees(n):
+            for branches, value in zip(grown, values, strict=True):
+                value[tree] = math.prod((branches[child] for child in tree), start=Fraction(1))
+        for tree in trees(n):
+            for row, branches in zip(rows, grown, strict=True):
+                branches[tree] = _sum(a * values[k][tree] for k, a in row)
+        yield {tree: _sum(a * values[k][tree] for k, a in end) for tree in trees(n)}
+
+
+def _nonzero(rows: Sequence[Row]) -> list[list[tuple[int, Number]]]:
+    """Each row's nonzero coefficients with their stages. Every float can change on its own."""
+    num_floats = sum(isinstance(a, float) for row in rows for a in row)
+    directions = iter(np.eye(num_floats))
+
+    def number(a: Fraction | float) -> Number:
+        if isinstance(a, Fraction):
+            return a
+        return _Rounded(Fraction(a), float(uncertainty(a)) * next(directions))
+
+    return [[(k, number(a)) for k, a in enumerate(row) if a] for row in rows]
+
+
+def _sum(terms: Iterable[Number]) -> Number:
+    return sum(terms, Fraction(0))

@@ -1,0 +1,49 @@
+"""Rotation of vectors in space by the exponential of a cross product."""
+
+import jax
+from jaxtyping import Array, Float
+
+from .._xla.pack import pack
+from .stumpff import stumpff_1_2_apart
+
+
+def cross(a: Float[Array, "3"], x: Float[Array, "3 *k"]) -> Float[Array, "3 *k"]:
+    """The cross product of `a` with a vector, or with every column of a matrix."""
+    return pack(_cross((a[0], a[1], a[2]), (x[0], x[1], x[2])), sums=True)
+
+
+@jax.jit  # One trace for the many rotations of a step.
+def rotate(a: Float[Array, "3"], x: Float[Array, "3 *k"]) -> Float[Array, "3 *k"]:
+    """Rotates a vector, or every column of a matrix, about `a` by the angle `|a|`.
+
+    Rodrigues' formula `x + c_1 a*x + c_2 a*(a*x)` with cross products and Stumpff functions
+    of `|a|^2`.
+    """
+    return x + displacement(a, x)
+
+
+@jax.jit
+def displacement(a: Float[Array, "3"], x: Float[Array, "3 *k"]) -> Float[Array, "3 *k"]:
+    """`rotate(a, x) - x`, with a rounding as small as it is.
+
+    The rounding of c_1 and c_2 is the same in every step of equal angle, so lengths would drift
+    in proportion to the number of steps. What c_1 and c_2 are at zero is exact, and is kept apart:
+    then the roundings are smaller by the square of the angle.
+    """
+    a0, a1, a2 = a[0], a[1], a[2]
+    s = a0 * a0 + a1 * a1 + a2 * a2
+    near, d1, d2 = stumpff_1_2_apart(s)
+    once = _cross((a0, a1, a2), (x[0], x[1], x[2]))
+    twice = _cross((a0, a1, a2), once)
+    return pack(
+        [near * (once[i] + twice[i] / 2) + (d1 * once[i] + d2 * twice[i]) for i in range(3)],
+        sums=True,
+    )
+
+
+def _cross(a, x):
+    return (
+        a[1] * x[2] - a[2] * x[1],
+        a[2] * x[0] - a[0] * x[2],
+        a[0] * x[1] - a[1] * x[0],
+    )

@@ -1,0 +1,92 @@
+"""Output within a step, on the manifold."""
+
+from collections.abc import Callable
+from typing import Any
+
+import diffrax
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import jax.tree_util as jtu
+from jaxtyping import Array, PyTree
+
+from .._field import combine, flow, leave
+from .._methods.tableau import Extension
+from .._xla.components import by_components
+
+
+class Interpolation(diffrax.AbstractLocalInterpolation):
+    """The solution within a step, by the maps of the step itself, so it stays on the manifold.
+
+    The time may lie outside the step: then it extrapolates.
+    """
+
+    t0: Any
+    t1: Any
+    path: "Path"
+
+    def evaluate(self, t0: Any, t1: Any = None, left: bool = True) -> PyTree:
+        """The solution at time `t0`, or what is added to it from `t0` to `t1`."""
+        del left
+        if t1 is not None:
+            start, end = self.evaluate(t0), self.evaluate(t1)
+            return jtu.tree_map(jnp.subtract, end, start)
+        with jax.numpy_dtype_promotion("standard"):
+            length = jnp.asarray(self.t1 - self.t0)
+            # A solve from a time to the same time makes no step, and asks for its end.
+            theta = (t0 - self.t0) / jnp.where(length == 0, 1, length)
+        return self.path.point(theta)
+
+
+class Path(eqx.Module):
+    """The fields of a step and where it starts, with the extension that they are to go into.
+
+    Arrays that occur several times are kept once: in fields on a common span most do. And the
+    fields stay on a common span only if its arrays are still the same.
+    """
+
+    arrays: tuple[Array, ...]
+    places: tuple[int, ...] = eqx.field(static=True)
+    structure: Any = eqx.field(static=True)
+    extension: Extension = eqx.field(static=True)
+    # Where a combination of the fields leads from a point.
+    move: Callable[[PyTree, PyTree], PyTree] = eqx.field(static=True)
+
+    @classmethod
+    def of(
+        cls,
+        extension: Extension,
+        start: PyTree,
+        fields: list[PyTree],
+        move: Callable[[PyTree, PyTree], PyTree] = flow,
+    ) -> "Path":
+        leaves, structure = jtu.tree_flatten((start, fields))
+        arrays = {id(leaf): leaf for leaf in leaves}
+        index = {key: i for i, key in enumerate(arrays)}
+        places = tuple(index[id(leaf)] for leaf in leaves)
+        return cls(tuple(arrays.values()), places, structure, extension, move)
+
+    def point(self, theta: Any) -> PyTree:
+        """The solution at a part `theta` of the step."""
+
+        def end(arrays: tuple[Array, ...]) -> PyTree:
+            leaves = [arrays[i] for i in self.places]
+            point, fields = jtu.tree_unflatten(self.structure, leaves)
+            for powers in self.extension:
+                weights = _polynomials(powers, theta)
+                used = [(w, f) for w, f in zip(weights, fields, strict=False) if w is not None]
+                point = self.move(combine(*zip(*used, strict=True)), point)
+            return leave(fields[0], point)
+
+        return by_components(end, self.arrays)
+
+
+def _polynomials(powers: Any, theta: Any) -> list[Any]:
+    """The weight of each stage, `sum_i powers[i] theta^(i+1)`; None if it is zero throughout."""
+    weights = []
+    for coefficients in zip(*powers, strict=True):
+        total = 0.0
+        for a in reversed(coefficients):
+            total = (total + float(a)) * theta
+        weights.append(total if any(coefficients) else None)
+    return weights

@@ -1,0 +1,741 @@
+"""Large batches: chunks, files, devices, processes."""
+
+import os
+import socket
+import stat
+import subprocess
+import sys
+from pathlib import Path
+
+import diffrax
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import lineax
+import ml_dtypes
+import numpy as np
+import problems
+import pytest
+from jax.experimental import io_callback
+
+import cfjax
+from cfjax._integrate import batch as _batch
+from cfjax._integrate import fingerprint as _fingerprint
+
+TERM = cfjax.LieTerm(problems.rigid_body)
+SIZE, CHUNK = 23, 5  # A last chunk of three.
+
+
+def solve(member):
+    y0, inertia = member
+    return cfjax.integrate(TERM, cfjax.CF4(), 0.0, 1.0, y0, inertia, num_steps=10).ys[-1]
+
+
+def members(size=SIZE):
+    rng = np.random.default_rng(3)
+    return rng.standard_normal((size, 3)), rng.uniform(1, 2, (size, 3))
+
+
+@pytest.fixture
+def computed(monkeypatch):
+    """The chunks that are computed, by the first entry of their members."""
+    calls = []
+    call = _batch._Program.__call__
+
+    def counted(self, inputs):
+        calls.append(float(inputs[0].flat[0]))
+        return call(self, inputs)
+
+    monkeypatch.setattr(_batch._Program, "__call__", counted)
+    return calls
+
+
+def test_chunks_have_the_values_of_one_vmap():
+    expected = jax.jit(jax.vmap(solve))(tuple(map(jnp.asarray, members())))
+    for chunk_size in (1, CHUNK, SIZE, 1000):
+        values, failed = cfjax.map_batch(solve, members(), chunk_size=chunk_size)
+        assert isinstance(values, np.ndarray)
+        # The compiler orders the operations of a vector and of a scalar loop differently: rounding.
+        np.testing.assert_allclose(values, expected, rtol=0, atol=1e-14)
+        assert failed.shape == (0,)
+
+
+def test_one_trace_for_all_chunks():
+    traces = 0
+
+    def traced(x):
+        nonlocal traces
+        traces += 1
+        return {"twice": 2 * x, "name": "kept"}
+
+    x = np.arange(SIZE)
+    values, _ = cfjax.map_batch(traced, x, chunk_size=CHUNK)
+    assert traces == 1
+    assert values["name"] == "kept"
+    np.testing.assert_array_equal(values["twice"], 2 * x)
+
+
+def test_a_solution_of_diffrax_and_members_that_fail():
+    y0, rate = np.ones((SIZE, 1)), np.ones(SIZE)
+    rate[[4, 17]] = 1e4  # Too fast for so few steps.
+
+    def solve(member):
+        y0, rate = member
+        return diffrax.diffeqsolve(
+            diffrax.ODETerm(lambda t, y, args: -args * y),
+            diffrax.Tsit5(),
+            0.0,
+            1.0,
+            0.1,
+            y0,
+            rate,
+            stepsize_controller=diffrax.PIDController(rtol=0, atol=1e-8),
+            max_steps=64,
+            throw=False,
+        )
+
+    values, failed = cfjax.map_batch(solve, (y0, rate), chunk_size=CHUNK)
+    np.testing.assert_array_equal(failed, [4, 17])
+    assert isinstance(values, diffrax.Solution)
+    good = np.delete(values.ys[:, 0, 0], failed)
+    np.testing.assert_allclose(good, np.exp(-1), rtol=0, atol=1e-7)
+
+
+def test_a_blow_up_with_constant_steps_is_a_failure_and_room_left_is_none():
+    """Of these diffrax gives no result for each member, and fills 2 of 10 places with infinity."""
+    y0 = np.full((SIZE, 1), 0.1)
+    y0[[4, 17]] = 3.0
+
+    def solve(y0):
+        return diffrax.diffeqsolve(
+            cfjax.LieTerm(lambda t, y, args: y * y),
+            cfjax.CF4(),
+            0.0,
+            1.0,
+            0.125,
+            y0,
+            saveat=diffrax.SaveAt(subs=diffrax.SubSaveAt(steps=True)),
+            max_steps=10,
+        )
+
+    values, failed = cfjax.map_batch(solve, y0, chunk_size=CHUNK)
+    np.testing.assert_array_equal(failed, [4, 17])
+    assert np.isinf(values.ts[0, 8:]).all()
+    # The error of CF4 is some 1e-9 here.
+    np.testing.assert_allclose(values.ys[0, 7], 0.1 / 0.9, rtol=1e-7)
+
+
+def test_entries_that_are_not_finite_are_failures():
+    x = np.array([1.0, 0.0, 2.0, 0.0])
+    values, failed = cfjax.map_batch(lambda x: {"a": x, "b": 1 / x, "c": 1}, x, chunk_size=3)
+    np.testing.assert_array_equal(failed, [1, 3])
+    np.testing.assert_array_equal(values["b"], [1, np.inf, 0.5, np.inf])
+
+
+def test_arrays_of_every_kind():
+    x = np.arange(SIZE)
+    result = cfjax.map_batch(every_kind, x, chunk_size=CHUNK)
+    check_every_kind(result, x)
+    swapped = x.astype(x.dtype.newbyteorder())  # As files of other machines have it.
+    check_every_kind(cfjax.map_batch(every_kind, swapped, chunk_size=CHUNK), x)
+    assert cfjax.map_batch(lambda x: None, x).values is None
+
+
+def every_kind(x):
+    return {
+        "none": None,
+        "float": 0.5,
+        "bool": x % 2 == 0,
+        "empty": jnp.zeros((0, 2)),
+        # NumPy and its files know nothing of this one.
+        "bfloat16": jnp.where(x == 7, jnp.nan, x.astype(jnp.bfloat16)),
+        "negative zero": -jnp.zeros(2, complex),
+        "key": jax.random.fold_in(jax.random.key(3), x),
+    }
+
+
+def check_every_kind(result, x):
+    values, failed = result
+    np.testing.assert_array_equal(failed, np.flatnonzero(x == 7))
+    assert values["none"] is None
+    np.testing.assert_array_equal(values["float"], np.full(len(x), 0.5))
+    np.testing.assert_array_equal(values["bool"], x % 2 == 0)
+    assert values["empty"].shape == (len(x), 0, 2)
+    assert values["bfloat16"].dtype == ml_dtypes.bfloat16
+    # Small integers are exact.
+    np.testing.assert_array_equal(values["bfloat16"].astype(float), np.where(x == 7, np.nan, x))
+    assert np.signbit(values["negative zero"].real).all()
+    keys = jax.vmap(lambda x: jax.random.fold_in(jax.random.key(3), x))(x)
+    assert values["key"].dtype == keys.dtype
+    np.testing.assert_array_equal(*map(jax.random.key_data, (values["key"], keys)))
+
+
+def test_keys_captured_among_the_members_and_returned(tmp_path, computed):
+    captured, keys = jax.random.key(1, impl="rbg"), jax.random.split(jax.random.key(2), 3)
+
+    def solve(member):
+        key, x = member
+        return key, captured, x + jax.random.normal(key, (2,)) + jax.random.normal(captured, (2,))
+
+    members = (keys, np.zeros((3, 2)))
+    noise = jax.vmap(solve)((keys, jnp.zeros((3, 2))))[2]
+    mesh = jax.make_mesh((1,), ("i",))
+    for options in ({}, {"mesh": mesh}, {"folder": tmp_path}, {"folder": tmp_path}):
+        returned, same, values = cfjax.map_batch(solve, members, chunk_size=2, **options).values
+        for array, expected in ((returned, keys), (same, captured)):
+            assert array.dtype == expected.dtype
+            assert array.shape == (3,)
+            assert (array == expected).all()
+        # The compiler may join operations in different ways: rounding.
+        np.testing.assert_allclose(values, noise, rtol=0, atol=1e-14)
+    assert len(computed) == 6  # The last two chunks are read.
+
+
+# Files.
+
+
+def test_what_is_finished_is_read_and_not_computed_again(tmp_path, computed):
+    folder = tmp_path / "some" / "results"
+    first, _ = cfjax.map_batch(solve, members(), chunk_size=CHUNK, folder=folder)
+    assert len(computed) == 5
+    assert sorted(os.listdir(folder)) == [f"chunk_{i:06}.bin" for i in range(5)]
+    again, _ = cfjax.map_batch(solve, members(), chunk_size=CHUNK, folder=str(folder))
+    assert len(computed) == 5
+    np.testing.assert_array_equal(again, first)
+
+
+def test_an_interrupted_batch_goes_on_where_it_stopped(tmp_path, computed, monkeypatch):
+    write = _batch._Store.write
+
+    def interrupted(self, number, inputs, outputs):
+        if number == 2:
+            raise KeyboardInterrupt
+        write(self, number, inputs, outputs)
+
+    with monkeypatch.context() as patch, pytest.raises(KeyboardInterrupt):
+        patch.setattr(_batch._Store, "write", interrupted)
+        cfjax.map_batch(solve, members(), chunk_size=CHUNK, folder=tmp_path)
+    assert sorted(os.listdir(tmp_path)) == ["chunk_000000.bin", "chunk_000001.bin"]
+    values, _ = cfjax.map_batch(solve, members(), chunk_size=CHUNK, folder=tmp_path)
+    y0 = members()[0][:, 0]
+    assert computed == list(y0[[0, 5, 10, 10, 15, 20]])
+    expected, _ = cfjax.map_batch(solve, members(), chunk_size=CHUNK)
+    np.testing.assert_array_equal(values, expected)
+
+
+def test_an_interrupted_write_leaves_no_file(tmp_path, monkeypatch):
+    def interrupted(descriptor):
+        raise KeyboardInterrupt
+
+    monkeypatch.setattr(os, "fsync", interrupted)
+    with pytest.raises(KeyboardInterrupt):
+        cfjax.map_batch(solve, members(), chunk_size=CHUNK, folder=tmp_path)
+    assert os.listdir(tmp_path) == []
+
+
+def test_a_damaged_file_is_computed_again(tmp_path, computed):
+    first, _ = cfjax.map_batch(solve, members(), chunk_size=CHUNK, folder=tmp_path)
+    del computed[:]
+    path = tmp_path / "chunk_000003.bin"
+    content = path.read_bytes()
+    path.write_bytes(content[:-1] + bytes([content[-1] ^ 1]))
+    again, _ = cfjax.map_batch(solve, members(), chunk_size=CHUNK, folder=tmp_path)
+    assert computed == [members()[0][15, 0]]
+    np.testing.assert_array_equal(again, first)
+    cfjax.map_batch(solve, members(), chunk_size=CHUNK, folder=tmp_path)
+    assert len(computed) == 1
+
+
+def test_no_damage_is_taken_for_results(tmp_path):
+    x = np.arange(3.0)
+    program = _batch._Program(lambda x: (x, x > 1), x, 3, None)
+    store = _batch._Store(tmp_path, program)
+    outputs = program([x])
+    store.write(0, [x], outputs)
+    path = tmp_path / "chunk_000000.bin"
+    content = path.read_bytes()
+    damaged = [content[:length] for length in range(len(content))]
+    damaged += [content + b"\0", b"something else"]
+    for bit in range(8 * len(content)):
+        changed = bytearray(content)
+        changed[bit // 8] ^= 1 << bit % 8
+        damaged.append(bytes(changed))
+    for wrong in damaged:
+        path.write_bytes(wrong)
+        assert store.read(0, [x]) is None
+    path.unlink()
+    path.mkdir()
+    assert store.read(0, [x]) is None
+    path.rmdir()
+    path.write_bytes(content)
+    assert store.read(0, [x + 1]) is None
+    for read, output in zip(store.read(0, [x]), outputs, strict=True):
+        np.testing.assert_array_equal(read, output)
+
+
+def test_files_of_every_kind(tmp_path, computed):
+    x = np.arange(SIZE)
+    for _ in range(2):
+        result = cfjax.map_batch(every_kind, x, chunk_size=CHUNK, folder=tmp_path)
+        check_every_kind(result, x)
+    assert len(computed) == 5
+
+
+def test_what_is_read_needs_no_compilation(tmp_path, monkeypatch):
+    def read_or_compute():
+        return cfjax.map_batch(lambda x: 2 * x, np.arange(3), folder=tmp_path).values
+
+    first = read_or_compute()
+    monkeypatch.setattr(_batch._Program, "run", None)
+    np.testing.assert_array_equal(read_or_compute(), first)
+
+
+@pytest.mark.skipif(os.name != "posix", reason="Modes of files are of POSIX.")
+def test_files_have_the_mode_that_the_user_wants(tmp_path):
+    old = os.umask(0o027)
+    try:
+        cfjax.map_batch(lambda x: x, np.ones(3), folder=tmp_path)
+    finally:
+        os.umask(old)
+    assert stat.S_IMODE((tmp_path / "chunk_000000.bin").stat().st_mode) == 0o640
+
+
+def test_what_a_killed_process_leaves_is_written_over(tmp_path):
+    killed = """
+import os, signal, sys
+import numpy as np
+import cfjax
+os.fsync = lambda descriptor: os.kill(os.getpid(), signal.SIGKILL)
+cfjax.map_batch(lambda x: x, np.ones(3, np.float32), folder=sys.argv[1])
+"""
+    process = subprocess.run([sys.executable, "-c", killed, str(tmp_path)])
+    assert process.returncode == -9
+    assert len(os.listdir(tmp_path)) == 1
+    cfjax.map_batch(lambda x: x, np.ones(3), folder=tmp_path)
+    assert os.listdir(tmp_path) == ["chunk_000000.bin"]
+
+
+def test_another_process_writes_the_same_chunk_at_the_same_time(tmp_path, monkeypatch):
+    x = np.arange(3.0)
+    program = _batch._Program(lambda x: 2 * x, x, 3, None)
+    store = _batch._Store(tmp_path, program)
+    sync, others = os.fsync, [store]
+
+    def other_comes_between(descriptor):
+        sync(descriptor)
+        while others:
+            others.pop().write(0, [x], [2 * x])
+
+    monkeypatch.setattr(os, "fsync", other_comes_between)
+    store.write(0, [x], [2 * x])
+    assert os.listdir(tmp_path) == ["chunk_000000.bin"]
+    np.testing.assert_array_equal(store.read(0, [x])[0], 2 * x)
+
+
+@pytest.mark.skipif(os.name != "posix", reason="Elsewhere no folder can be opened.")
+def test_the_name_of_a_file_is_on_the_disk_too(tmp_path, monkeypatch):
+    events = []
+    sync, replace, open_ = os.fsync, os.replace, os.open
+
+    def spied_sync(descriptor):
+        events.append("folder" if stat.S_ISDIR(os.fstat(descriptor).st_mode) else "file")
+        sync(descriptor)
+
+    def spied_replace(old, new):
+        events.append("name")
+        replace(old, new)
+
+    monkeypatch.setattr(os, "fsync", spied_sync)
+    monkeypatch.setattr(os, "replace", spied_replace)
+    cfjax.map_batch(lambda x: x, np.ones(3), folder=tmp_path)
+    assert events == ["file", "name", "folder"]
+
+    def no_folders(path, *arguments, **options):
+        if os.path.isdir(path):
+            raise PermissionError
+        return open_(path, *arguments, **options)
+
+    monkeypatch.setattr(os, "open", no_folders)
+    cfjax.map_batch(lambda x: x, np.zeros(3), folder=tmp_path)
+    assert events[3:] == ["file", "name"]
+
+
+def test_results_of_other_members_or_another_solve_are_not_taken(tmp_path, computed):
+    def scaled(factor):
+        return lambda member: factor * solve(member)
+
+    factor = jnp.asarray(2.0)
+    cfjax.map_batch(scaled(factor), members(), chunk_size=CHUNK, folder=tmp_path)
+    for constant in (2.5, jnp.asarray(3.0)):
+        del computed[:]
+        values, _ = cfjax.map_batch(scaled(constant), members(), chunk_size=CHUNK, folder=tmp_path)
+        assert len(computed) == 5
+        expected, _ = cfjax.map_batch(scaled(constant), members(), chunk_size=CHUNK)
+        np.testing.assert_array_equal(values, expected)
+    del computed[:]
+    y0, inertia = members()
+    y0[7, 0] += 1
+    cfjax.map_batch(scaled(jnp.asarray(3.0)), (y0, inertia), chunk_size=CHUNK, folder=tmp_path)
+    assert computed == [y0[5, 0]]
+
+
+def test_results_of_another_parameter_of_the_field_are_not_taken(tmp_path):
+    for inertia in (jnp.asarray([7 / 8, 5 / 8, 1 / 4]), jnp.asarray([2.0, 1.0, 0.5])):
+        y0, _ = members()
+        solve = SOLVES["array in the field"](inertia)
+        values, _ = cfjax.map_batch(solve, y0, folder=tmp_path)
+        expected, _ = cfjax.map_batch(solve, y0)
+        np.testing.assert_array_equal(values, expected)
+
+
+# A folder's key: each of these captures its parameter in another place.
+
+
+def rigid_body(parameter):
+    term = cfjax.LieTerm(lambda t, y, args: cfjax.Rotation(-y / parameter))
+    return lambda y: cfjax.integrate(term, cfjax.LieEuler(), 0.0, 1.0, y, num_steps=10).ys[-1]
+
+
+def decay(parameter):
+    term = diffrax.ODETerm(lambda t, y, args: -y / parameter)
+    return lambda y: diffrax.diffeqsolve(term, diffrax.Euler(), 0.0, 1.0, 0.1, y).ys[-1]
+
+
+def network(parameter):
+    mlp = eqx.nn.MLP(3, 3, 4, 1, key=jax.random.key(0))
+    bias = jnp.full(4, parameter[0])
+    mlp = eqx.tree_at(lambda mlp: mlp.layers[0].bias, mlp, bias)
+    return jax.jit(lambda y: mlp(y))
+
+
+def jitted(parameter):
+    return jax.jit(jax.jit(lambda y: jnp.where(y > 0, y * np.asarray(parameter), 1.0)))
+
+
+def custom_derivative(parameter):
+    @jax.custom_jvp
+    def scaled(y):
+        return parameter * y
+
+    scaled.defjvp(lambda primals, tangents: (scaled(*primals), np.asarray(parameter) * tangents[0]))
+    return jax.grad(lambda y: jnp.sum(jnp.where(y > 0, scaled(y), y)))
+
+
+def branch(parameter):
+    return lambda y: jax.lax.cond(y[0] > 0, lambda: y, lambda: y - parameter)
+
+
+def loop(parameter):
+    return lambda y: jax.lax.while_loop(lambda y: y[0] < 1, lambda y: y + parameter, y)
+
+
+def operator(parameter):
+    """The jaxpr shows where in memory the function lies, and the set in an order by chance."""
+    tags = {lineax.symmetric_tag, lineax.positive_semidefinite_tag, lineax.diagonal_tag}
+    scaled = lambda x, factor=float(parameter[0]): factor * x  # noqa: E731
+
+    def solve(y):
+        scale = lineax.FunctionLinearOperator(scaled, jax.eval_shape(lambda: y), tags)
+        return lineax.linear_solve(scale, y, lineax.GMRES(1e-8, 1e-8)).value
+
+    return solve
+
+
+def one_of_many(parameter):
+    table = np.zeros(1000)
+    table[567] = parameter[1]
+    return jax.jit(lambda y: y + jnp.asarray(table)[jnp.argmax(y)])
+
+
+SOLVES = {
+    "array in the field": rigid_body,
+    "number in the field": lambda parameter: rigid_body(float(parameter[0])),
+    "array without axes": lambda parameter: rigid_body(jnp.asarray(parameter[0])),
+    "field for diffrax": decay,
+    "network": network,
+    "jit": jitted,
+    "custom derivative": custom_derivative,
+    "branch": branch,
+    "loop": loop,
+    "operator": operator,
+    "one of many": one_of_many,
+}
+
+
+def key(solve):
+    return _batch._Program(solve, np.ones((4, 3)), 4, None).fingerprint()
+
+
+@pytest.mark.parametrize("name", SOLVES)
+def test_a_key_knows_every_constant_to_the_last_bit(name):
+    parameter = np.asarray([0.1, 0.2, 0.3])
+    first = key(SOLVES[name](parameter))
+    assert key(SOLVES[name](parameter.copy())) == first
+    assert key(SOLVES[name](np.nextafter(parameter, 1))) != first
+
+
+@pytest.mark.skipif(
+    not hasattr(jax.config, "jax_use_simplified_jaxpr_constants"), reason="For a time only."
+)
+def test_a_key_knows_constants_that_jax_makes_inputs():
+    jax.config.update("jax_use_simplified_jaxpr_constants", True)
+    try:
+        first, again, other = (key(one_of_many(np.arange(3.0) + x)) for x in (0, 0, 1))
+    finally:
+        jax.config.update("jax_use_simplified_jaxpr_constants", False)
+    assert first == again != other
+
+
+KEYS = f"""
+import sys
+sys.path[:0] = [{str(Path(__file__).parent)!r}, {str(Path(__file__).parents[1])!r}]
+import jax
+jax.config.update("jax_enable_x64", True)
+jax.config.update("jax_numpy_dtype_promotion", "strict")
+import numpy as np
+import test_batch
+for name in reversed(test_batch.SOLVES):
+    solve = test_batch.SOLVES[name](np.asarray([0.1, 0.2, 0.3]))
+    print(name, test_batch.key(solve).hex(), sep=":")
+"""
+
+
+def test_a_key_is_the_same_in_every_process_and_after_other_programs():
+    parameter = np.asarray([0.1, 0.2, 0.3])
+    keys = {name: key(make(parameter)).hex() for name, make in SOLVES.items()}
+    for make in SOLVES.values():  # The same functions of jax and equinox in other programs.
+        jax.eval_shape(jax.vmap(make(2 * parameter)), jnp.ones((2, 3)))
+    assert {name: key(SOLVES[name](parameter)).hex() for name in reversed(SOLVES)} == keys
+    # Nor does the order of sets count, which is another one in every process.
+    elsewhere = subprocess.run(
+        [sys.executable, "-c", KEYS],
+        env=os.environ | {"PYTHONHASHSEED": "7", "JAX_PLATFORMS": "cpu"},
+        stdout=subprocess.PIPE,
+        text=True,
+        check=True,
+    )
+    assert dict(line.split(":") for line in elsewhere.stdout.splitlines()) == keys
+
+
+def test_a_key_does_not_know_what_jax_remembers():
+    """A function that jax knows is shared by its calls, and one that it has forgotten is not."""
+    called = jax.jit(lambda y: jnp.where(y > 0, jnp.sin(y), y))
+
+    def solve(y, forget):
+        y = called(eqx.error_if(y, y > 2, "too large"))
+        if forget:
+            jax.clear_caches()
+        return called(eqx.error_if(y, y > 2, "too large")) + called(y)
+
+    texts = [jax.jit(solve, static_argnums=1).lower(jnp.ones(3), x).as_text() for x in (0, 1)]
+    assert texts[0].count("func.func") < texts[1].count("func.func")
+    assert key(lambda y: solve(y, False)) == key(lambda y: solve(y, True))
+
+
+def test_a_key_knows_versions_precision_device_and_mesh(monkeypatch, no_shape_hook):
+    matrix = np.ones((3, 3), np.float32)
+    solve = lambda y: matrix @ y.astype(np.float32)  # noqa: E731
+    keys = [key(solve)]
+    with jax.default_matmul_precision("highest"):
+        keys.append(key(solve))
+    program = _batch._Program(solve, np.ones((4, 3)), 4, jax.make_mesh((1,), ("i",)))
+    keys.append(program.fingerprint())
+    for module in (cfjax, jax, _fingerprint.jaxlib.version):
+        with monkeypatch.context() as patch:
+            patch.setattr(module, "__version__", "another")
+            keys.append(key(solve))
+
+    class Other:
+        platform, device_kind = "gpu", "H100"
+
+    keys.append(_fingerprint.fingerprint(program.traced, program.lowered, [Other()]))
+    assert len(set(keys)) == len(keys)
+
+
+# Functions of the host.
+
+
+def on_host(y):
+    return jax.pure_callback(np.sin, y, y, vmap_method="expand_dims")
+
+
+def host_in_a_loop(y):
+    return jax.lax.fori_loop(0, 3, lambda i, y: jax.jit(on_host)(y), y)
+
+
+def host_in_an_operator(y):
+    shape = jax.ShapeDtypeStruct(y.shape, y.dtype)
+    return lineax.linear_solve(
+        lineax.FunctionLinearOperator(host_in_a_loop, shape), y, lineax.GMRES(1e-8, 1e-8)
+    ).value
+
+
+def progress_meter(y):
+    term, meter = diffrax.ODETerm(lambda t, y, args: -y), diffrax.TextProgressMeter()
+    return diffrax.diffeqsolve(
+        term, diffrax.Euler(), 0.0, 1.0, 0.5, y, progress_meter=meter, throw=False
+    ).ys
+
+
+@pytest.mark.parametrize(
+    "solve",
+    [
+        on_host,
+        host_in_a_loop,
+        host_in_an_operator,
+        progress_meter,
+        lambda y: io_callback(np.sin, y, y),
+        lambda y: eqx.filter_pure_callback(
+            np.sin, y, result_shape_dtypes=y, vmap_method="expand_dims"
+        ),
+    ],
+)
+def test_no_folder_where_the_host_gives_values(tmp_path, solve):
+    checked = lambda y: solve(eqx.error_if(y, y < 0, "negative"))  # noqa: E731
+    with pytest.raises(ValueError, match="calls a function of the host"):
+        cfjax.map_batch(checked, np.ones((4, 3)), folder=tmp_path / "none")
+    assert os.listdir(tmp_path) == []
+
+
+def test_prints_and_checks_of_equinox_give_no_values(tmp_path, capfd):
+    def solve(y):
+        jax.debug.print("y = {}", y)
+        loss = lambda y: jnp.sum(eqx.error_if(y, y < 0, "negative") ** 2)  # noqa: E731
+        return jax.grad(loss)(y), jax.hessian(loss)(y)
+
+    for _ in range(2):
+        values, _ = cfjax.map_batch(solve, np.ones((2, 1)), folder=tmp_path)
+        jax.effects_barrier()
+        np.testing.assert_array_equal(values[0], np.full((2, 1), 2.0))
+    assert capfd.readouterr().out == 2 * "y = [1.]\n"
+    with pytest.raises(Exception, match="negative"):
+        cfjax.map_batch(solve, -np.ones((2, 1)), folder=tmp_path)
+
+
+# Members in files.
+
+
+def test_members_of_a_memory_map(tmp_path):
+    y0, inertia = members()
+    np.save(tmp_path / "y0.npy", y0)
+    mapped = np.load(tmp_path / "y0.npy", mmap_mode="r")
+    values, _ = cfjax.map_batch(solve, (mapped, inertia), chunk_size=CHUNK)
+    expected, _ = cfjax.map_batch(solve, members(), chunk_size=CHUNK)
+    np.testing.assert_array_equal(values, expected)
+
+
+# Many devices. Each needs a process of its own, as jax fixes its devices when it starts.
+
+PROGRAM = f"""
+import sys
+sys.path[:0] = [{str(Path(__file__).parent)!r}, {str(Path(__file__).parents[1])!r}]
+import jax
+jax.config.update("jax_enable_x64", True)
+if len(sys.argv) > 4:
+    jax.distributed.initialize(sys.argv[4], num_processes=2, process_id=int(sys.argv[5]))
+import numpy as np
+import cfjax
+import test_batch
+shape = tuple(map(int, sys.argv[2].split("x")))
+mesh = jax.make_mesh(shape, ("i", "j")[: len(shape)])
+assert mesh.size == jax.device_count()
+values, failed = cfjax.map_batch(
+    test_batch.solve, test_batch.members(), chunk_size=test_batch.CHUNK, mesh=mesh,
+    folder=sys.argv[3],
+)
+again, failed = cfjax.map_batch(
+    test_batch.solve, test_batch.members(), chunk_size=test_batch.CHUNK, mesh=mesh,
+    folder=sys.argv[3],
+)
+np.testing.assert_array_equal(again, values)
+np.save(sys.argv[1], values)
+x = np.arange(test_batch.SIZE)
+for _ in range(2):
+    result = cfjax.map_batch(test_batch.every_kind, x, mesh=mesh, folder=sys.argv[3] + "_of_kinds")
+    test_batch.check_every_kind(result, x)
+"""
+
+
+def start(devices, *arguments):
+    flags = f"--xla_force_host_platform_device_count={devices}"
+    return subprocess.Popen(
+        [sys.executable, "-c", PROGRAM, *map(str, arguments)],
+        env=os.environ | {"XLA_FLAGS": flags, "JAX_PLATFORMS": "cpu"},
+        stderr=subprocess.PIPE,
+        text=True,
+    )
+
+
+def check_against_one_device(path):
+    expected, _ = cfjax.map_batch(solve, members(), chunk_size=CHUNK)
+    # Parts of other lengths may be compiled to other vectors: rounding, as above.
+    np.testing.assert_allclose(np.load(path), expected, rtol=0, atol=1e-14)
+
+
+@pytest.mark.parametrize("shape", ["8", "4x2"])
+def test_eight_devices(tmp_path, shape):
+    process = start(8, tmp_path / "values.npy", shape, tmp_path / "chunks")
+    _, error = process.communicate(timeout=300)
+    assert process.returncode == 0, error
+    assert len(os.listdir(tmp_path / "chunks")) == 3  # Of eight members instead of five.
+    check_against_one_device(tmp_path / "values.npy")
+
+
+def test_two_processes(tmp_path):
+    with socket.socket() as free:
+        free.bind(("localhost", 0))
+        address = f"localhost:{free.getsockname()[1]}"
+    processes = [
+        start(2, tmp_path / f"values{i}.npy", "4", tmp_path / "chunks", address, i)
+        for i in range(2)
+    ]
+    for process in processes:
+        _, error = process.communicate(timeout=300)
+        assert process.returncode == 0, error
+    assert len(os.listdir(tmp_path / "chunks")) == 3
+    for i in range(2):
+        check_against_one_device(tmp_path / f"values{i}.npy")
+
+
+# Wrong inputs.
+
+
+@pytest.mark.parametrize(
+    "wrong, kind, message",
+    [
+        ((), TypeError, "at least one array"),
+        ((np.ones(2), 1.0), TypeError, r"members\[1\] must be an array"),
+        ((np.ones(2), np.ones(())), TypeError, r"members\[1\] must be an array"),
+        ((np.ones(2), np.ones((3, 2))), ValueError, r"members\[0\]': 2, 'members\[1\]': 3"),
+        ((np.ones((0, 2)),), ValueError, "must not be empty"),
+        (jax.random.key(0), TypeError, "members must be an array of numbers or of PRNG keys"),
+        ((np.array(["a"]),), TypeError, r"members\[0\] must be an array of numbers"),
+        ((np.array([None]),), TypeError, r"members\[0\] must be an array of numbers"),
+        ((np.ones(2, "M8[s]"),), TypeError, r"members\[0\] must be an array of numbers"),
+        ((np.ones(2, np.longdouble),), TypeError, r"members\[0\] must be an array of numbers"),
+        ([1.0, 2.0], TypeError, r"members\[0\] must be an array of numbers.*got 1\.0"),
+        ((np.ma.masked_less(np.ones(2), 2),), TypeError, r"members\[0\] must not be masked"),
+    ],
+)
+def test_wrong_members(wrong, kind, message):
+    with pytest.raises(kind, match=message):
+        cfjax.map_batch(lambda x: x, wrong)
+
+
+@pytest.mark.parametrize("chunk_size", [0, -1, 2.0, True])
+def test_wrong_chunk_size(chunk_size, no_shape_hook):
+    with pytest.raises(ValueError, match="chunk_size must be an integer of at least 1, got"):
+        cfjax.map_batch(solve, members(), chunk_size=chunk_size)
+
+
+def test_a_chunk_size_of_numpy(no_shape_hook):
+    values, _ = cfjax.map_batch(lambda x: 2 * x, np.arange(3), chunk_size=np.int64(2))
+    np.testing.assert_array_equal(values, [0, 2, 4])
+
+
+def test_a_folder_that_is_a_file(tmp_path):
+    path = tmp_path / "file"
+    path.write_text("mine")
+    with pytest.raises(FileExistsError):
+        cfjax.map_batch(solve, members(), folder=path)
+    assert path.read_text() == "mine"

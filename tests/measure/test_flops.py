@@ -1,0 +1,240 @@
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from jax import lax
+
+from cfjax._measure.flops import count_flops
+
+X = jnp.ones(10)
+SCALAR = jnp.ones(())
+
+
+def matrix(*shape):
+    return jax.ShapeDtypeStruct(shape, float)
+
+
+def horner(x):
+    return ((2.0 * x + 3.0) * x + 5.0) * x + 7.0
+
+
+def steps(x):
+    return lax.scan(lambda y, _: (2.0 * y + 1.0, None), x, length=5)[0]
+
+
+def either(x):
+    return lax.cond(x[0] > 0, jnp.sin, lambda x: x * x + 1.0, x)
+
+
+def branches_in_a_loop(x):
+    """Adds 1 three times and then, the sum being 4, doubles and adds 1 twice."""
+
+    def step(y, _):
+        return lax.cond(y < 4.0, lambda y: y + 1.0, lambda y: 2.0 * y + 1.0, y), None
+
+    return lax.scan(step, x, length=5)[0]
+
+
+@jax.custom_jvp
+def own_derivative(x):
+    return x * 3.0
+
+
+own_derivative.defjvp(lambda primals, tangents: (own_derivative(*primals), tangents[0] * 3.0))
+
+
+@pytest.mark.parametrize(
+    "fun, arguments, flops",
+    [
+        (jnp.matmul, (matrix(3, 4), matrix(4, 5)), 2 * 3 * 4 * 5),
+        (jnp.matmul, (matrix(6, 3, 4), matrix(6, 4, 5)), 6 * 2 * 3 * 4 * 5),
+        (jnp.dot, (X, X), 20),
+        (jnp.cross, (matrix(3), matrix(3)), 9),
+        (horner, (X,), 60),
+        (steps, (SCALAR,), 10),
+        (lambda x: lax.fori_loop(0, 4, lambda i, y: jnp.sin(y) / 2.0, x), (X,), 80),
+        (either, (matrix(10),), 20),
+        (either, (X,), 10),
+        (either, (-X,), 20),
+        (lambda x: lax.cond(False, jnp.sin, lambda x: x * x + 1.0, x), (matrix(10),), 20),
+        (branches_in_a_loop, (SCALAR,), 3 + 2 * 2),
+        (branches_in_a_loop, (matrix(),), 5 * 2),
+        (jnp.sum, (X,), 9),
+        (jnp.prod, (matrix(4, 5),), 19),
+        (lambda x: jnp.sum(x, axis=0), (matrix(4, 5),), 15),
+        (jnp.cumsum, (X,), 9),
+        (lambda x: x**5, (X,), 30),
+        (lambda x: x**8, (SCALAR,), 3),
+        (lambda x: x**-2, (SCALAR,), 2),
+        (lambda x: jnp.sqrt(x) + jnp.exp(x), (X,), 30),
+        (own_derivative, (X,), 10),
+        (jax.grad(lambda x: own_derivative(x)), (SCALAR,), 1),
+        (jax.checkpoint(horner), (X,), 60),
+        (jax.jit(horner), (X,), 60),
+        (lambda x: horner(x)[0], (X,), 60),
+    ],
+)
+def test_flops_of_known_programs(fun, arguments, flops):
+    assert count_flops(fun, *arguments) == flops
+
+
+def test_moves_signs_and_comparisons_are_free():
+    def fun(x):
+        y = jnp.where(x > 0, -x, jnp.maximum(x, 2.0))
+        y = jnp.concatenate([y[3:], jnp.round(abs(y[:3]))]).reshape(5, 2).T
+        return y, jnp.max(y), y.astype(jnp.float32)
+
+    assert count_flops(fun, X) == 0
+
+
+def test_integer_arithmetic_is_free():
+    assert count_flops(lambda n: n * n + 1, jnp.arange(3)) == 0
+
+
+def test_what_is_not_needed_is_not_counted():
+    def fun(x):
+        unused = jnp.sin(x) * 3.0
+        return x + 1.0, jax.jit(lambda a, b: (a, b * 2.0))(x, unused)[0]
+
+    assert count_flops(fun, X) == 10
+
+
+def test_what_is_computed_twice_counts_once():
+    def twice(x, y):
+        return jax.jit(horner)(x) + jax.jit(horner)(x), horner(x) * 2.0, horner(y)
+
+    assert count_flops(twice, X, X) == 60 + 10 + 10 + 60
+
+
+# Solves and factorisations, against the operations written out
+
+
+def gauss(n, right):
+    """Elimination and two substitutions: divisions, multiplications and additions."""
+    flops = 0
+    for k in range(n):
+        flops += (n - k - 1) * (1 + 2 * (n - k - 1))
+    for k in range(n):
+        # Forward with ones on the diagonal, backward with a division.
+        flops += right * (2 * k + 2 * k + 1)
+    return flops
+
+
+def cholesky(n):
+    flops = 0
+    for k in range(n):
+        flops += 1 + (n - k - 1)
+        flops += sum(2 for i in range(k + 1, n) for j in range(k + 1, i + 1))
+    return flops
+
+
+def householder(m, n):
+    """The leading terms: each reflection of length l on c columns costs 4 l c."""
+    return sum(4 * (m - k) * (n - k) for k in range(min(m, n)))
+
+
+@pytest.mark.parametrize("n, right", [(1, 1), (3, 2), (8, 4), (20, 1)])
+def test_linear_solve(n, right):
+    flops = count_flops(jnp.linalg.solve, matrix(n, n), matrix(n, right))
+    assert flops == gauss(n, right)
+    batch = count_flops(jnp.linalg.solve, matrix(5, n, n), matrix(5, n, right))
+    assert batch == 5 * flops
+
+
+@pytest.mark.parametrize("m, n", [(3, 3), (5, 2), (2, 5)])
+def test_lu(m, n):
+    pivots = range(min(m, n))
+    flops = sum((m - k - 1) * (1 + 2 * (n - k - 1)) for k in pivots)
+    assert count_flops(lambda a: lax.linalg.lu(a)[0], matrix(m, n)) == flops
+
+
+@pytest.mark.parametrize("n", [1, 2, 7])
+def test_cholesky(n):
+    assert count_flops(lambda a: lax.linalg.cholesky(a, symmetrize_input=False), matrix(n, n)) == (
+        cholesky(n)
+    )
+
+
+def test_triangular_solve():
+    def solve(unit, a, b):
+        return lax.linalg.triangular_solve(a, b, left_side=True, lower=True, unit_diagonal=unit)
+
+    for unit, flops in [(False, 16), (True, 12)]:
+        assert count_flops(lambda a, b, u=unit: solve(u, a, b), matrix(4, 4), matrix(4, 3)) == (
+            3 * flops
+        )
+
+
+@pytest.mark.parametrize("m, n", [(200, 200), (300, 100)])
+def test_qr(m, n):
+    # To the leading order, which is all that a count by formula means.
+    flops = count_flops(jnp.linalg.qr, matrix(m, n))
+    assert abs(flops / (2 * householder(m, n)) - 1) < 0.02
+
+
+def test_eigh():
+    n = 6
+    flops = count_flops(lambda a: lax.linalg.eigh(a, symmetrize_input=False)[0], matrix(n, n))
+    assert flops == 9 * n**3
+
+
+@pytest.mark.parametrize(
+    "fun, argument, flops",
+    [
+        (jnp.fft.fft, jax.ShapeDtypeStruct((16,), complex), 5 * 16 * 4),
+        (jnp.fft.fft, jax.ShapeDtypeStruct((3, 8), complex), 3 * 5 * 8 * 3),
+        (jnp.fft.fft2, jax.ShapeDtypeStruct((4, 8), complex), 5 * 32 * 5),
+        (jnp.fft.rfft, matrix(16), 5 * 16 * 4 // 2),
+        (jnp.fft.irfft, jax.ShapeDtypeStruct((9,), complex), 5 * 16 * 4 // 2),
+    ],
+)
+def test_fourier_transforms(fun, argument, flops):
+    assert count_flops(fun, argument) == flops
+
+
+@pytest.mark.parametrize(
+    "fun, flops",
+    [
+        (lambda x, y: x + y, 2),
+        (lambda x, y: x - y, 2),
+        (lambda x, y: x * y, 6),
+        (lambda x, y: x / y, 11),
+        (lambda x, y: abs(x), 4),
+        (lambda x, y: -x.conj().real, 0),
+        (lambda x, y: x**3, 12),
+    ],
+)
+def test_complex_numbers(fun, flops):
+    z = jax.ShapeDtypeStruct((10,), complex)
+    assert count_flops(fun, z, z) == 10 * flops
+
+
+def test_complex_products_of_matrices():
+    def z(*shape):
+        return jax.ShapeDtypeStruct(shape, complex)
+
+    assert count_flops(jnp.matmul, z(3, 4), z(4, 5)) == 4 * 2 * 3 * 4 * 5
+    assert count_flops(jnp.linalg.solve, z(5, 5), z(5, 2)) == 4 * gauss(5, 2)
+
+
+@pytest.mark.parametrize(
+    "fun, message",
+    [
+        (lambda x: jnp.linalg.svd(x)[1], "svd"),
+        (lax.lgamma, "lgamma"),
+        (lambda x: jnp.sin(lax.complex(x, x)), "sin of complex"),
+        (lambda x: lax.while_loop(lambda y: y[0, 0] < 9.0, lambda y: y + 1.0, x), "while loop"),
+    ],
+)
+def test_what_has_no_rule_raises(fun, message):
+    with pytest.raises(NotImplementedError, match=message):
+        count_flops(fun, matrix(3, 3))
+
+
+def test_a_check_counts_nothing_and_a_function_of_the_host_is_refused():
+    checked = lambda x: eqx.error_if(2 * x, x > 3, "too large")  # noqa: E731
+    assert count_flops(checked, 1.0) == 1
+    host = lambda x: jax.pure_callback(np.sin, jax.ShapeDtypeStruct((), float), x)  # noqa: E731
+    with pytest.raises(NotImplementedError, match="function of the host"):
+        count_flops(host, 1.0)

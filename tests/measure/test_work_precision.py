@@ -1,0 +1,557 @@
+"""Work and precision: counts by hand, errors against a known solution, failures, files."""
+
+import csv
+import io
+import sys
+
+import diffrax
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+import problems
+import pytest
+from matplotlib.backends.backend_agg import FigureCanvasAgg
+from rich.console import Console
+from rich.progress import Progress
+
+import cfjax
+from cfjax._measure import work_precision as _work_precision
+
+Y0, ARGS = problems.MOMENTUM, problems.INERTIA
+TERM = cfjax.LieTerm(problems.driven_body)
+SPACE = diffrax.ODETerm(lambda t, y, args: cfjax.tangent(problems.driven_body(t, y, args), y))
+QUICK = dict(repeats=2, budget=5.0)
+
+
+@pytest.fixture(scope="module")
+def answer():
+    return problems.reference(
+        lambda t, y: problems.driven_body_ode(t, y, ARGS), 0.0, 1.0, problems.MOMENTUM
+    )
+
+
+@pytest.fixture(scope="module")
+def equal(answer):
+    return cfjax.work_precision(
+        TERM,
+        0.0,
+        1.0,
+        Y0,
+        ARGS,
+        methods={
+            "CF4": cfjax.CF4(),
+            "CG3": cfjax.CG3(),
+            "RKMK4": cfjax.RKMK4(),
+            "Tsit5": (SPACE, diffrax.Tsit5()),
+        },
+        reference=answer,
+        num_steps=[8, 16, 32],
+        **QUICK,
+    )
+
+
+@pytest.fixture(scope="module")
+def adaptive(answer):
+    return cfjax.work_precision(
+        TERM,
+        0.0,
+        1.0,
+        Y0,
+        ARGS,
+        methods={
+            "CF4": diffrax.HalfSolver(cfjax.CF4()),
+            "Tsit5": (SPACE, diffrax.Tsit5()),
+        },
+        reference=answer,
+        tolerances=[1e-4, 1e-8],
+        **QUICK,
+    )
+
+
+# Numbers
+
+
+def test_rows_are_methods_by_settings(equal, adaptive):
+    assert equal.method == ("CF4",) * 3 + ("CG3",) * 3 + ("RKMK4",) * 3 + ("Tsit5",) * 3
+    np.testing.assert_array_equal(equal.num_steps, [8, 16, 32] * 4)
+    np.testing.assert_array_equal(equal.num_rejected, 0)
+    assert np.all(np.isnan(equal.tolerance))
+    np.testing.assert_array_equal(adaptive.tolerance, [1e-4, 1e-8] * 2)
+    assert not any(equal.note) and not any(adaptive.note)
+
+
+def test_errors_fall_by_the_order(equal):
+    for name, order in [("CF4", 4), ("CG3", 3), ("RKMK4", 4)]:
+        observed = problems.slope([16, 32], equal.select(name).error[1:])
+        assert abs(observed - order) < 0.15
+
+
+def test_errors_are_those_of_a_loop_of_its_own(equal, answer):
+    expected = problems.errors(problems.driven_body, cfjax.CF4(), 1.0, Y0, ARGS, answer, [8, 16])
+    # The same steps in another program: a unit of rounding of the state for each of 16.
+    np.testing.assert_allclose(
+        equal.select("CF4").error[:2], expected, rtol=0, atol=16 * np.finfo(float).eps
+    )
+
+
+def test_one_program_takes_the_steps_of_integrate(equal, answer):
+    for name, term, solver in [("CF4", TERM, cfjax.CF4()), ("Tsit5", SPACE, diffrax.Tsit5())]:
+        rows = equal.select(name)
+        assert len(set(rows.compile_seconds)) == 1
+        for n, found in zip([8, 32], rows.error[[0, 2]], strict=True):
+            solution = cfjax.integrate(term, solver, 0.0, 1.0, Y0, ARGS, num_steps=n)
+            expected = np.linalg.norm(solution.ys[-1] - answer)
+            # A unit of rounding of the state for each step of another program.
+            np.testing.assert_allclose(found, expected, rtol=0, atol=n * np.finfo(float).eps)
+
+
+def test_evaluations_and_flows_of_equal_steps(equal):
+    steps = np.array([8, 16, 32])
+    # The tableau's own numbers, and those of Munthe-Kaas & Owren's method.
+    for name, evaluations, flows in [("CF4", 4, 5), ("CG3", 3, 6), ("RKMK4", 4, 4)]:
+        rows = equal.select(name)
+        np.testing.assert_array_equal(rows.num_evaluations, evaluations * steps)
+        np.testing.assert_array_equal(rows.num_flows, flows * steps)
+    # First same as last: six evaluations a step, and one more for the first.
+    np.testing.assert_array_equal(equal.select("Tsit5").num_evaluations, 6 * steps + 1)
+    np.testing.assert_array_equal(equal.select("Tsit5").num_flows, 0)
+
+
+def test_evaluations_are_those_that_happen():
+    """Counted by a callback in the field of whole solves, adaptive with rejected steps."""
+    happened = 0
+
+    def count():
+        nonlocal happened
+        happened += 1
+
+    def field(t, y, args):
+        jax.debug.callback(count)
+        return jnp.cross(y, y / args) + jnp.sin(20 * t)
+
+    term = diffrax.ODETerm(field)
+    for solver in (diffrax.Bosh3(), diffrax.HalfSolver(diffrax.Heun())):
+        work = cfjax.work_precision(
+            term,
+            0.0,
+            1.0,
+            Y0,
+            ARGS,
+            methods={"m": solver},
+            reference=Y0,
+            tolerances=[1e-4],
+            repeats=1,
+        )
+        assert work.num_rejected[0] > 0
+        jax.effects_barrier()
+        happened = 0
+        diffrax.diffeqsolve(
+            term,
+            solver,
+            0.0,
+            1.0,
+            0.01,
+            jnp.asarray(Y0),
+            jnp.asarray(ARGS),
+            stepsize_controller=diffrax.PIDController(rtol=0.0, atol=1e-4),
+        )
+        jax.effects_barrier()
+        assert work.num_evaluations[0] == happened
+
+
+def test_a_product_of_manifolds_moves_in_one_flow():
+    work = cfjax.work_precision(
+        cfjax.LieTerm(problems.body_in_flight),
+        0.0,
+        0.5,
+        problems.FLIGHT_START,
+        problems.FLIGHT_ARGS,
+        methods={"CF4": cfjax.CF4()},
+        reference=problems.FLIGHT_START,
+        num_steps=[3],
+        **QUICK,
+    )
+    assert (work.num_evaluations[0], work.num_flows[0]) == (12, 15)
+
+
+def test_counts_that_are_not_known(equal):
+    """Translations are no flows; implicit steps differ; diffrax's loops have no rule."""
+    work = cfjax.work_precision(
+        diffrax.ODETerm(lambda t, y, args: -y),
+        0.0,
+        1.0,
+        jnp.ones(2),
+        methods={
+            "CF4": cfjax.CF4(),
+            "implicit": diffrax.ImplicitEuler(root_finder=diffrax.VeryChord(1e-6, 1e-8)),
+        },
+        reference=np.full(2, np.exp(-1.0)),
+        num_steps=[8],
+        **QUICK,
+    )
+    np.testing.assert_array_equal(work.num_flows, [0, np.nan])
+    np.testing.assert_array_equal(work.num_evaluations, [32, np.nan])
+    # For each entry: 4 products with h, 11 with weights other than 1, of which the rows of the end
+    # point share 2, 7 sums of terms and 5 translations. And the step h itself, and the zero in its
+    # time that carries the check of the start.
+    assert work.flops[0] == 8 * (2 * (4 + 11 - 2 + 7 + 5) + 2)
+    assert np.isnan(work.flops[1])
+    assert np.all(np.isfinite(work.error))
+    assert np.all(np.isnan(equal.select("Tsit5").flops))
+
+
+def test_flops_grow_with_the_steps(equal):
+    for name in ("CF4", "CG3", "RKMK4"):
+        flops = equal.select(name).flops
+        assert flops[0] > 8 * 4 * 20
+        np.testing.assert_array_equal(flops, flops[0] * np.array([1, 2, 4]))
+
+
+def test_adaptive_steps_are_diffraxs(adaptive, answer):
+    solution = diffrax.diffeqsolve(
+        SPACE,
+        diffrax.Tsit5(),
+        0.0,
+        1.0,
+        0.01,
+        jnp.asarray(Y0),
+        jnp.asarray(ARGS),
+        stepsize_controller=diffrax.PIDController(rtol=0.0, atol=1e-8),
+    )
+    rows = adaptive.select("Tsit5")
+    assert rows.num_steps[1] == solution.stats["num_steps"]
+    assert rows.num_rejected[1] == solution.stats["num_rejected_steps"]
+    error = np.linalg.norm(np.asarray(solution.ys[-1]) - answer)
+    # Up to rounding of programs that are compiled apart.
+    np.testing.assert_allclose(rows.error[1], error, rtol=1e-3)
+    assert rows.error[1] < 1e-6 < rows.error[0]
+
+
+def test_times(equal, adaptive):
+    for work in (equal, adaptive):
+        assert work.seconds.shape == (len(work.method), 2)
+        assert np.all(work.seconds > 0)
+        assert np.all(work.compile_seconds > 0)
+
+
+def test_turns_are_taken_in_order_and_within_the_budget():
+    runs = []
+    programs = [lambda i=i: runs.append(i) for i in range(3)]
+    assert _work_precision.take_turns(programs, repeats=4, budget=np.inf).shape == (3, 4)
+    assert runs == [0, 1, 2] * 4
+    # A budget that is spent at once leaves one round.
+    assert _work_precision.take_turns(programs, repeats=4, budget=1e-9).shape == (3, 1)
+
+
+def test_backwards_in_time_and_in_single_precision(answer):
+    y0, args = np.float32(answer), np.float32(ARGS)
+    bosh = (SPACE, diffrax.Bosh3())
+    for settings in (dict(num_steps=[32]), dict(tolerances=[1e-4])):
+        work = cfjax.work_precision(
+            TERM,
+            1.0,
+            0.0,
+            y0,
+            args,
+            methods={"CF4": cfjax.CF4()} if "num_steps" in settings else {"m": bosh},
+            reference=Y0,
+            **settings,
+            **QUICK,
+        )
+        # Roundings of 6e-8 in some hundred flows, and the tolerance in a few steps.
+        assert work.error[0] < (1e-5 if "num_steps" in settings else 1e-3)
+
+
+def test_controller_error_and_first_step_of_the_caller(answer):
+    ends = []
+
+    def controller(tolerance):
+        return diffrax.PIDController(rtol=0.0, atol=tolerance, dtmax=0.05)
+
+    def error(y, reference):
+        ends.append(y)
+        return float(np.max(np.abs(y - reference)))
+
+    work = cfjax.work_precision(
+        SPACE,
+        0.0,
+        1.0,
+        Y0,
+        ARGS,
+        methods={"Tsit5": diffrax.Tsit5()},
+        reference=answer,
+        tolerances=[1e-2],
+        controller=controller,
+        dt0=0.05,
+        error=error,
+        **QUICK,
+    )
+    # No step is longer than 0.05 and none is rejected at this tolerance. The last may be split by
+    # rounding of the times.
+    assert work.num_steps[0] in (20, 21)
+    assert work.error[0] == np.abs(ends[0] - answer).max()
+
+
+# Failures
+
+
+def blow_up(**settings):
+    """y' = y^2 from 1 is infinite at t = 1."""
+    return cfjax.work_precision(
+        diffrax.ODETerm(lambda t, y, args: y**2),
+        0.0,
+        2.0,
+        jnp.ones(2),
+        methods={"m": diffrax.HalfSolver(cfjax.CF4())},
+        reference=np.zeros(2),
+        **settings,
+        **QUICK,
+    )
+
+
+@pytest.mark.parametrize(
+    "settings, reason",
+    [
+        (dict(num_steps=[200]), "Nonfinite"),
+        (dict(tolerances=[1e-6], max_steps=300), "maximum number of solver steps"),
+    ],
+)
+def test_a_blow_up_is_nan_with_its_reason(settings, reason):
+    work = blow_up(**settings)
+    assert np.isnan(work.error[0])
+    assert np.all(np.isnan(work.seconds[0]))
+    assert reason in work.note[0]
+    assert work.num_steps[0] in (200, 300)
+    assert reason in rendered(work.table())
+    work.plot()
+
+
+def test_a_check_in_the_field_is_a_reason():
+    def field(t, y, args):
+        return eqx.error_if(y, t > 0.5, "no field after one half")
+
+    work = cfjax.work_precision(
+        diffrax.ODETerm(field),
+        0.0,
+        1.0,
+        jnp.ones(2),
+        methods={"CF4": cfjax.CF4()},
+        reference=np.ones(2),
+        num_steps=[4],
+        **QUICK,
+    )
+    assert work.note == ("no field after one half",)
+    assert np.isnan(work.error[0])
+    assert (work.num_steps[0], work.num_evaluations[0]) == (4, 16)
+
+
+def test_other_runs_survive_a_failure():
+    def field(t, y, args):
+        return -1000 * y
+
+    work = cfjax.work_precision(
+        diffrax.ODETerm(field),
+        0.0,
+        1.0,
+        jnp.ones(2),
+        methods={"CF4": cfjax.CF4()},
+        reference=np.full(2, np.exp(-1000.0)),
+        num_steps=[100, 1000],
+        **QUICK,
+    )
+    # Stable for steps up to 2.785 / 1000; at 10 / 1000 each step grows by 291.
+    assert np.isnan(work.error[0]) and work.error[1] < 1e-10
+    assert np.isnan(work.seconds[0]).all() and np.isfinite(work.seconds[1]).all()
+
+
+# Output
+
+
+def rendered(part) -> str:
+    text = io.StringIO()
+    Console(width=120, file=text).print(part)
+    return text.getvalue()
+
+
+def test_the_table_has_every_row(equal, adaptive):
+    text = rendered(equal.table())
+    assert [text.count(name) for name in ("CF4", "CG3", "RKMK4", "Tsit5")] == [3] * 4
+    text = rendered(adaptive.table())
+    assert "rejected" in text and text.count("Tsit5") == 2
+
+
+def test_csv_keeps_every_digit(equal, tmp_path):
+    path = tmp_path / "work.csv"
+    equal.to_csv(path)
+    with open(path, newline="") as file:
+        rows = list(csv.DictReader(file))
+    assert [row["method"] for row in rows] == list(equal.method)
+    for name in ("error", "num_steps", "flops", "compile_seconds"):
+        np.testing.assert_array_equal([float(row[name]) for row in rows], getattr(equal, name))
+    best = [float(row["seconds_min"]) for row in rows]
+    np.testing.assert_array_equal(best, equal.seconds.min(axis=1))
+
+
+def test_the_chart_shows_every_method_in_both_panels(equal):
+    figure = equal.plot()
+    FigureCanvasAgg(figure).draw()
+    left, right = figure.axes
+    _, labels = left.get_legend_handles_labels()
+    assert labels == ["CF4", "CG3", "RKMK4", "Tsit5"]
+    cf4 = equal.select("CF4")
+    line = left.containers[0].lines[0]
+    np.testing.assert_array_equal(line.get_xdata(), cf4.seconds.min(axis=1))
+    np.testing.assert_array_equal(line.get_ydata(), cf4.error)
+    np.testing.assert_array_equal(right.lines[0].get_xdata(), cf4.flops)
+    assert right.get_xlabel() == "flops (not known: Tsit5)"
+
+
+def test_evaluations_where_no_flops_are_known(equal):
+    figure = equal.select("Tsit5").plot()
+    assert figure.axes[1].get_xlabel() == "evaluations of the field"
+
+
+def test_select_refuses_unknown_names(equal):
+    with pytest.raises(KeyError, match=r"CF4.*'CF5'"):
+        equal.select("CF5")
+
+
+def test_progress_is_reported():
+    with Progress(disable=True) as progress:
+        cfjax.work_precision(
+            SPACE,
+            0.0,
+            1.0,
+            Y0,
+            ARGS,
+            methods={"Heun": diffrax.Heun()},
+            reference=Y0,
+            num_steps=np.array([2, 4]),
+            progress=progress,
+            **QUICK,
+        )
+    compiling, measuring = progress.tasks
+    assert compiling.description == "Running Heun"
+    assert (compiling.total, compiling.completed) == (1, 1)
+    assert measuring.completed >= 1
+
+
+# What it refuses
+
+
+@pytest.mark.parametrize(
+    "change, message",
+    [
+        (dict(num_steps=None), "one of num_steps and tolerances"),
+        (dict(tolerances=[1e-3]), "one of num_steps and tolerances"),
+        (dict(num_steps=[]), "at least one entry"),
+        (dict(num_steps=[0]), "num_steps must be an integer of at least 1"),
+        (dict(num_steps=None, tolerances=[0.0]), "tolerances must be positive"),
+        (
+            dict(num_steps=None, tolerances=[1e-3], methods={"m": cfjax.CG4()}),
+            "CG4 has none: use diffrax.HalfSolver",
+        ),
+        (dict(num_steps=8), "num_steps must be a sequence of numbers, got 8"),
+        (dict(num_steps=None, tolerances="1e-3"), "tolerances must be a sequence of numbers"),
+        (dict(num_steps=None, tolerances=["1e-3"]), "tolerances must be positive"),
+        (dict(methods={}), "at least one solver"),
+        (dict(methods=[cfjax.CF4()]), "methods must be a dict of solvers by name"),
+        (dict(methods={4: cfjax.CF4()}), "methods must be a dict of solvers by name"),
+        (dict(methods={"m": "CF4"}), "solver must be a diffrax solver"),
+        (dict(methods={"m": (1, cfjax.CF4())}), "term must be a diffrax term"),
+        (dict(reference=np.ones(4)), "reference must be shaped like y0"),
+        (dict(reference={"y": Y0}), "reference must be shaped like y0"),
+        (dict(t1=0.0), "t0 and t1 must be finite and differ, got 0.0 and 0.0"),
+        (dict(t1=np.nan), "t0 and t1 must be finite"),
+        (dict(t1="1"), "t1 must be a real scalar"),
+        (dict(dt0=-0.1), "dt0 must be a step from t0=0.0 towards t1=1.0, got -0.1"),
+        (dict(dt0="0.1"), "dt0 must be a real scalar"),
+        (dict(controller=diffrax.PIDController(0.0, 1e-3)), "controller must be a function"),
+        (
+            dict(num_steps=None, tolerances=[1e-3], controller=lambda tolerance: tolerance),
+            "controller must return a diffrax step size controller",
+        ),
+        (dict(error=1e-3), "error must be a function, got 0.001"),
+        (dict(progress=None), "progress must be a bool or a rich.progress.Progress, got None"),
+        (dict(budget=0.0), "budget must be a positive number"),
+        (dict(budget="20"), "budget must be a positive number"),
+        (dict(repeats=0), "repeats must be an integer of at least 1"),
+        (dict(max_steps=0), "max_steps must be an integer of at least 1"),
+    ],
+)
+def test_mistakes(change, message, no_shape_hook):
+    arguments = dict(
+        t0=0.0, t1=1.0, methods={"m": cfjax.CF4()}, reference=Y0, num_steps=[2], **QUICK
+    )
+    with pytest.raises((TypeError, ValueError), match=message):
+        cfjax.work_precision(TERM, y0=Y0, args=ARGS, **(arguments | change))
+
+
+def test_an_error_that_is_no_number():
+    with pytest.raises(TypeError, match=r"error must return a real number, got f64\[3\]") as info:
+        cfjax.work_precision(
+            TERM,
+            0.0,
+            1.0,
+            Y0,
+            ARGS,
+            methods={"m": cfjax.LieEuler()},
+            reference=Y0,
+            num_steps=[2],
+            error=lambda y, reference: y - reference,
+        )
+    assert info.value.__notes__[-1] == "This is about methods['m']."
+
+
+@pytest.mark.parametrize("value", [None, "1", 1j, np.ones(1), -1.0])
+def test_what_is_no_error(value):
+    with pytest.raises((TypeError, ValueError), match="error must return a"):
+        _work_precision._checked_error(value)
+
+
+@pytest.mark.parametrize("package, part", [("matplotlib", "plot"), ("rich", "table")])
+def test_a_missing_extra(package, part, equal, monkeypatch):
+    for name in [name for name in sys.modules if name.partition(".")[0] == package]:
+        monkeypatch.setitem(sys.modules, name, None)
+    monkeypatch.delitem(sys.modules, "cfjax._measure.style", raising=False)
+    monkeypatch.delattr(cfjax._measure, "style", raising=False)
+    with pytest.raises(ModuleNotFoundError, match=rf"{package} is missing.*'cfjax\[paper\]'"):
+        getattr(equal, part)()
+
+
+def test_plot_refuses_what_is_no_figure(equal):
+    with pytest.raises(TypeError, match=r"figure must be a matplotlib figure, got 'work\.png'"):
+        equal.plot("work.png")
+
+
+def test_a_mistake_names_its_method():
+    with pytest.raises(TypeError, match="needs brackets") as info:
+        cfjax.work_precision(
+            cfjax.LieTerm(lambda t, y, args: problems.Growth(-y)),
+            0.0,
+            1.0,
+            jnp.ones(2),
+            methods={"fine": cfjax.CF4(), "wrong": cfjax.RKMK4()},
+            reference=np.ones(2),
+            num_steps=[2],
+        )
+    assert info.value.__notes__[-1] == "This is about methods['wrong']."
+
+
+def test_an_implicit_solver_takes_the_tolerances_that_there_are():
+    def measure(**settings):
+        return cfjax.work_precision(
+            diffrax.ODETerm(lambda t, y, args: -y),
+            0.0,
+            1.0,
+            jnp.ones(2),
+            methods={"implicit": diffrax.Kvaerno3()},
+            reference=np.full(2, np.exp(-1.0)),
+            **settings,
+            **QUICK,
+        )
+
+    assert measure(tolerances=[1e-6]).error[0] < 1e-5
+    with pytest.raises(ValueError, match="solver must have tolerances of its own"):
+        measure(num_steps=[8])

@@ -1,0 +1,373 @@
+import math
+import random
+from fractions import Fraction
+
+import diffrax
+import hypothesis
+import hypothesis.strategies as st
+import numpy as np
+import pytest
+
+import cfjax
+from cfjax._methods.order_conditions import (
+    error_constant,
+    exact_tree_weight,
+    exact_weight,
+    order,
+    runge_kutta_order,
+    trees,
+    words,
+)
+from cfjax._methods.tableau import (
+    CF2,
+    CF3,
+    CF4,
+    CG3,
+    CG4,
+    CG5,
+    LIE_EULER,
+    Tableau,
+    third_order_a,
+    third_order_b,
+)
+
+HALF = Fraction(1, 2)
+THIRD = Fraction(1, 3)
+
+ORDERS = {
+    "LIE_EULER": (LIE_EULER, 1),
+    "CF2": (CF2, 2),
+    "CF3": (CF3, 3),
+    "CF4": (CF4, 4),
+    "CG3": (CG3, 3),
+    "CG4": (CG4, 4),
+    "CG5": (CG5, 5),
+}
+named = pytest.mark.parametrize(("tableau", "q"), ORDERS.values(), ids=ORDERS.keys())
+
+
+def low_storage(A, B):
+    """d_i = A_i d_(i-1) + F_i, then the flow of B_i d_i; rounded once."""
+    d, rows = [], []
+    for a, b in zip(A, B, strict=True):
+        d = [Fraction(a) * x for x in d] + [Fraction(1)]
+        rows.append([float(Fraction(b) * x) for x in d])
+    return Tableau([rows[:i] for i in range(len(rows))], rows)
+
+
+# Williamson, J. Comput. Phys. 35 (1980).
+WILLIAMSON3 = low_storage(["0", "-5/9", "-153/128"], ["1/3", "15/16", "8/15"])
+# Carpenter & Kennedy, NASA TM-109112 (1994).
+CK54 = low_storage(
+    [
+        "0",
+        "-567301805773/1357537059087",
+        "-2404267990393/2016746695238",
+        "-3550918686646/2091501179385",
+        "-1275806237668/842570457699",
+    ],
+    [
+        "1432997174477/9575080441755",
+        "5161836677717/13612068292357",
+        "1720146321549/2090206949498",
+        "3134564353537/4481467310338",
+        "2277821191437/14882151754819",
+    ],
+)
+# Yan (2017); Bazavov, BIT 62 (2022). Its coefficients reach 35, and 416 when multiplied out.
+YRK135 = low_storage(
+    [
+        "0",
+        "-0.33672143119427413",
+        "-1.2018205782908164",
+        "-2.6261919625495068",
+        "-1.5418507843260567",
+        "-0.2845614242371758",
+        "-0.1700096844304301",
+        "-1.0839412680446804",
+        "-11.61787957751822",
+        "-4.5205208057464192",
+        "-35.86177355832474",
+        "-0.000021340899996007288",
+        "-0.066311516687861348",
+    ],
+    [
+        "0.069632640247059393",
+        "0.088918462778092020",
+        "1.0461490123426779",
+        "0.42761794305080487",
+        "0.20975844551667144",
+        "-0.11457151862012136",
+        "-0.01392019988507068",
+        "4.0330655626956709",
+        "0.35106846752457162",
+        "-0.16066651367556576",
+        "-0.0058633163225038929",
+        "0.077296133865151863",
+        "0.054301254676908338",
+    ],
+)
+
+
+def as_floats(tableau):
+    alpha = [[list(map(float, row)) for row in rows] for rows in tableau.alpha]
+    return Tableau(alpha, [list(map(float, row)) for row in tableau.beta])
+
+
+def reversed_composition(tableau):
+    return Tableau([rows[::-1] for rows in tableau.alpha], tableau.beta[::-1])
+
+
+def row_sums(tableau):
+    """The Runge-Kutta method that the tableau becomes in a linear space."""
+
+    def collapse(rows, length):
+        return [sum(row[k] for row in rows) for k in range(length)]
+
+    a = [collapse(rows, r) for r, rows in enumerate(tableau.alpha)][1:]
+    return a, collapse(tableau.beta, tableau.num_stages)
+
+
+def nonzero_places(tableau):
+    for r, rows in enumerate((*tableau.alpha, tableau.beta)):
+        for j, row in enumerate(rows):
+            yield from ((r, j, k) for k, entry in enumerate(row) if entry)
+
+
+def changed(tableau, place, amount):
+    """With one coefficient changed; in beta another makes up for it, to remain consistent."""
+    products = [[list(row) for row in rows] for rows in (*tableau.alpha, tableau.beta)]
+    r, j, k = place
+    products[r][j][k] += amount
+    if r == tableau.num_stages:
+        j, k = next((j, k) for q, j, k in nonzero_places(tableau) if q == r and (r, j, k) != place)
+        products[r][j][k] -= amount
+    return Tableau(products[:-1], products[-1])
+
+
+# The conditions themselves
+
+
+def test_number_of_words_and_trees():
+    assert [len(words(n)) for n in range(8)] == [1, 1, 2, 5, 14, 42, 132, 429]
+    assert [len(trees(n)) for n in range(1, 10)] == [1, 1, 2, 4, 9, 20, 48, 115, 286]
+    for n in range(7):
+        assert len(set(words(n))) == len(words(n))
+
+
+def test_words_of_order_three():
+    dot, line = (), ((),)
+    assert set(words(3)) == {
+        (dot, dot, dot),
+        (dot, line),
+        (line, dot),
+        ((dot, dot),),
+        ((line,),),
+    }
+
+
+def test_exact_weights():
+    dot, line = (), ((),)
+    assert exact_weight((dot, dot, dot)) == Fraction(1, 6)
+    assert exact_weight((line,)) == HALF
+    # They differ: this is what a reversed composition gets wrong.
+    assert exact_weight((dot, line)) == THIRD
+    assert exact_weight((line, dot)) == Fraction(1, 6)
+    assert exact_tree_weight((dot, dot)) == THIRD
+    assert exact_tree_weight((line,)) == Fraction(1, 6)
+
+
+def test_exact_tree_weights_follow_from_the_words():
+    # A tree in a linear space gathers the ordered trees that are equal to it.
+    def unordered(tree):
+        return tuple(sorted(map(unordered, tree)))
+
+    def symmetry(tree):
+        repeats = [tree.count(child) for child in set(tree)]
+        return math.prod(map(math.factorial, repeats)) * math.prod(map(symmetry, tree))
+
+    for n in range(1, 6):
+        total = dict.fromkeys(trees(n), Fraction(0))
+        for word in words(n - 1):
+            total[unordered(word)] += exact_weight((word,))
+        assert total == {tree: exact_tree_weight(tree) / symmetry(tree) for tree in trees(n)}
+
+
+# The order of commutator-free methods
+
+
+@named
+def test_order_of_named_tableaus(tableau, q):
+    assert order(tableau) == q
+
+
+@named
+def test_rounding_keeps_the_order(tableau, q):
+    rounded = as_floats(tableau)
+    assert not rounded.is_exact
+    assert order(rounded) == q
+    assert error_constant(rounded) == pytest.approx(error_constant(tableau), rel=1e-10)
+
+
+@pytest.mark.parametrize(
+    ("tableau", "q", "flows", "constant"),
+    [
+        (WILLIAMSON3, 3, 3, None),
+        (CK54, 4, 5, 0.00637),
+        (YRK135, 5, 13, 0.00061),
+    ],
+    ids=["Williamson3", "CK54", "YRK135"],
+)
+def test_low_storage_methods(tableau, q, flows, constant):
+    assert order(tableau) == q
+    assert tableau.num_flows == flows
+    if constant is not None:
+        assert error_constant(tableau) == pytest.approx(constant, abs=5e-6)
+
+
+@pytest.mark.parametrize(
+    ("tableau", "constant"),
+    [(CF3, 0.0618), (CF4, 0.0225), (CG4, 0.0782), (CG5, 0.0966)],
+    ids=["CF3", "CF4", "CG4", "CG5"],
+)
+def test_error_constants(tableau, constant):
+    assert error_constant(tableau) == pytest.approx(constant, abs=5e-5)
+
+
+def test_error_constant_of_euler():
+    # Both words of order 2 have the exact weight 1/2; Euler gives 1/2 and 0.
+    assert error_constant(LIE_EULER) == HALF
+
+
+@pytest.mark.parametrize("name", ["CF3", "CF4", "CG3", "CG4", "CG5"])
+def test_reversed_composition_has_order_two(name):
+    tableau, q = ORDERS[name]
+    wrong = reversed_composition(tableau)
+    assert order(wrong) == 2 < q
+    # The two words of one dot and one line swap their weights, 1/3 and 1/6.
+    assert error_constant(wrong) == pytest.approx(math.sqrt(2) / 6)
+
+
+def test_one_flow_is_not_enough_for_order_three():
+    # Kutta's methods: of orders 3 and 4 in a linear space.
+    sixths = [Fraction(n, 6) for n in (1, 4, 1)]
+    assert order(Tableau([[], [[HALF]], [[-1, 2]]], [sixths])) == 2
+    sixths = [Fraction(n, 6) for n in (1, 2, 2, 1)]
+    assert order(Tableau([[], [[HALF]], [[0, HALF]], [[0, 0, 1]]], [sixths])) == 2
+
+
+parameters = st.fractions(min_value=-20, max_value=20, max_denominator=1000)
+FAMILIES = [(third_order_a, (0, THIRD)), (third_order_b, (1, THIRD))]
+
+
+@pytest.mark.parametrize(("family", "excluded"), FAMILIES)
+@hypothesis.given(alpha=parameters)
+@hypothesis.settings(deadline=None)
+def test_families_have_order_three(family, excluded, alpha):
+    hypothesis.assume(alpha not in excluded)
+    assert order(family(alpha)) == 3
+
+
+@pytest.mark.parametrize(("family", "excluded"), FAMILIES)
+@hypothesis.given(alpha=st.floats(min_value=-20, max_value=20))
+@hypothesis.settings(deadline=None)
+def test_families_of_floats_have_order_three(family, excluded, alpha):
+    hypothesis.assume(all(abs(alpha - float(value)) > 1e-9 for value in excluded))
+    assert order(family(alpha)) == 3
+
+
+@pytest.mark.parametrize(("family", "excluded"), FAMILIES)
+@pytest.mark.parametrize("distance", [1e-3, -1e-6, 1e-9, -1e-12])
+def test_families_close_to_singular_have_order_three(family, excluded, distance):
+    for value in excluded:
+        assert order(family(float(value) + distance)) == 3
+
+
+@pytest.mark.parametrize("tableau", [CF3, CF4, CG3], ids=["CF3", "CF4", "CG3"])
+def test_changing_any_coefficient_lowers_the_order(tableau):
+    for place in nonzero_places(tableau):
+        wrong = changed(tableau, place, Fraction(1, 1000))
+        assert order(wrong) < order(tableau), place
+        assert order(as_floats(wrong)) == order(wrong)
+
+
+@pytest.mark.parametrize("tableau", [CG4, CK54], ids=["CG4", "CK54"])
+def test_a_small_mistake_in_any_digit_is_seen(tableau):
+    for place in nonzero_places(tableau):
+        assert order(changed(tableau, place, 1e-10)) < order(tableau), place
+
+
+def test_a_small_mistake_in_a_long_tableau_is_seen():
+    for place in random.Random(0).sample(list(nonzero_places(CG5)), 5):
+        assert order(changed(CG5, place, 1e-10)) < 5, place
+    assert order(changed(YRK135, (13, 12, 12), 1e-10)) < 5
+
+
+def test_order_is_at_most_the_number_of_stages():
+    assert order(LIE_EULER) == LIE_EULER.num_stages
+    assert runge_kutta_order([], [1]) == 1
+
+
+# The classical order
+
+
+@pytest.mark.parametrize(
+    ("solver", "q"),
+    [
+        (diffrax.Heun, 2),
+        (diffrax.Midpoint, 2),
+        (diffrax.Ralston, 2),
+        (diffrax.Bosh3, 3),
+        (diffrax.Tsit5, 5),
+        (diffrax.Dopri5, 5),
+        (diffrax.Dopri8, 8),
+    ],
+)
+def test_order_of_the_tableaus_in_diffrax(solver, q):
+    tableau = solver.tableau
+    assert runge_kutta_order(tableau.a_lower, tableau.b_sol) == q
+
+
+@pytest.mark.parametrize("solver", [diffrax.Tsit5, diffrax.Dopri8])
+def test_a_small_mistake_in_a_diffrax_tableau_is_seen(solver):
+    rows = [np.array(row) for row in solver.tableau.a_lower]
+    rows[3][2] += 1e-10
+    assert runge_kutta_order(rows, solver.tableau.b_sol) < runge_kutta_order(
+        solver.tableau.a_lower, solver.tableau.b_sol
+    )
+
+
+def test_classical_order_of_exact_tableaus():
+    assert runge_kutta_order([[1]], [HALF, HALF]) == 2
+    assert runge_kutta_order([[1]], [1, 0]) == 1
+    kutta = [[HALF], [0, HALF], [0, 0, 1]]
+    sixths = [Fraction(n, 6) for n in (1, 2, 2, 1)]
+    assert runge_kutta_order(kutta, sixths) == 4
+    kutta[2] = [Fraction(1, 10**20), 0, 1 - Fraction(1, 10**20)]
+    assert runge_kutta_order(kutta, sixths) < 4
+
+
+def test_classical_order_names_a_bad_coefficient():
+    with pytest.raises(ValueError, match=r"alpha\[1\]\[0\]\[1\] is 1, .* explicit"):
+        runge_kutta_order([[0, 1]], [0, 1])
+    with pytest.raises(ValueError, match=r"beta must sum to 1"):
+        runge_kutta_order([[1]], [1, 1])
+    with pytest.raises(ValueError, match=r"beta\[0\] must have at most 2 entries"):
+        runge_kutta_order([[1]], [0, 0, 1])
+
+
+@named
+def test_in_a_linear_space_the_order_is_at_least_the_same(tableau, q):
+    assert runge_kutta_order(*row_sums(tableau)) >= q
+
+
+def test_in_a_linear_space_the_order_may_be_higher():
+    wrong = reversed_composition(CG4)
+    assert order(wrong) == 2
+    assert runge_kutta_order(*row_sums(wrong)) == 4
+
+
+def test_order_is_of_a_tableau(no_shape_hook):
+    # The method instead of its tableau is an easy mistake.
+    with pytest.raises(TypeError, match=r"tableau must be a cfjax.Tableau, got CF4\(\)"):
+        order(cfjax.CF4())  # pyright: ignore[reportArgumentType]

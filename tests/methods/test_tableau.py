@@ -1,0 +1,375 @@
+import dataclasses
+from fractions import Fraction
+
+import hypothesis
+import hypothesis.strategies as st
+import numpy as np
+import pytest
+
+from cfjax._methods.tableau import (
+    CF2,
+    CF3,
+    CF4,
+    CG3,
+    CG4,
+    CG5,
+    LIE_EULER,
+    Tableau,
+    crouch_grossman,
+    third_order_a,
+    third_order_b,
+)
+
+HALF = Fraction(1, 2)
+THIRD = Fraction(1, 3)
+
+NAMED = {
+    "LIE_EULER": LIE_EULER,
+    "CF2": CF2,
+    "CF3": CF3,
+    "CF4": CF4,
+    "CG3": CG3,
+    "CG4": CG4,
+    "CG5": CG5,
+}
+named = pytest.mark.parametrize("tableau", NAMED.values(), ids=NAMED.keys())
+
+
+# Normal form
+
+
+def test_every_kind_of_nested_sequence_gives_the_same_tableau():
+    rows = [[[0, 0]], [[0.5, 0]]]
+    lists = Tableau(rows, [[0, 1]])
+    assert lists.alpha == ((), ((HALF, 0),))
+    assert lists.beta == ((0, 1),)
+    assert Tableau(tuple(map(tuple, rows)), ((0, 1),)) == lists
+    assert Tableau(np.array(rows), np.array([[0, 1]])) == lists
+    assert Tableau([[], [[0.5]]], [[0, 1]]) == lists
+    assert Tableau((r for r in rows), ((b for b in [0, 1]),)) == lists
+
+
+def test_rows_of_zeros_are_dropped_and_short_rows_padded():
+    tableau = Tableau([[], [[0], [HALF], [0, 0]]], [[0, 0], [0, 1], []])
+    assert (tableau.alpha, tableau.beta) == (CF2.alpha, CF2.beta)
+    assert all(len(row) == 2 for row in (*tableau.alpha[1], *tableau.beta))
+
+
+def test_coefficients_become_fractions_or_floats():
+    beta = [[np.int64(1), 1, HALF, -0.5, np.float32(-0.5), np.float64(-0.5), 0.0]]
+    (row,) = Tableau([[]] * 7, beta).beta
+    assert [type(b) for b in row] == [Fraction] * 3 + [float] * 3 + [Fraction]
+    assert row == (1, 1, 0.5, -0.5, -0.5, -0.5, 0)
+
+
+def test_numpy_float32_is_converted_without_loss():
+    third = np.float32(1) / np.float32(3)
+    tableau = Tableau([[], [[third]]], [[0, 1]])
+    assert tableau.alpha[1][0][0] == float(third) != 1 / 3
+
+
+@named
+def test_is_compared_and_hashed_by_value(tableau):
+    again = Tableau(
+        [list(map(list, rows)) for rows in tableau.alpha],
+        tableau.beta,
+        tableau.companion,
+        tableau.extension,
+    )
+    assert again is not tableau
+    assert again == tableau
+    assert hash(again) == hash(tableau)
+    assert {again: 1}[tableau] == 1
+
+
+def test_named_tableaus_differ():
+    assert len(set(NAMED.values())) == len(NAMED)
+    assert CF3 != "CF3"
+
+
+def test_is_frozen():
+    with pytest.raises(dataclasses.FrozenInstanceError):
+        CF3.beta = CF2.beta  # pyright: ignore[reportAttributeAccessIssue]
+
+
+def test_replace_checks_again():
+    tableau = Tableau(CF2.alpha, CF2.beta)
+    assert dataclasses.replace(tableau, beta=[[HALF, HALF]]).beta == ((HALF, HALF),)
+    with pytest.raises(ValueError, match="beta must sum to 1"):
+        dataclasses.replace(tableau, beta=[[HALF]])
+    with pytest.raises(ValueError, match="extension must lead to the end"):
+        dataclasses.replace(CF2, beta=[[HALF, HALF]])
+
+
+def test_repr_is_short():
+    family = third_order_a(Fraction(2, 3))
+    assert repr(family) == "Tableau(alpha=[[], [(1/3)], [(0, 2/3)]], beta=[(1/3), (-1/12, 0, 3/4)])"
+    assert repr(CF2) == (
+        "Tableau(alpha=[[], [(1/2)]], beta=[(0, 1)], companion=[(1)], extension=[[(1), (-1, 1)]])"
+    )
+
+
+# Derived facts
+
+
+@named
+def test_stage_times_are_row_sums(tableau):
+    assert len(tableau.c) == tableau.num_stages == tableau.num_evaluations
+    for c, rows in zip(tableau.c, tableau.alpha, strict=True):
+        assert c == pytest.approx(float(sum(map(sum, rows))), abs=1e-15)
+
+
+def test_stage_times_are_exact():
+    assert LIE_EULER.c == (0,)
+    assert CF2.c == (0, HALF)
+    assert CF3.c == (0, THIRD, Fraction(2, 3))
+    assert CF4.c == (0, HALF, HALF, 1)
+    assert CG3.c == (0, Fraction(3, 4), Fraction(17, 24))
+    assert all(isinstance(c, Fraction) for c in (*CF3.c, *CF4.c, *CG3.c))
+    # Added as floats these would lose the 1.
+    tableau = Tableau([[], [[1e16]], [[1e16, 1], [-1e16]]], [[0, 0, 1]])
+    assert tableau.c == (0, 1e16, 1)
+    assert [type(c) for c in tableau.c] == [Fraction, float, float]
+
+
+@pytest.mark.parametrize(
+    ("tableau", "flows"),
+    [(LIE_EULER, 1), (CF2, 2), (CF3, 3), (CF4, 5), (CG3, 6), (CG4, 15), (CG5, 43)],
+    ids=NAMED.keys(),
+)
+def test_num_flows(tableau, flows):
+    assert tableau.num_flows == flows
+    assert len(tableau.prefixes) == flows
+
+
+@named
+def test_prefixes_come_after_their_own_beginning(tableau):
+    known = {()}
+    for prefix in tableau.prefixes:
+        assert prefix not in known
+        assert prefix[:-1] in known
+        known.add(prefix)
+    assert {*tableau.alpha, tableau.beta} <= known
+
+
+def test_rows_share_flows_only_from_the_start():
+    shared = Tableau([[], [[HALF]], [[HALF], [0, HALF]]], [[HALF], [0, HALF]])
+    assert shared.num_flows == 2
+    swapped = Tableau([[], [[HALF]], [[HALF], [0, HALF]]], [[0, HALF], [HALF]])
+    assert swapped.num_flows == 4
+
+
+def test_is_exact():
+    assert [t.is_exact for t in NAMED.values()] == [True] * 5 + [False] * 2
+    assert not Tableau([[], [[0.25]]], [[0, 1]]).is_exact
+    assert Tableau(np.zeros((1, 1, 1)), [[1]]).is_exact
+
+
+def test_crouch_grossman():
+    tableau = crouch_grossman([[HALF], [0, HALF]], [0, 0, 1])
+    assert tableau == Tableau([[], [[HALF]], [[0, HALF]]], [[0, 0, 1]])
+    tableau = crouch_grossman([[1]], [HALF, HALF])
+    assert tableau == Tableau([[], [[1]]], [[HALF], [0, HALF]])
+    assert crouch_grossman([], [1]) == Tableau([[]], [[1]])
+    tableau = crouch_grossman([[1]], [HALF, HALF], [1, 0], [[1, -HALF], [0, HALF]])
+    assert tableau.companion == ((1, 0, 0),)
+    assert tableau.extension == (((1, 0, 0), (-HALF, 0, 0)), ((0, 0, 0), (0, HALF, 0)))
+
+
+# Companion and extension
+
+
+@pytest.mark.parametrize(
+    "name, companion_flows, last", [("CF3", 1, False), ("CF4", 1, True), ("CG3", 3, False)]
+)
+def test_what_a_companion_costs(name, companion_flows, last):
+    tableau = NAMED[name]
+    assert tableau.num_companion_flows == companion_flows
+    assert tableau.first_same_as_last is last
+    assert tableau.companion_method.alpha[-1][0][: tableau.num_stages] == tableau.beta[0]
+
+
+def test_without_a_companion_there_is_no_method():
+    assert CG4.companion_method is None and CG4.num_companion_flows == 0
+    assert not CG4.first_same_as_last
+
+
+@pytest.mark.parametrize(
+    "more, message",
+    [
+        ({"companion": [[HALF]]}, r"companion must sum to 1 .* got a sum of 1/2"),
+        ({"companion": [[0, 0, 0, 1]]}, r"companion\[0\] must have at most 3 entries"),
+        ({"companion": [[float("nan"), 1]]}, r"companion\[0\]\[0\] must be finite"),
+        ({"extension": [[[1]]]}, r"extension must lead to the end.* stage 0 sum to 1, .* to 0"),
+        ({"extension": [[[0, 0, 0, 1]]]}, r"extension\[0\]\[0\] must have at most 3 entries"),
+    ],
+)
+def test_a_mistaken_companion_or_extension(more, message):
+    with pytest.raises(ValueError, match=message):
+        Tableau([[], [[HALF]]], [[0, 1]], **more)
+
+
+@pytest.mark.parametrize("more", [{"companion": 1}, {"extension": [1]}, {"extension": "ab"}])
+def test_a_companion_or_extension_of_wrong_type(more, no_shape_hook):
+    with pytest.raises(TypeError, match=f"{next(iter(more))}.* must be a"):
+        Tableau([[], [[HALF]]], [[0, 1]], **more)
+
+
+# The two families
+
+parameters = st.fractions(min_value=-20, max_value=20, max_denominator=1000)
+
+
+@hypothesis.given(parameters)
+@hypothesis.settings(deadline=None)
+def test_first_family_costs_three_flows(alpha):
+    hypothesis.assume(alpha not in (0, THIRD))
+    tableau = third_order_a(alpha)
+    assert tableau.c == (0, THIRD, alpha)
+    assert tableau.num_flows == 3
+    assert tableau.is_exact
+
+
+@hypothesis.given(parameters)
+@hypothesis.settings(deadline=None)
+def test_second_family_costs_three_flows(alpha):
+    hypothesis.assume(alpha not in (1, THIRD))
+    tableau = third_order_b(alpha)
+    assert tableau.c[2] == alpha
+    assert tableau.c[1] == 2 * (3 * alpha**2 - 3 * alpha + 1) / (3 * (1 - alpha))
+    assert tableau.num_flows == 3
+    assert tableau.is_exact
+
+
+def test_families_at_known_members():
+    assert third_order_a(Fraction(2, 3)) == Tableau(CF3.alpha, CF3.beta)
+    assert third_order_a(1) == Tableau(
+        [[], [[THIRD]], [[-1, 2]]], [[THIRD], [-THIRD, Fraction(3, 4), Fraction(1, 4)]]
+    )
+    assert third_order_b(Fraction(2, 3)) == Tableau(
+        [[], [[Fraction(2, 3)]], [[Fraction(5, 12), Fraction(1, 4)]]],
+        [[Fraction(5, 12), Fraction(1, 4)], [Fraction(-1, 6), Fraction(-1, 2), 1]],
+    )
+    assert third_order_b(0).c == (0, Fraction(2, 3), 0)
+
+
+@pytest.mark.parametrize("family", [third_order_a, third_order_b])
+def test_family_of_a_float_is_rounded_once(family):
+    exact, rounded = family(Fraction(0.7)), family(0.7)
+    assert not rounded.is_exact
+    assert rounded.c[2] == 0.7
+    assert [tuple(map(float, row)) for row in exact.beta] == list(rounded.beta)
+    assert family(np.float64(0.7)) == rounded
+
+
+@pytest.mark.parametrize(
+    ("family", "alpha", "shown", "divisor"),
+    [
+        (third_order_a, 0, "0", "6 alpha"),
+        (third_order_a, 0.0, "0", "6 alpha"),
+        (third_order_a, -0.0, "0", "6 alpha"),
+        (third_order_a, THIRD, "1/3", "3 alpha - 1"),
+        (third_order_a, 1 / 3, "1/3", "3 alpha - 1"),
+        (third_order_b, 1, "1", "1 - alpha"),
+        (third_order_b, 1.0, "1", "1 - alpha"),
+        (third_order_b, THIRD, "1/3", "3 alpha - 1"),
+        (third_order_b, np.float64(1) / 3, "1/3", "3 alpha - 1"),
+    ],
+)
+def test_excluded_parameters_raise(family, alpha, shown, divisor):
+    expected = f"alpha must not be {shown}, got .*divide by {divisor}, which is zero there"
+    with pytest.raises(ValueError, match=expected):
+        family(alpha)
+
+
+@pytest.mark.parametrize("family", [third_order_a, third_order_b])
+@pytest.mark.usefixtures("no_shape_hook")
+def test_other_bad_parameters_raise(family):
+    with pytest.raises(ValueError, match="alpha must be finite, got nan"):
+        family(float("nan"))
+    with pytest.raises(TypeError, match="alpha must be an int, a Fraction or a float, got '1/2'"):
+        family("1/2")
+    with pytest.raises(TypeError, match=r"alpha must be .*, got True of type bool"):
+        family(True)
+
+
+def test_overflow_raises():
+    with pytest.raises(ValueError, match=r"alpha = 5e-324 is out of range"):
+        third_order_a(5e-324)
+    with pytest.raises(ValueError, match=r"alpha = 1e\+308 is out of range"):
+        third_order_a(1e308)
+
+
+# Errors
+
+
+@pytest.mark.parametrize(
+    ("alpha", "beta", "message"),
+    [
+        ([], [[1]], r"alpha must have at least one stage, got none"),
+        ([[]], [[1, 0]], r"beta\[0\] must have at most 1 entries, .*, got 2"),
+        (
+            [[], [[1], [0, 0, 0]]],
+            [[1]],
+            r"alpha\[1\]\[1\] must have at most 2 entries, .*, got 3",
+        ),
+        (
+            [[], [[HALF], [0, HALF]]],
+            [[1]],
+            r"alpha\[1\]\[1\]\[1\] is 1/2, but .* explicit: alpha\[1\] may use only stages before "
+            r"1, so this entry must be 0",
+        ),
+        ([[[1]]], [[1]], r"alpha\[0\]\[0\]\[0\] is 1, .* alpha\[0\] may use no stage"),
+        ([[], [[float("nan")]]], [[1]], r"alpha\[1\]\[0\]\[0\] must be finite, got nan"),
+        ([[]], [[float("-inf")]], r"beta\[0\]\[0\] must be finite, got -inf"),
+        ([[]], [], r"beta must sum to 1 over all its rows \(consistency\), got a sum of 0\."),
+        ([[]], [[HALF], [THIRD]], r"beta must sum to 1 .*, got a sum of 5/6\."),
+        ([[]], [[0.5], [THIRD]], r"beta must sum to 1 .*, got a sum of 0.8333"),
+        ([[]], [[1 + 1e-14]], r"beta must sum to 1 .*, got a sum of 1.00000000000001\."),
+        ([[]], [[1 + Fraction(1, 10**30)]], r"beta must sum to 1 .* 10{29}1/10{30}\."),
+    ],
+)
+def test_bad_values_raise(alpha, beta, message):
+    with pytest.raises(ValueError, match=message):
+        Tableau(alpha, beta)
+
+
+@pytest.mark.parametrize(
+    ("alpha", "beta", "message"),
+    [
+        (1, [[1]], r"alpha must be a sequence with one list of flows .*, got 1 of type int"),
+        (np.array(1.0), [[1]], r"alpha must be .*, got array\(1\.\) of type ndarray"),
+        ([[], 1], [[1]], r"alpha\[1\] must be a sequence of rows, .*, got 1 of type int"),
+        ([[], [0.5]], [[1]], r"alpha\[1\]\[0\] must be a row .*, got 0.5 of type float"),
+        ([[]], 1, r"beta must be a sequence of rows, .*, got 1 of type int"),
+        ([[]], [1], r"beta\[0\] must be a row .*, got 1 of type int"),
+        ([[]], ["1"], r"beta\[0\] must be a row .*, got '1' of type str"),
+        ([[]], {0: [1]}, r"beta must be a sequence of rows, .* of type dict"),
+        ([[]], [{1}], r"beta\[0\] must be a row .*, got \{1\} of type set"),
+        ([[]], [["1"]], r"beta\[0\]\[0\] must be an int, .*, got '1' of type str"),
+        ([[]], [[None]], r"beta\[0\]\[0\] must be an int, .*, got None of type NoneType"),
+        ([[]], [[1j]], r"beta\[0\]\[0\] must be an int, .*, got 1j of type complex"),
+        ([[]], [[True]], r"beta\[0\]\[0\] must be an int, .*, got True of type bool"),
+        ([[]], [[np.True_]], r"beta\[0\]\[0\] must be an int, .*, got (np\.)?True_? of type bool"),
+        ([[]], [[[1]]], r"beta\[0\]\[0\] must be an int, .*, got \[1\] of type list"),
+        ([[], [[[1]]]], [[1]], r"alpha\[1\]\[0\]\[0\] must be an int, .*, got \[1\] of type list"),
+    ],
+)
+@pytest.mark.usefixtures("no_shape_hook")
+def test_bad_types_raise(alpha, beta, message):
+    with pytest.raises(TypeError, match=message):
+        Tableau(alpha, beta)
+
+
+def test_a_number_that_would_lose_digits_raises():
+    precise = np.longdouble(1) / 3
+    if float(precise) == precise:
+        pytest.skip("long double is double here")
+    with pytest.raises(TypeError, match=r"alpha\[1\]\[0\]\[0\] must be an int"):
+        Tableau([[], [[precise]]], [[1]])
+
+
+def test_sum_of_rounded_weights_is_accepted():
+    assert sum(map(Fraction, [0.1] * 10)) != 1
+    assert Tableau([[]] * 10, [[0.1] * 10]).beta == ((0.1,) * 10,)
+    assert Tableau([[]] * 3, [[1e6 + 1 / 3, 1 / 3, 1 / 3 - 1e6]]).num_stages == 3

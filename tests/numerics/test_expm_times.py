@@ -1,0 +1,191 @@
+"""Flows of matrix fields on few columns: accuracy at every norm, derivatives, batches."""
+
+import functools
+import math
+from fractions import Fraction
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+import scipy.linalg
+
+from cfjax import LeftMatrix, RightMatrix
+from cfjax._fields.matrix import _is_thin
+from cfjax._numerics.expm_times import _DEGREES
+
+N = 16
+BOTH = pytest.mark.parametrize("cls", [LeftMatrix, RightMatrix])
+# One on each side of every bound, far beyond them, and zero.
+NORMS = [0.0, 1e-9, 1e-3, 0.1, 0.15, 0.29, 0.31, 0.7, 0.8, 0.99, 1.0, 1.4, 1.5, 2.2, 2.4, 2.5, 30.0]
+
+
+def random(shape, seed, dtype: type = np.float64):
+    rng = np.random.default_rng(seed)
+    x = rng.normal(size=shape)
+    if np.issubdtype(dtype, np.complexfloating):
+        x = x + 1j * rng.normal(size=shape)
+    return x.astype(dtype)
+
+
+def matrix(kind, norm, dtype: type = np.float64):
+    """Of the given norm, as the field takes it."""
+    a = random((N, N), 0, dtype)
+    if kind == "skew":
+        a = a - a.conj().T
+    if kind == "one sided":
+        a = np.triu(a, 1)
+    size = np.abs(a.real) + np.abs(a.imag)
+    return (a / size.sum(axis=0).max() * norm).astype(dtype)
+
+
+def act(cls, matrix, point):
+    return matrix @ point if cls is LeftMatrix else point @ matrix
+
+
+@jax.jit
+def flow(field, point):
+    return field.flow(point)
+
+
+@jax.jit
+def displacement(field, point):
+    return field.displacement(point)
+
+
+@pytest.mark.parametrize(("precision", "unit"), [("float32", 2.0**-24), ("float64", 2.0**-53)])
+def test_the_bounds_are_where_the_backward_error_reaches_the_unit_roundoff(precision, unit):
+    """With `log(exp(-x) T(x)) = sum_k c_k x^k` it is `sum_k |c_k| theta^(k-1)`."""
+    for degree, theta in _DEGREES[precision]:
+        length = degree + 40  # At theta the terms beyond are below 1e-20 of the first.
+        taylor = [Fraction(int(k <= degree), math.factorial(k)) for k in range(length)]
+        inverse = [Fraction((-1) ** k, math.factorial(k)) for k in range(length)]
+        q = [sum(taylor[i] * inverse[k - i] for i in range(k + 1)) for k in range(length)]
+        c = [Fraction(0)] * length
+        for k in range(1, length):
+            c[k] = q[k] - sum((i * c[i] * q[k - i] for i in range(degree, k)), Fraction(0)) / k
+        assert not any(c[: degree + 1])
+
+        def backward(x, c=c):
+            return sum(abs(float(a)) * x ** (k - 1) for k, a in enumerate(c) if a)
+
+        assert backward(theta) <= unit < backward(theta * 1.001)
+
+
+def test_which_points_are_thin():
+    a = jnp.zeros((N, N))
+    assert _is_thin(a, jnp.zeros(N)) and _is_thin(a, jnp.zeros((N, 2)))
+    assert not _is_thin(a, jnp.zeros((N, 3)))
+    assert _is_thin(a, jnp.zeros(N, complex)) and not _is_thin(a, jnp.zeros((N, 2), complex))
+    assert not _is_thin(jnp.zeros((7, 7)), jnp.zeros(7))
+
+
+@BOTH
+@pytest.mark.parametrize(
+    ("kind", "dtype", "point_dtype"),
+    [
+        ("any", np.float32, np.float32),
+        ("any", np.float64, np.float64),
+        ("one sided", np.float64, np.float64),
+        ("skew", np.float64, np.complex128),
+        ("skew", np.complex64, np.complex64),
+        ("skew", np.complex128, np.complex128),
+    ],
+)
+def test_every_norm(cls, kind, dtype, point_dtype):
+    point = random((N,), 1, point_dtype)
+    wide = np.promote_types(dtype, np.float64)
+    eps = np.finfo(dtype).eps
+    for norm in NORMS:
+        a = matrix(kind, norm, dtype)
+        e = scipy.linalg.expm(a.astype(wide))
+        got = flow(cls(a), point)
+        assert got.dtype == point_dtype and got.shape == point.shape
+        # Backward errors of a few units; beyond the bounds each of four squarings doubles them.
+        growth = np.exp(np.linalg.norm((a + a.conj().T) / 2, 2))
+        scale = eps * growth * np.linalg.norm(point)
+        tolerance = (8 if norm < 2.45 else 100) * (1 + norm) * scale
+        np.testing.assert_allclose(got, act(cls, e, point), rtol=0, atol=tolerance)
+        if norm < 2.2:
+            # What is added is as accurate as it is small.
+            change = np.asarray(displacement(cls(a), point))
+            exact = act(cls, e - np.eye(N), point) if norm > 1e-2 else act(cls, a, point)
+            atol = 8 * norm * scale + (norm**2 * np.linalg.norm(point) if norm <= 1e-2 else 0)
+            np.testing.assert_allclose(change, exact, rtol=0, atol=atol)
+
+
+def test_rounding_of_lengths_is_that_of_one_sum():
+    """After 1000 steps of norm 0.1 the length is off by a random walk of units of rounding."""
+    a, y = jnp.asarray(matrix("skew", 0.1)), jnp.asarray(random((N,), 1))
+    end = jax.lax.fori_loop(0, 1000, lambda _, y: LeftMatrix(a).flow(y), y)
+    assert abs(jnp.linalg.norm(end) / jnp.linalg.norm(y) - 1) < 1e-14
+
+
+@functools.partial(jax.jit, static_argnums=0)
+def value_and_gradients(cls, a, point, weight):
+    def value(a, point):
+        return jnp.vdot(weight, cls(a).flow(point))
+
+    return jax.value_and_grad(value, (0, 1))(a, point)
+
+
+@functools.partial(jax.jit, static_argnums=0)
+def forward(cls, a, direction, point):
+    return jax.jvp(lambda a: cls(a).flow(point), (a,), (direction,))[1]
+
+
+@BOTH
+@pytest.mark.parametrize("norm", [0.0, 0.5, 2.0, 30.0])
+def test_derivatives(cls, norm):
+    a, direction = matrix("skew", norm), random((N, N), 2)
+    point, weight = random((N,), 3), random((N,), 4)
+    exact, frechet = scipy.linalg.expm_frechet(a, direction)
+    # A skew matrix keeps norms, so nothing grows: units of rounding of sums of N^2 products of
+    # size 1, doubled by five squarings beyond the bounds.
+    atol = 1e-13 * (1 + norm) * (2**5 if norm > 2.4 else 1)
+
+    value, (in_a, in_point) = value_and_gradients(cls, a, jnp.asarray(point), weight)
+    assert value == pytest.approx(np.vdot(weight, act(cls, exact, point)), abs=atol)
+    want = np.vdot(weight, act(cls, frechet, point))
+    assert np.vdot(in_a, direction) == pytest.approx(want, abs=atol)
+    other = RightMatrix if cls is LeftMatrix else LeftMatrix
+    np.testing.assert_allclose(in_point, act(other, exact, weight), rtol=0, atol=atol)
+    found = forward(cls, a, direction, point)
+    np.testing.assert_allclose(found, act(cls, frechet, point), rtol=0, atol=atol)
+
+
+def test_a_derivative_does_not_depend_on_the_point():
+    """Where `a y = 0` all terms vanish, and not their derivatives."""
+    a, direction = matrix("skew", 1.0), random((N, N), 2)
+    a[:, 0] = a[0, :] = 0
+    y = np.eye(N)[0]
+    got = jax.jvp(lambda a: flow(LeftMatrix(a), y), (a,), (direction,))[1]
+    want = scipy.linalg.expm_frechet(a, direction, compute_expm=False) @ y
+    np.testing.assert_allclose(got, want, rtol=0, atol=1e-13)
+
+
+def test_the_second_derivative_at_zero():
+    # The term of second order of exp is d d / 2, so its second derivative along d is d d.
+    d, point = random((N, N), 2), jnp.asarray(random((N,), 3))
+    got = jax.jit(jax.jacfwd(jax.jacrev(lambda t: LeftMatrix(t * d).flow(point))))(0.0)
+    np.testing.assert_allclose(got, d @ d @ point, rtol=0, atol=1e-12)
+
+
+def test_a_batch_of_different_norms():
+    point = random((N,), 1)
+    for norms in (NORMS[:6], NORMS):
+        batch = np.stack([matrix("skew", norm) for norm in norms])
+        got = jax.jit(jax.vmap(lambda a: LeftMatrix(a).flow(jnp.asarray(point))))(batch)
+        want = [scipy.linalg.expm(a) @ point for a in batch]
+        # As above, with five squarings for the last.
+        np.testing.assert_allclose(got, want, rtol=0, atol=1e-12)
+
+
+def test_what_is_not_finite_stays_so():
+    point = random((N,), 1)
+    for bad in (np.nan, np.inf):
+        a = matrix("any", 1.0)
+        a[3, 5] = bad
+        assert not np.isfinite(flow(LeftMatrix(a), point)).any()
+    # Beyond the largest float no exponential is right.
+    assert not np.isfinite(flow(LeftMatrix(matrix("skew", 1e300)), point)).any()

@@ -1,0 +1,124 @@
+"""phi_1: accuracy for every argument, derivatives of several orders, and what is not finite."""
+
+import jax
+import jax.numpy as jnp
+import mpmath
+import numpy as np
+import pytest
+
+from cfjax._numerics.phi import phi_1
+
+ORDERS = 3
+# On both sides of every switch between the formulas, which are at 1/1024, 1, 2 and 3.
+SWITCHES = [k * d for k in (2**-10, 1, 2, 3) for d in (1 - 1e-9, 1, 1 + 1e-9)]
+MAGNITUDES = np.array([1e-300, 1e-20, 1e-9, 1e-3, 0.3, 0.999, *SWITCHES, 1.5, 2.5, 5, 20, 80])
+LARGE = np.array([-1e4, -1e8, -1e30])
+DIRECTIONS = {
+    "negative": -1,
+    "positive": 1,
+    "imaginary": 1j,
+    "left": -0.8 + 0.6j,
+    "right": 0.8 - 0.6j,
+}
+REAL = {"negative": -1, "positive": 1}
+
+
+def exact(z, order):
+    """The integral of s^order exp(s z) over s from 0 to 1, by its series or its recursion."""
+    with mpmath.workdps(60):
+        z = mpmath.mpmathify(z)
+        if abs(z) < 4:
+            terms, power, j = [], mpmath.mpf(1), 0
+            while j < 80:
+                terms.append(power / (mpmath.factorial(j) * (order + j + 1)))
+                power, j = power * z, j + 1
+            return complex(mpmath.fsum(terms))
+        value = (mpmath.exp(z) - 1) / z
+        for m in range(1, order + 1):
+            value = (mpmath.exp(z) - m * value) / z
+        return complex(value)
+
+
+def derivatives(z):
+    """The value and three derivatives, from one nest of forward modes."""
+
+    def deeper(f):
+        return lambda z: jax.jvp(f, (z,), (jnp.ones_like(z),))
+
+    ((value, first), (_, second)), (_, (_, third)) = deeper(deeper(deeper(phi_1)))(z)
+    return jnp.stack([value, first, second, third])
+
+
+@pytest.mark.parametrize("dtype", [np.float32, np.float64, np.complex64, np.complex128])
+def test_value_and_three_derivatives(dtype):
+    directions = DIRECTIONS if np.issubdtype(dtype, np.complexfloating) else REAL
+    z = np.concatenate([[0], *(d * MAGNITUDES for d in directions.values()), LARGE])
+    eps = np.finfo(dtype).eps
+    z = z.astype(dtype)
+    found = np.asarray(jax.jit(derivatives)(z)).astype(complex)
+    assert not np.any(np.isnan(found))
+    for order in range(ORDERS + 1):
+        wanted = np.array([exact(complex(x), order) for x in z])
+        # A few units of rounding. On the imaginary axis the integrand turns and the integral is
+        # smaller than what is added up, which is exp(z) / z; XLA's own exponential of a complex
+        # number has the error of its angle.
+        size = np.maximum(
+            np.abs(wanted), np.abs(np.exp(z.astype(complex)) / np.maximum(np.abs(z), 1))
+        )
+        limit = np.where(np.imag(z) == 0, 4, 12) * eps * size
+        # Below the smallest normal number XLA on a CPU gives zero.
+        limit = limit + np.finfo(dtype).tiny
+        worst = np.argmax(np.abs(found[order] - wanted) / limit)
+        assert abs(found[order] - wanted)[worst] <= limit[worst], (order, z[worst])
+
+
+@pytest.mark.parametrize("dtype", [jnp.float32, jnp.float64])
+def test_derivatives_at_zero_in_reverse(dtype):
+    # The series: phi_1^(k)(0) = 1 / (k + 1), to the rounding of one division.
+    f = phi_1
+    for k in range(5):
+        assert float(f(jnp.zeros((), dtype))) == pytest.approx(
+            1 / (k + 1), rel=float(jnp.finfo(dtype).eps)
+        )
+        f = jax.grad(f)
+
+
+def test_modes_agree():
+    z = jnp.asarray(np.concatenate([[0.0], -MAGNITUDES, MAGNITUDES[:-1]]))
+    forward = jax.vmap(jax.jvp, in_axes=(None, 0, 0))(phi_1, (z,), (jnp.ones_like(z),))[1]
+    reverse = jax.vmap(jax.grad(phi_1))(z)
+    # The same formula in both.
+    np.testing.assert_allclose(forward, reverse, rtol=1e-15)
+    twice = jax.vmap(jax.grad(jax.grad(phi_1)))(z)
+    mixed = jax.vmap(jax.jacfwd(jax.grad(phi_1)))(z)
+    np.testing.assert_allclose(twice, mixed, rtol=1e-15)
+
+
+def test_second_reverse_pass_through_a_checkpointed_loop():
+    """A loop may lose the rule of the derivative, and then differentiates what is inside."""
+
+    def f(z):
+        step = jax.checkpoint(lambda x, _: (x * phi_1(z), None))
+        return jax.lax.scan(step, 1.0, None, length=3)[0]
+
+    for z in (0.0, 0.3, -0.99, -5.0):
+        p, p1, p2 = (exact(z, k).real for k in range(3))
+        wanted = 3 * p**2 * p2 + 6 * p * p1**2
+        found = jax.grad(jax.grad(f))(z)
+        assert float(found) == pytest.approx(wanted, rel=1e-13)
+
+
+@pytest.mark.parametrize("dtype", [np.float32, np.float64])
+def test_what_is_not_finite(dtype):
+    z = jnp.asarray([np.nan, -np.inf, np.inf, 1e4], dtype)
+    found = np.asarray(phi_1(z))
+    assert np.isnan(found[0])
+    assert found[1] == 0
+    assert not np.any(np.isfinite(found[2:]))
+
+
+@pytest.mark.parametrize("shape", [(), (0,), (2, 3)])
+def test_shapes(shape):
+    z = jnp.linspace(-5.0, 2.0, int(np.prod(shape))).reshape(shape)
+    assert phi_1(z).shape == shape
+    assert jax.vmap(phi_1)(z[None]).shape == (1, *shape)

@@ -1,0 +1,348 @@
+"""Transforms: against scipy, the operators they make diagonal, derivatives, and what is refused."""
+
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+import scipy.fft
+
+import cfjax
+from cfjax._numerics.transforms import _MAX_DENSE
+
+# The dense path, both sides of the switch, and a prime number of intervals, 251.
+SIZES = [1, 2, 8, 99, _MAX_DENSE, _MAX_DENSE + 1, 250, 1023, 1024]
+
+
+def transform(kind, n):
+    return {
+        "sine": cfjax.SineTransform,
+        "cosine": cfjax.CosineTransform,
+        "Fourier": cfjax.FourierTransform,
+        "real Fourier": lambda: cfjax.RealFourierTransform(n),
+    }[kind]()
+
+
+SCIPY = {
+    "sine": lambda x: np.asarray(scipy.fft.dst(x, type=1, norm="ortho", axis=0)),
+    "cosine": lambda x: np.asarray(scipy.fft.dct(x, type=2, norm="ortho", axis=0)),
+    "Fourier": lambda x: np.asarray(scipy.fft.fft(x, norm="ortho", axis=0)),
+    "real Fourier": lambda x: np.asarray(scipy.fft.rfft(x, norm="ortho", axis=0)),
+}
+kinds = pytest.mark.parametrize("kind", SCIPY)
+
+
+def point(kind, shape, seed=1):
+    rng = np.random.default_rng(seed)
+    x = rng.standard_normal(shape)
+    return x + 1j * rng.standard_normal(shape) if kind == "Fourier" else x
+
+
+def close(found, wanted, n):
+    """A dense product adds n terms and a fast one log n, of entries of size one."""
+    eps = np.finfo(np.asarray(found).dtype).eps
+    np.testing.assert_allclose(found, wanted, rtol=0, atol=4 * eps * np.sqrt(n) * np.log2(n + 2))
+
+
+@kinds
+@pytest.mark.parametrize("n", SIZES)
+def test_against_scipy_and_back(kind, n):
+    t, x = transform(kind, n), point(kind, (n,))
+    c = t.forward(jnp.asarray(x))
+    close(c, SCIPY[kind](x), n)
+    close(t.inverse(c), x, n)
+
+
+@kinds
+@pytest.mark.parametrize("n", [5, 255])
+def test_columns_and_batches(kind, n):
+    t, x = transform(kind, n), jnp.asarray(point(kind, (n, 3, 2)))
+    found = t.forward(x)
+    close(found, SCIPY[kind](np.asarray(x)), n)
+    close(t.inverse(found), x, n)
+    batch = jax.vmap(jax.vmap(t.forward))(x.transpose(1, 2, 0))
+    close(batch.transpose(2, 0, 1), found, n)
+
+
+@kinds
+@pytest.mark.parametrize("n", [6, 200])
+def test_float32(kind, n):
+    t, x = transform(kind, n), point(kind, (n,))
+    single = jnp.asarray(x, jnp.complex64 if kind == "Fourier" else jnp.float32)
+    c = t.forward(single)
+    assert c.dtype == (jnp.complex64 if "Fourier" in kind else jnp.float32)
+    close(c, SCIPY[kind](x), n)
+    assert t.inverse(c).dtype == single.dtype
+
+
+@pytest.mark.parametrize("kind", ["sine", "cosine"])
+@pytest.mark.parametrize("n", [7, 180])
+def test_complex_points(kind, n):
+    t, x = transform(kind, n), point("Fourier", (n,))
+    c = t.forward(jnp.asarray(x))
+    close(c, SCIPY[kind](x.real) + 1j * SCIPY[kind](x.imag), n)
+    close(t.inverse(c), x, n)
+
+
+def operator(kind, n):
+    """The operator that the docstring says is diagonal, dense, and its eigenvalues."""
+    a = np.diag(np.full(n, -2.0)) + np.diag(np.ones(n - 1), 1) + np.diag(np.ones(n - 1), -1)
+    k = np.arange(n)
+    if kind == "sine":
+        return a, -4 * np.sin((k + 1) * np.pi / (2 * (n + 1))) ** 2
+    if kind == "cosine":
+        a[0, 0] += 1
+        a[-1, -1] += 1
+        return a, -4 * np.sin(k * np.pi / (2 * n)) ** 2
+    # An upwind difference: complex eigenvalues.
+    a = np.eye(n) - np.roll(np.eye(n), 1, axis=0)
+    eigenvalues = 1 - np.exp(-2j * np.pi * k / n)
+    return a, eigenvalues if kind == "Fourier" else eigenvalues[: n // 2 + 1]
+
+
+@kinds
+@pytest.mark.parametrize("n", [3, 16, 201])
+def test_the_operator_is_diagonal(kind, n):
+    t, x = transform(kind, n), point(kind, (n,))
+    a, eigenvalues = operator(kind, n)
+    found = t.inverse(jnp.asarray(eigenvalues) * t.forward(jnp.asarray(x)))
+    close(found, a @ x, n)
+
+
+@kinds
+@pytest.mark.parametrize("n", [4, 5, 170])
+def test_transpose_and_derivative(kind, n):
+    """The transpose of a map L by its definition, and its derivative, which is L itself."""
+    t, x, dx = transform(kind, n), point(kind, (n,), 1), point(kind, (n,), 2)
+    x, dx = jnp.asarray(x), jnp.asarray(dx)
+    c, dc = jax.jvp(t.forward, (x,), (dx,))
+    close(dc, t.forward(dx), n)
+    g = t.forward(jnp.asarray(point(kind, (n,), 3)))
+    (pulled,) = jax.vjp(t.forward, x)[1](g)
+    # JAX pairs complex numbers by the real part of their product, without a conjugate.
+    close(np.sum(g * dc).real, np.sum(pulled * dx).real, n)
+    (pulled,) = jax.vjp(t.inverse, c)[1](x)
+    close(np.sum(x * dx).real, np.sum(pulled * dc).real, n)
+
+
+def test_norm_is_kept():
+    for kind in ("sine", "cosine", "Fourier"):
+        for n in (10, 300):
+            x = point(kind, (n,))
+            norm = np.linalg.norm(transform(kind, n).forward(jnp.asarray(x)))
+            assert norm == pytest.approx(np.linalg.norm(x), rel=1e-13)
+
+
+def second_difference(kind, n):
+    """The operator of the docstring, dense. On one or two periodic points neighbours coincide."""
+    if "Fourier" not in kind:
+        return operator(kind, n)[0]
+    eye = np.eye(n)
+    return np.roll(eye, 1, axis=0) + np.roll(eye, -1, axis=0) - 2 * eye
+
+
+@kinds
+@pytest.mark.parametrize("n", [1, 2, 5, 6, 161])
+def test_eigenvalues_of_the_second_difference(kind, n):
+    t, x = transform(kind, n), jnp.asarray(point(kind, (n,)))
+    eigenvalues = jnp.asarray(t.second_difference(n))
+    found = t.inverse(eigenvalues.astype(t.forward(x).dtype) * t.forward(x))
+    close(found, second_difference(kind, n) @ np.asarray(x), n)
+    # What np.int64 counts is counted all the same.
+    np.testing.assert_array_equal(t.second_difference(np.int64(n)), eigenvalues)
+
+
+# Tensor products.
+
+PAIRS = [(a, b) for a in SCIPY for b in SCIPY if (a, b) != ("real Fourier",) * 2]
+# Small grids, and beyond the dense limit along either axis, for the kinds that have one.
+LARGE = {(_MAX_DENSE + 2, 3): 0, (3, _MAX_DENSE + 1): 1}
+GRIDS = [(pair, (4, 5)) for pair in PAIRS] + [
+    (pair, shape)
+    for shape, axis in LARGE.items()
+    for pair in PAIRS
+    if pair[axis] in ("sine", "cosine")
+]
+
+
+def on_grid(grid_kinds, shape, seed=1):
+    """The product of transforms and a point on the grid, complex where no transform takes real."""
+    axes = zip(grid_kinds, shape, strict=False)
+    t = cfjax.TensorTransform([kind and transform(kind, n) for kind, n in axes])
+    is_complex = "Fourier" in grid_kinds and "real Fourier" not in grid_kinds
+    return t, point("Fourier" if is_complex else "real", shape, seed)
+
+
+def scipy_on_grid(grid_kinds, x: Any):
+    """SciPy's transforms along the axes: those of real points first, and of complex ones last."""
+    order = ("sine", "cosine", "real Fourier", "Fourier")
+    for kind in order:
+        for axis in [k for k, found in enumerate(grid_kinds) if found == kind]:
+            x = np.moveaxis(x, axis, 0)
+            by_parts = kind in order[:2] and np.iscomplexobj(x)
+            x = SCIPY[kind](x.real) + 1j * SCIPY[kind](x.imag) if by_parts else SCIPY[kind](x)
+            x = np.moveaxis(x, 0, axis)
+    return x
+
+
+@pytest.mark.parametrize("pair, shape", GRIDS)
+def test_grids_against_scipy_and_back(pair, shape):
+    t, x = on_grid(pair, shape)
+    c = t.forward(jnp.asarray(x))
+    wanted = scipy_on_grid(pair, x)
+    assert c.shape == wanted.shape and c.dtype == wanted.dtype
+    close(c, wanted, max(shape))
+    back = t.inverse(c)
+    assert back.dtype == x.dtype
+    close(back, x, max(shape))
+
+
+@pytest.mark.parametrize(
+    "three",
+    [
+        ("Fourier", "real Fourier", "sine"),
+        ("cosine", "Fourier", "real Fourier"),
+        (None, "sine", "cosine"),
+        ("sine", None, "real Fourier"),
+    ],
+)
+def test_three_axes_and_columns(three):
+    shape = (3, 4, 5, 2)
+    t, x = on_grid(three, shape)
+    c = jax.jit(t.forward)(jnp.asarray(x))
+    close(c, scipy_on_grid(three, x), 5)
+    close(jax.jit(t.inverse)(c), x, 5)
+    batch = jax.vmap(t.forward, in_axes=-1, out_axes=-1)(jnp.asarray(x))
+    close(batch, c, 5)
+
+
+@pytest.mark.parametrize("pair", [("sine", "real Fourier"), ("Fourier", "cosine")])
+def test_transpose_and_derivative_on_grids(pair):
+    """The transpose of a map L by its definition, and its derivative, which is L itself."""
+    t, x = on_grid(pair, (4, 5))
+    x, dx = jnp.asarray(x), jnp.asarray(on_grid(pair, (4, 5), 2)[1])
+    c, dc = jax.jvp(t.forward, (x,), (dx,))
+    close(dc, t.forward(dx), 5)
+    g = jnp.asarray(point("Fourier", c.shape, 3))
+    (pulled,) = jax.vjp(t.forward, x)[1](g)
+    close(np.sum(g * dc).real, np.sum(pulled * dx).real, 20)
+    (pulled,) = jax.vjp(t.inverse, c)[1](x)
+    close(np.sum(x * dx).real, np.sum(pulled * dc).real, 20)
+
+
+def test_float32_on_grids():
+    pair = ("cosine", "real Fourier")
+    t, x = on_grid(pair, (6, 5))
+    c = t.forward(jnp.asarray(x, jnp.float32))
+    assert c.dtype == jnp.complex64 and t.inverse(c).dtype == jnp.float32
+    close(c, scipy_on_grid(pair, x), 6)
+
+
+# What is refused.
+
+
+@pytest.mark.parametrize("n", [0, -1, 2.0, True, None])
+def test_wrong_number_of_points(n, no_shape_hook):
+    for call in (cfjax.RealFourierTransform, cfjax.SineTransform().second_difference):
+        with pytest.raises(ValueError, match="n must be an integer of at least 1, got"):
+            call(n)
+
+
+def test_number_of_points_of_any_integer_type(no_shape_hook):
+    t = cfjax.RealFourierTransform(np.int64(4))
+    assert t == cfjax.RealFourierTransform(4) and type(t.n) is int
+
+
+@pytest.mark.parametrize(
+    "call, error, message",
+    [
+        (
+            lambda: cfjax.RealFourierTransform(4).forward(jnp.ones(5)),
+            ValueError,
+            r"RealFourierTransform\(4\) got a point of length 5, expected 4",
+        ),
+        # irfft would fill up with zeros.
+        (
+            lambda: cfjax.RealFourierTransform(6).inverse(jnp.ones(3, complex)),
+            ValueError,
+            r"RealFourierTransform\(6\) got coefficients of length 3, expected 4",
+        ),
+        (
+            lambda: cfjax.RealFourierTransform(6).second_difference(5),
+            ValueError,
+            r"RealFourierTransform\(6\) got points of length 5, expected 6",
+        ),
+        # The matrix in integers would be zero.
+        (
+            lambda: cfjax.SineTransform().forward(jnp.arange(4)),
+            TypeError,
+            "SineTransform takes arrays of float32, .*, got int64",
+        ),
+        (
+            lambda: cfjax.CosineTransform().inverse(jnp.ones(4, jnp.float16)),
+            TypeError,
+            "CosineTransform takes arrays of .*, got float16",
+        ),
+        (
+            lambda: cfjax.CosineTransform().forward(jnp.ones(())),
+            ValueError,
+            r"CosineTransform needs points along the first axis, got shape \(\)",
+        ),
+        (
+            lambda: cfjax.FourierTransform().forward(jnp.ones((0, 2), complex)),
+            ValueError,
+            r"FourierTransform needs points along the first axis, got shape \(0, 2\)",
+        ),
+        (
+            lambda: cfjax.FourierTransform().forward(jnp.ones(4)),
+            TypeError,
+            "FourierTransform takes complex arrays, got float64. Real points take",
+        ),
+        (
+            lambda: cfjax.RealFourierTransform(4).forward(jnp.ones(4, complex)),
+            TypeError,
+            r"RealFourierTransform\(4\) takes real points, got complex128",
+        ),
+        (
+            lambda: cfjax.TensorTransform(cfjax.SineTransform()),
+            TypeError,
+            r"transforms must be a sequence of transforms, got SineTransform\(\)",
+        ),
+        (
+            lambda: cfjax.TensorTransform((cfjax.SineTransform(), "sine")),
+            TypeError,
+            "transforms must hold cfjax.AbstractTransform or None, got 'sine'",
+        ),
+        (
+            lambda: cfjax.TensorTransform((cfjax.TensorTransform(()),)),
+            TypeError,
+            "transforms must be of one axis each, got a TensorTransform",
+        ),
+        (
+            lambda: cfjax.TensorTransform([cfjax.RealFourierTransform(4)] * 2),
+            ValueError,
+            "transforms must hold at most one RealFourierTransform, .* got .*n=4",
+        ),
+        (
+            lambda: cfjax.TensorTransform([cfjax.SineTransform()] * 3).forward(jnp.ones((4, 5))),
+            ValueError,
+            r"TensorTransform of 3 axes got an array of shape \(4, 5\)",
+        ),
+        (
+            lambda: cfjax.TensorTransform([None, cfjax.SineTransform()]).inverse(jnp.ones(4)),
+            ValueError,
+            r"TensorTransform of 2 axes got an array of shape \(4,\)",
+        ),
+        (
+            lambda: cfjax.TensorTransform(
+                [cfjax.SineTransform(), cfjax.FourierTransform()]
+            ).forward(jnp.ones((4, 5))),
+            TypeError,
+            "FourierTransform takes complex arrays, got float64",
+        ),
+    ],
+)
+def test_wrong_arrays_and_transforms(call, error, message, no_shape_hook):
+    with pytest.raises(error, match=message):
+        call()

@@ -1,0 +1,53 @@
+"""What goes through memory. That nothing else changes is in test_pack.py."""
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+from cfjax._xla.held import held
+from cfjax._xla.pack import pack, unpack
+
+
+def test_what_is_held_is_computed_once():
+    """Without it XLA computes the entries anew for each of two results."""
+
+    def program(keep):
+        def fun(x):
+            entries = unpack(x)
+            for _ in range(4):
+                a, b, c = entries
+                entries = [a * b + c, b * c - a, a + b * b]
+            entries = keep(entries)
+            return pack(entries), pack([a * a for a in entries])
+
+        return jax.jit(fun).lower(jnp.ones(3)).compile().cost_analysis()["flops"]
+
+    assert program(held) < program(list)
+
+
+@pytest.mark.parametrize("in_batches", [False, True])
+def test_in_a_batch_only_if_asked_for(in_batches):
+    """There a call is what XLA does not fuse."""
+
+    def fun(x):
+        return pack(held(unpack(x * x), in_batches=in_batches)) * x
+
+    program = str(jax.jit(jax.vmap(fun)).lower(jnp.ones((5, 3))).compile().as_text())
+    assert (" call(" in program) == in_batches
+
+
+@pytest.mark.parametrize("now", [False, True])
+def test_in_a_derivative_only_if_asked_for(now):
+    def fun(x):
+        return jnp.sum(jnp.sin(pack(held(unpack(x * x), in_batches=True, now=now))))
+
+    for f, is_held in ((fun, now), (jax.grad(fun), True)):
+        program = str(jax.jit(jax.vmap(f)).lower(jnp.ones((5, 3))).compile().as_text())
+        assert (" call(" in program) == is_held
+
+
+def test_other_dtypes_stay():
+    x = [jnp.asarray(True), jnp.asarray(3), jnp.asarray(0.5), jnp.asarray(2j, np.complex64)]
+    for got, want in zip(jax.jit(lambda x: held(x))(x), x, strict=True):
+        assert got.dtype == want.dtype and got == want

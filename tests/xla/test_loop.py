@@ -1,0 +1,160 @@
+"""`repeat`: the numbers and derivatives of a plain scan, whatever travels packed."""
+
+from typing import Any
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import jax.tree_util as jtu
+import numpy as np
+import pytest
+from jax import lax
+
+from cfjax._xla.loop import repeat
+
+VECTOR = jnp.asarray([0.3, -0.7, 1.1])
+MATRIX = jnp.asarray(np.random.default_rng(0).normal(size=(2, 3)))
+ATTITUDE = jnp.asarray(np.random.default_rng(1).normal(size=(3, 3)))
+COMPLEX = jnp.asarray([0.4 + 0.2j, -0.3j])
+LONG = jnp.linspace(-1.0, 1.0, 9)
+NUM_STEPS = 5
+
+
+def mix(carry, parameters):
+    """A step that couples everything with everything."""
+    floats = [x for x in jtu.tree_leaves((carry, parameters)) if x.dtype.kind in "fc"]
+    total: Any = sum(jnp.sum(jnp.sin((n + 1) * x)).real.astype(float) for n, x in enumerate(floats))
+
+    def advance(x):
+        if x.dtype.kind not in "fc":
+            return x + 1
+        share = total.astype(x.dtype)
+        return x + jnp.cos(share * x) / (1 + share**2)
+
+    return jtu.tree_map(advance, carry)
+
+
+CASES = {
+    "vector": (VECTOR, ()),
+    "vector and parameters": (VECTOR, {"a": VECTOR * 2, "b": jnp.asarray(0.4)}),
+    "parts": ((VECTOR, {"x": jnp.asarray(0.5), "m": MATRIX, "n": jnp.asarray(3)}), (LONG, VECTOR)),
+    "matrix": (ATTITUDE, (VECTOR, MATRIX)),
+    "matrix in components forward only": ((ATTITUDE, MATRIX, VECTOR), VECTOR),
+    "no short vector": ((MATRIX, LONG), VECTOR),
+    "two precisions": ((VECTOR, VECTOR.astype(np.float32)), (VECTOR.astype(np.float32), VECTOR)),
+    "more parameters than travel": (VECTOR, [VECTOR * k for k in range(1, 9)]),
+    "integers among the parameters": (VECTOR, (jnp.arange(3), VECTOR, jnp.asarray(True))),
+    "complex": (COMPLEX, (VECTOR, COMPLEX * 2)),
+    "real and complex": ((VECTOR, COMPLEX), (VECTOR, COMPLEX)),
+    "empty": ((VECTOR, jnp.zeros(0)), jnp.zeros(0)),
+}
+
+
+def plain(carry, parameters):
+    return lax.scan(lambda c, _: (mix(c, parameters), None), carry, length=NUM_STEPS)[0]
+
+
+def looped(carry, parameters):
+    return repeat(lambda c: mix(c, parameters), carry, NUM_STEPS)
+
+
+def scalar(run):
+    def fun(floats, rest):
+        leaves = jtu.tree_leaves(run(*eqx.combine(floats, rest)))
+        return sum(
+            jnp.sum(jnp.exp(jnp.sin(x.astype(complex)) / (n + 2))).real
+            for n, x in enumerate(leaves)
+        )
+
+    return fun
+
+
+def close(found, want, case):
+    def numbers(tree):
+        return [x for x in jtu.tree_leaves(tree) if x.dtype.kind in "fc"]
+
+    # Every number depends on all, so on the roundings of the coarsest and the size of the largest.
+    # Five coupled steps magnify them a hundredfold.
+    eps = max(float(jnp.finfo(x.dtype).eps) for x in numbers(case))
+    scale = max(1.0, *(float(jnp.max(jnp.abs(x), initial=0)) for x in numbers(want)))
+    jtu.tree_map(
+        lambda a, b: np.testing.assert_allclose(a, b, rtol=0, atol=1e3 * eps * scale), found, want
+    )
+    assert jtu.tree_structure(found) == jtu.tree_structure(want)
+
+
+@pytest.mark.parametrize("case", CASES.values(), ids=CASES.keys())
+def test_values(case):
+    want = jax.jit(plain)(*case)
+    found = jax.jit(looped)(*case)
+    close(found, want, case)
+    assert jtu.tree_map(lambda x: x.dtype, found) == jtu.tree_map(lambda x: x.dtype, want)
+
+
+@pytest.mark.parametrize("case", ["parts", "matrix", "no short vector"])
+def test_a_number_of_steps_that_is_traced(case):
+    case = CASES[case]
+
+    @jax.jit
+    def several(case, num_steps):
+        carry, parameters = case
+        return repeat(lambda c: mix(c, parameters), carry, num_steps)
+
+    close(several(case, jnp.asarray(NUM_STEPS)), jax.jit(plain)(*case), case)
+    # The same program.
+    close(several(case, jnp.asarray(0)), case[0], case)
+
+
+TRANSFORMS = {
+    "reverse": jax.grad,
+    "forward": lambda f: lambda x, rest: jax.jvp(lambda x: f(x, rest), (x,), (x,)),
+    "both": lambda f: lambda x, rest: jax.jvp(lambda x: jax.grad(f)(x, rest), (x,), (x,)),
+}
+DERIVATIVES = [
+    *((case, "reverse") for case in CASES),
+    *((case, "forward") for case in ("vector and parameters", "parts", "real and complex")),
+    *((case, "both") for case in ("vector and parameters", "parts")),
+]
+
+
+@pytest.mark.parametrize("case, transform", DERIVATIVES)
+def test_derivatives(case, transform):
+    case, transform = CASES[case], TRANSFORMS[transform]
+    x, rest = eqx.partition(case, eqx.is_inexact_array)
+    want, found = (jax.jit(transform(scalar(run)))(x, rest) for run in (plain, looped))
+    close(found, want, case)
+
+
+@pytest.mark.parametrize("axes", [(0, None), (None, 0)], ids=["carry", "parameters"])
+@pytest.mark.parametrize("order", ["grad in vmap", "vmap in grad", "none"])
+def test_a_batch(axes, order):
+    def batched(run):
+        if order == "grad in vmap":
+            return jax.vmap(jax.grad(lambda c, p: scalar(run)((c, p), (c, p)), (0, 1)), axes)
+        many = jax.vmap(run, axes)
+        if order == "none":
+            return many
+        return jax.grad(lambda c, p: scalar(many)((c, p), (c, p)), (0, 1))
+
+    vectors = jnp.stack([VECTOR, VECTOR * 2])
+    case = (vectors, (VECTOR, VECTOR[0])) if axes[0] == 0 else (VECTOR, (vectors, vectors[:, 0]))
+    want, found = (jax.jit(batched(run))(*case) for run in (plain, looped))
+    close(found, want, case)
+
+
+def test_only_what_is_differentiated():
+    """One parameter among those that the step closes over, and one in an inner program."""
+
+    def run(repeated):
+        @jax.jit
+        def fun(a, b):
+            def step(y):
+                return y + jnp.sin(a * y) / (1 + jax.jit(lambda: b * b)())
+
+            if repeated:
+                return jnp.sum(repeat(step, VECTOR, NUM_STEPS))
+            return jnp.sum(lax.fori_loop(0, NUM_STEPS, lambda _, y: step(y), VECTOR))
+
+        return jax.jacfwd(jax.grad(fun, 1), 0)(VECTOR, jnp.asarray(0.7)), jax.grad(fun)(VECTOR, 0.7)
+
+    close(run(True), run(False), VECTOR)

@@ -1,0 +1,81 @@
+"""`pack` and `unpack`: the numbers of `jnp.stack` under every transformation."""
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+from cfjax._xla.held import held
+from cfjax._xla.pack import pack, unpack
+
+RNG = np.random.default_rng(0)
+
+
+@pytest.mark.parametrize("axis", [0, 1])
+@pytest.mark.parametrize("dtype", [np.float32, np.float64, np.complex128, np.int32, np.bool_])
+@pytest.mark.parametrize("count", [1, 4])
+def test_pack_is_stack_and_unpack_its_inverse(axis, dtype, count):
+    entries = [jnp.asarray(RNG.normal(size=(2, 5)) * 3, dtype) for _ in range(count)]
+    for run in (pack, jax.jit(pack, static_argnums=1)):
+        whole = run(entries, axis)
+        assert whole.dtype == dtype
+        np.testing.assert_array_equal(whole, np.stack(entries, axis))
+    for entry, found in zip(entries, unpack(whole, axis), strict=True):
+        np.testing.assert_array_equal(found, entry)
+
+
+def weighted(stack):
+    """A function whose derivatives differ from entry to entry. One entry is never used."""
+
+    def fun(x, y):
+        a, b, c = y if stack is jnp.stack else unpack(y)
+        whole = stack([x * a, jnp.sin(b * x), x * x, c * a, x])
+        return jnp.sum(jnp.exp(whole[1:4] / 2) * whole[:3])
+
+    return fun
+
+
+@pytest.mark.parametrize(
+    "transform",
+    [
+        jax.grad,
+        lambda f: jax.grad(f, 1),
+        lambda f: lambda x, y: jax.jvp(f, (x, y), (x + 1, y * y)),
+        lambda f: lambda x, y: jax.jvp(lambda x: f(x, y), (x,), (x + 1,)),
+        lambda f: jax.hessian(f, 1),
+        lambda f: jax.grad(lambda x, y: jnp.sum(jax.grad(f, 1)(x, y) ** 2)),
+        lambda f: lambda x, y: jax.vmap(jax.grad(f), (None, 0))(x, jnp.stack([y, y * y])),
+        lambda f: lambda x, y: jax.vmap(f, (0, 1), 0)(y[:2], jnp.stack([y, y * y], 1)),
+        lambda f: jax.grad(lambda x, y: jnp.sum(jax.vmap(f, (0, None))(x * y, y))),
+    ],
+    ids=[
+        "grad",
+        "grad 1",
+        "jvp",
+        "jvp of one",
+        "hessian",
+        "reverse twice",
+        "grad in vmap",
+        "vmap of both",
+        "vmap in grad",
+    ],
+)
+@pytest.mark.parametrize(
+    "stack",
+    [
+        pack,
+        lambda entries: pack(entries, sums=True),
+        lambda entries: pack(held(entries)),
+        lambda entries: pack(held(entries, in_batches=True)),
+        lambda entries: pack(held(entries, in_batches=True, alone=False, now=False)),
+    ],
+    ids=["pack", "pack with sums", "held", "held in batches", "held in derivatives"],
+)
+def test_transformations(transform, stack):
+    x, y = jnp.asarray(0.7), jnp.asarray(RNG.normal(size=3))
+    want = transform(weighted(jnp.stack))(x, y)
+    for run in (transform(weighted(stack)), jax.jit(transform(weighted(stack)))):
+        # The same sums of at most some ten terms, perhaps in another order.
+        jax.tree.map(
+            lambda a, b: np.testing.assert_allclose(a, b, rtol=0, atol=1e-13), run(x, y), want
+        )
