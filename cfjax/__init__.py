@@ -63,6 +63,7 @@ from ._solvers.munthe_kaas import RKMK4 as RKMK4
 from ._solvers.retraction import CayleyRK4 as CayleyRK4
 from ._solvers.richardson import Richardson as Richardson
 from ._term import LieTerm as LieTerm
+from ._xla import rewriting as rewriting
 
 if TYPE_CHECKING:
     from . import scenes as scenes

@@ -13,7 +13,7 @@ from jax import lax
 from jaxtyping import Array, Bool, Int, PyTree, Real
 
 from .._solvers.base import AbstractLieSolver, State
-from .._xla.loop import repeat
+from .._xla import repeat
 
 
 def integrate(

@@ -3,7 +3,7 @@
 import jax
 from jaxtyping import Array, Float
 
-from .._xla.pack import pack
+from .._xla import pack
 from .stumpff import stumpff_1_2_apart
 
 

@@ -15,9 +15,7 @@ from jaxtyping import Array, Inexact, PyTree, Real
 
 from .._field import Displaced, flow, is_displaced, is_field, value
 from .._term import product
-from .._xla.components import by_components, is_inside, is_short, is_small
-from .._xla.held import held
-from .._xla.pack import pack, unpack
+from .._xla import by_components, once_for_sums
 from .dense import Interpolation, Path
 from .failure import result_of
 
@@ -94,8 +92,6 @@ class AbstractLieSolver(diffrax.AbstractSolver):
         if first is not None and made_jump is not False:
             first = _select(made_jump, lambda: terms.vf(t0, y0, args), first)
 
-        in_own_loop = is_inside()
-
         def move(y0):
             control = terms.contr(t0, t1)
             values = []
@@ -118,15 +114,14 @@ class AbstractLieSolver(diffrax.AbstractSolver):
             )
             made = self.move(field, start)
             end = jtu.tree_map(
-                lambda lost, end: _held_displacement(lost, end, in_own_loop),
+                lambda lost, end: _shared(lost, end),
                 lost,
                 made.end,
                 is_leaf=_is_leaf,
             )
-            # The end of a step and the field there are always wanted, the rest is not.
             return (end, None if first is None else values[-1]), (made.error, made.path)
 
-        (end, last), (error, path) = by_components(move, y0, has_extra=True)
+        (end, last), (error, path) = by_components(move, y0)
         sums = jtu.tree_map(
             lambda lost, p: (p, None) if lost is None else lost.up_to(p),
             lost,
@@ -240,27 +235,11 @@ class _Sum(eqx.Module):
         return total, _Sum(lax.stop_gradient(b - (total - a)))
 
 
-def held_entries(point: Any) -> Any:
-    """The same point; the entries of a short vector are computed once for all that uses them."""
-    if is_displaced(point):
-        return Displaced(point.start, held_entries(point.displacement))
-    return pack(held(unpack(point))) if is_short(point) else point
-
-
-def _held_displacement(lost: Any, end: Any, in_own_loop: bool) -> Any:
-    """The end of a step. A compensated sum uses the displacement several times.
-
-    Else each use would compute the step of a batch anew, and matrices so only in diffrax's loop.
-    Alone it is fast in ours, but makes diffrax's too large to be one function.
-    """
-    if not isinstance(lost, _Sum) or not is_small(lost.lost):
+def _shared(lost: Any, end: Any) -> Any:
+    """The end of a step. A compensated sum uses the displacement several times."""
+    if not isinstance(lost, _Sum):
         return end
-    d = end.displacement
-    if is_short(d):
-        d = pack(held(unpack(d), in_batches=True, alone=in_own_loop))
-    else:
-        (d,) = held([d], in_batches=not in_own_loop)
-    return Displaced(end.start, d)
+    return Displaced(end.start, once_for_sums(end.displacement))
 
 
 def _is_leaf(x: Any) -> bool:

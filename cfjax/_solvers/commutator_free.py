@@ -24,7 +24,8 @@ from .._methods import tableau as _tableau
 from .._methods.extension import extension
 from .._methods.order_conditions import order
 from .._methods.tableau import Product, Row, Tableau
-from .base import AbstractLieSolver, Move, held_entries
+from .._xla import once
+from .base import AbstractLieSolver, Move
 from .dense import Path
 
 
@@ -95,7 +96,7 @@ class AbstractCommutatorFree(AbstractLieSolver):
             evaluate(float(c), rows)
         if self.first_same_as_last:
             # Two results of the step, the state and the last field, need its end.
-            points[stages[-1]] = jtu.tree_map(held_entries, point(stages[-1]), is_leaf=is_displaced)
+            points[stages[-1]] = once(point(stages[-1]))
         end = leave(fields[0], point(stages[-1]))
         # All that follows is for error control and output within the step. It is dead code, left
         # out by the compiler, where nobody asks for them.

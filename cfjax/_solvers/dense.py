@@ -12,7 +12,7 @@ from jaxtyping import Array, PyTree
 
 from .._field import combine, flow, leave
 from .._methods.tableau import Extension
-from .._xla.components import by_components
+from .._xla import by_components
 
 
 class Interpolation(diffrax.AbstractLocalInterpolation):

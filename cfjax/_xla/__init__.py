@@ -1,0 +1,16 @@
+"""All that reads and rewrites programs, so that XLA makes fast code of them.
+
+- `by_components`, `repeat`: a step, and many equal ones, on single numbers.
+- `once`, `once_for_sums`: values that several results need, computed once.
+- `pack`: `jnp.stack` in a form that XLA fuses.
+- `rewriting`: the switch that turns it all off.
+
+Nothing outside may import from the files within. `README.md` here says what each trick buys.
+"""
+
+from .components import by_components as by_components
+from .held import once as once
+from .held import once_for_sums as once_for_sums
+from .loop import repeat as repeat
+from .pack import pack as pack
+from .scope import rewriting as rewriting

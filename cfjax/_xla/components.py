@@ -1,16 +1,15 @@
-"""Evaluation of a function with small arrays held as their components.
+"""A step of a small system on single numbers instead of short vectors.
 
-XLA fuses scalars well and vectors of three badly: it computes what several components need once
-for each of them, or sends it through memory. A step of a small system runs several times faster
-when no small array is ever built inside it, above all in a batch.
+XLA fuses numbers well and vectors of three badly: it computes what several entries need once for
+each of them, or sends it through memory. So the program of a step is read, and evaluated again with
+every small array held as its entries.
 """
 
 import functools
 import math
 import operator
 from collections.abc import Callable, Iterable, Sequence
-from contextvars import ContextVar
-from typing import Any, NamedTuple, SupportsIndex
+from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -18,7 +17,6 @@ import jax.tree_util as jtu
 import numpy as np
 from jax import lax
 from jax.core import Tracer
-from jax.custom_batching import custom_vmap
 from jax.extend.core import (
     ClosedJaxpr,
     Jaxpr,
@@ -30,41 +28,45 @@ from jax.extend.core import (
 from jaxtyping import Array, PyTree
 
 from .held import held, held_p
-from .operation import evaluate, operation, variables, without_dead_code
+from .operation import evaluate, operation, without_dead_code
 from .pack import pack, pack_p, unpack, unpack_p
+from .scope import Place, is_numeric, is_on, is_short, unread, where, within
 
-# Larger arrays fuse well as they are, and the program grows with the number of components. With
-# matrices come the vectors of all their entries.
-_MAX_LENGTH = 6
-_MAX_SIZE = 9
-_MAX_PRODUCT = 36
+# A state is taken apart if all of it is numbers and short vectors, so many entries together, and if
+# a step is not longer than that: counted in operations on single numbers. Longer programs take XLA
+# longer to compile than it saves.
+_MAX_ENTRIES = 16
+_MAX_OPERATIONS = 6000
+# Within a step matrices made from them too, such as the 4 x 4 matrix of a quaternion.
+_MAX_SIZE = 36
+_MAX_PRODUCT = 216
 
-# Operations between two cuts of a program of vectors, and of matrices, where more are linear. Into
-# one function XLA on CPU puts at most 2000 operations. Beyond, and wherever entries of one array
-# are used apart, it computes anew what two later results share: in long programs exponentially
-# often. Its operations are some 1.7 times ours, and a derivative has three or four times as many.
-# A step of CF4 for one vector, with its estimate, has 512 and is better whole.
-_MAX_OPERATIONS = 550, 850
-# Every so many cuts there is one for values too; the others are for derivatives alone.
-_CUTS_OF_VALUES = 2
-
-_CHEAP = frozenset(
-    "abs add add_any and ceil clamp complex conj convert_element_type copy eq floor ge gt imag "
-    "integer_pow is_finite le lt max min mul ne neg not or real round select_n sign square sub "
-    "xor".split()
+_ELEMENTWISE = frozenset(
+    "abs acos acosh add add_any and asin asinh atan atan2 atanh cbrt ceil clamp complex conj "
+    "convert_element_type copy cos cosh div eq erf exp exp2 expm1 floor ge gt imag integer_pow "
+    "is_finite le log log1p logistic lt max min mul ne neg not or pow real rem round rsqrt "
+    "select_n sign sin sinh sqrt square sub tan tanh xor".split()
 )
-_EXPENSIVE = frozenset(
-    "acos acosh asin asinh atan atan2 atanh cbrt cos cosh div erf exp exp2 expm1 log log1p "
-    "logistic pow rem rsqrt sin sinh sqrt tan tanh".split()
-)
-
+_REDUCTIONS: dict[str, Callable[[Any, Any], Any]] = {
+    "reduce_and": operator.and_,
+    "reduce_max": lax.max,
+    "reduce_min": lax.min,
+    "reduce_or": operator.or_,
+    "reduce_prod": operator.mul,
+    "reduce_sum": operator.add,
+}
+_SCATTERS: dict[str, Callable[[Any, Any], Any]] = {
+    "scatter-add": operator.add,
+    "scatter-mul": operator.mul,
+    "scatter_add": operator.add,
+    "scatter_mul": operator.mul,
+}
 _CALLS = frozenset(("jit", "pjit"))
-_BRANCHES = frozenset(("cond", "scan", "while"))
 
 
 @jtu.register_pytree_node_class
 class Components:
-    """A small array as its entries, which are scalars, row by row."""
+    """A small array as its entries, which are numbers, row by row."""
 
     def __init__(self, entries: Iterable[Any], shape: tuple[int, ...]):
         self.entries = tuple(entries)
@@ -84,12 +86,9 @@ class Components:
         return cls(children, shape)
 
 
-def split(tree: PyTree, matrices: bool) -> PyTree:
-    """The tree with every vector of at most six entries in components.
-
-    With `matrices` every array of at most nine entries, such as a matrix of 3 x 3.
-    """
-    return jtu.tree_map(lambda x: _components(x) if _is_small(np.shape(x), matrices) else x, tree)
+def split(tree: PyTree) -> PyTree:
+    """The tree with every small array in components."""
+    return jtu.tree_map(lambda x: _components(x) if _is_small(x) else x, tree)
 
 
 def join(tree: PyTree) -> PyTree:
@@ -97,111 +96,91 @@ def join(tree: PyTree) -> PyTree:
     return jtu.tree_map(_whole, tree, is_leaf=_is_components)
 
 
-def is_small(x: Any) -> bool:
-    """Whether this is an array of at most nine entries."""
-    return _is_small(np.shape(x), matrices=True)
+def by_components(fun: Callable[[PyTree], PyTree], y: PyTree) -> PyTree:
+    """`fun(y)`, computed on single numbers where `y` is a small state of short vectors.
 
-
-def is_short(x: Any) -> bool:
-    """Whether an array is a vector of at most six entries."""
-    return _is_small(np.shape(x), matrices=False)
-
-
-def has_few(tree: PyTree, most: int) -> bool:
-    """Whether there are small matrices, and with all small arrays no more than `most` entries."""
-    small = [x for x in jtu.tree_leaves(tree) if is_small(x)]
-    return any(np.ndim(x) > 1 for x in small) and sum(map(np.size, small)) <= most
-
-
-def by_components(fun: Callable[[PyTree], PyTree], y: PyTree, *, has_extra: bool = False) -> PyTree:
-    """`fun(y)`, computed with every vector of at most six entries in components.
-
-    Small matrices too, where they are few: XLA would compute anew for every component what many
-    share, above all backwards. The result agrees with that of `fun` to rounding. `fun` may close
-    over traced values. Operations that have no rule here get the array whole, so every function
-    works. Where nothing in `y` is small, and inside of `trace`, this is `fun(y)`. With `has_extra`
-    its result is a pair of what is needed and what perhaps is not.
+    The result agrees with that of `fun` to rounding. `fun` may close over traced values. Operations
+    that have no rule here get the array whole. Where `y` is another state, the program is too long
+    or cannot be read, and inside of `trace`, this is `fun(y)`.
 
     Divisions by what no `y` changes become products with the reciprocal, as XLA does for literals:
-    a loop then computes the reciprocal once, and a division would be a barrier to fusion. Not so
-    where a part of `y` stays whole: there the barrier saves XLA from computing the components anew
-    for every entry of that part.
+    a loop then computes the reciprocal once, and a division would be a barrier to fusion.
     """
-    if is_inside() or not any(map(is_small, jtu.tree_leaves(y))):
+    program = None if where() else trace(fun, y, "step")
+    if program is None:
         return fun(y)
-    program, parameters, is_straight, is_plain = trace(fun, y, has_extra)
-    matrices = is_straight and has_few(y, _MAX_SIZE)
     # What is around may use single entries, so that XLA computes anew what these share. It does
     # little harm to a step, but much to a derivative.
-    y, parameters = _held(split((y, parameters), matrices), now=False)
-
-    def step(y: PyTree, parameters: PyTree) -> PyTree:
-        return program(y, parameters, matrices, True)
-
+    y, parameters = _held(split((y, program.parameters)))
     # The derivative of an adaptive loop computes a step at one place and uses its derivative at
-    # another. What that needs of the step is many scalars: to compute them again is cheaper than to
+    # another. What that needs of the step is many numbers: to compute them again is cheaper than to
     # send them there through memory.
-    out = operation(step, y, parameters) if _is_split(y) and is_plain else step(y, parameters)
-    # What is known before the program runs may come out as NumPy's.
-    out = jtu.tree_map(jnp.asarray, out)
+    out = operation(program.run, y, parameters, place="step")
     # One by one: what nobody uses is not computed.
-    return jtu.tree_map(lambda x: _whole(_held(x, now=False)), out, is_leaf=_is_components)
+    return jtu.tree_map(lambda x: _whole(_held(x)), out, is_leaf=_is_components)
 
 
-_is_inside: ContextVar[bool] = ContextVar("is_inside", default=False)
+class Program(NamedTuple):
+    """A function that can be taken apart, and what it closes over.
 
-
-def is_inside() -> bool:
-    """Whether this is part of a program that is taken apart as a whole."""
-    return _is_inside.get()
-
-
-def trace(
-    fun: Callable[[PyTree], PyTree], y: PyTree, has_extra: bool = False
-) -> tuple[Callable[[PyTree, PyTree, bool, bool], PyTree], list[Array], bool, bool]:
-    """A program for `by_components`, what `fun` closes over, whether to split matrices, and whether
-    it can be an operation.
-
-    `program(y, parameters, matrices, cuts)` takes both split, with the same `matrices`, and returns
-    what is split. It closes over nothing that is traced. Where it is long, its values go through
-    memory at some places: in a batch, and with `cuts` also alone.
-
-    Matrices that go through branches or loops, as in `expm`, are better left whole: XLA fuses
-    nothing across these.
+    `run(y, parameters)` takes both split, returns what is split and closes over nothing traced.
     """
-    token = _is_inside.set(True)
-    try:
+
+    run: Callable[[PyTree, PyTree], PyTree]
+    parameters: list[Array]
+
+
+def trace(fun: Callable[[PyTree], PyTree], y: PyTree, place: Place) -> Program | None:
+    """`fun` as a program to take apart at `y`; None if that does not pay or cannot be done.
+
+    It must have no effects, and no function with a rule for reverse mode alone.
+    """
+    if not is_on() or not _is_small_state(y):
+        return None
+    with within(place):
         jaxpr, out = jax.make_jaxpr(fun, return_shape=True)(y)
-    finally:
-        _is_inside.reset(token)
-    code = without_dead_code(jaxpr.jaxpr)
-    needed = code.outvars[: len(jtu.tree_leaves(out[0]))] if has_extra else code.outvars
+    structure = jtu.tree_structure(out)
+    consts = [_constant(x) for x in jaxpr.consts]
+    try:
+        code = without_dead_code(jaxpr.jaxpr)
+        if jaxpr.effects or not _has_jvp(code) or _operations(code) > _MAX_OPERATIONS:
+            return None
+    except Exception as error:
+        return unread(error)
 
-    def program(y: PyTree, parameters: PyTree, matrices: bool, cuts: bool) -> PyTree:
-        values = jtu.tree_leaves(y, is_leaf=_is_components)
-        if _has_components(y):
-            fixed = [True] * len(parameters) + [False] * len(values)
-            rules = _Rules(matrices, _is_split(y), cuts)
-            outs, _ = _evaluate(code, (*parameters, *values), fixed, rules, needed)
-        else:
-            outs = jaxpr_as_fun(ClosedJaxpr(code, join(parameters)))(*values)
-        return split(jtu.tree_unflatten(jtu.tree_structure(out), outs), matrices)
+    def run(y: PyTree, parameters: PyTree) -> PyTree:
+        rest = iter(parameters)
+        values = [next(rest) if x is None else x for x in consts]
+        moving = jtu.tree_leaves(y, is_leaf=_is_components)
+        fixed = [True] * len(values) + [False] * len(moving)
+        try:
+            outs, _ = _evaluate(code, (*values, *moving), fixed)
+        except Exception as error:
+            unread(error)
+            outs = jaxpr_as_fun(ClosedJaxpr(code, list(map(_whole, values))))(*map(_whole, moving))
+        # What is known before the program runs may come out as NumPy's.
+        outs = [x if _is_components(x) else jnp.asarray(x) for x in outs]
+        return split(jtu.tree_unflatten(structure, outs))
 
-    parameters = list(map(jnp.asarray, jaxpr.consts))
-    return program, parameters, _is_straight(code), not jaxpr.effects and _has_jvp(code)
+    parameters = [
+        jnp.asarray(x) for x, known in zip(jaxpr.consts, consts, strict=True) if known is None
+    ]
+    return Program(run, parameters)
 
 
-def _is_straight(jaxpr: Jaxpr) -> bool:
-    """Whether no small matrix goes through a branch or a loop."""
+def _constant(x: Any) -> np.ndarray | None:
+    """An array of indices that is known now."""
+    if isinstance(x, Tracer) or not isinstance(x, jax.Array | np.ndarray | np.generic):
+        return None
+    return None if np.size(x) > _MAX_SIZE or _is_inexact(x) or not is_numeric(x) else np.asarray(x)
 
-    def is_matrix(v: Any) -> bool:
-        return v.aval.ndim > 1 and _is_small(v.aval.shape, matrices=True)
 
-    return all(
-        _is_straight(eqn.params["jaxpr"].jaxpr)
-        if eqn.primitive.name in _CALLS
-        else eqn.primitive.name not in _BRANCHES or not any(map(is_matrix, eqn.invars))
-        for eqn in jaxpr.eqns
+def _is_small_state(y: PyTree) -> bool:
+    leaves = jtu.tree_leaves(y)
+    return (
+        any(map(is_short, leaves))
+        and all(is_short(x) or (np.ndim(x) == 0 and is_numeric(x)) for x in leaves)
+        and sum(map(np.size, leaves)) <= _MAX_ENTRIES
     )
 
 
@@ -213,175 +192,127 @@ def _has_jvp(jaxpr: Jaxpr) -> bool:
     )
 
 
-class _Rules(NamedTuple):
-    """What is taken apart besides vectors, if fixed divisors become reciprocals, and if there are
-    cuts outside of batches.
-    """
+def _operations(jaxpr: Jaxpr) -> int:
+    """About how many operations on single numbers or whole arrays there will be."""
+    return sum(map(_operations_of, jaxpr.eqns))
 
-    matrices: bool
-    reciprocals: bool
-    cuts: bool
+
+def _operations_of(eqn: JaxprEqn) -> int:
+    name = eqn.primitive.name
+    if name in _CALLS:
+        return _operations(eqn.params["jaxpr"].jaxpr)
+    if name in _MOVES or name in ("split", "stack") or eqn.primitive in (pack_p, unpack_p):
+        return 0
+    terms = 1
+    if name == "dot_general":
+        left: Any = eqn.invars[0].aval
+        (axes, _), _ = eqn.params["dimension_numbers"]
+        terms = 2 * math.prod(left.shape[k] for k in axes)
+    elif name in _REDUCTIONS:
+        terms = math.prod(getattr(eqn.invars[0].aval, "shape", ()))
+    shapes: list[tuple[int, ...]] = [getattr(v.aval, "shape", ()) for v in eqn.outvars]
+    sizes = map(math.prod, shapes)
+    return sum(terms * n if n <= _MAX_SIZE else 1 for n in sizes)
 
 
 def _evaluate(
-    jaxpr: Jaxpr,
-    values: Sequence[Any],
-    fixed: Sequence[bool],
-    rules: _Rules,
-    needed: Sequence[Any],
+    jaxpr: Jaxpr, values: Sequence[Any], fixed: Sequence[bool]
 ) -> tuple[list[Any], list[bool]]:
     """What a program makes of values for its constants and arguments, some of which are fixed.
 
-    Fixed results are those that depend on nothing else. Those in `needed` are not dead code.
+    Fixed results are those that depend on nothing else.
     """
     env: dict[Any, Any] = {}
     loose: set[Any] = set()
 
     def read(v: Any) -> Any:
-        aval: Any = v.aval
-        return jnp.asarray(v.val, aval.dtype) if isinstance(v, Literal) else env[v]
+        return _literal(v) if isinstance(v, Literal) else env[v]
 
     def is_fixed(v: Any) -> bool:
         return isinstance(v, Literal) or v not in loose
 
     variables = (*jaxpr.constvars, *jaxpr.invars)
     for variable, value, is_one in zip(variables, values, fixed, strict=True):
-        if not isinstance(value, Components):
-            # What is known before the program runs may still be NumPy's.
-            value = jnp.asarray(value)
-        env[variable] = _components(value) if _is_small(value.shape, rules.matrices) else value
+        env[variable] = _components(value) if _is_small(value) else value
         if not is_one:
             loose.add(variable)
-    cuts = _cuts(jaxpr, rules)
-    for k, eqn in enumerate(jaxpr.eqns):
-        if k in cuts:
-            for used in _used(jaxpr, k, needed):
-                live = [v for v in used if v in env]
-                values = _held([env[v] for v in live], now=cuts[k], alone=rules.cuts)
-                env.update(zip(live, values, strict=True))
+    for eqn in jaxpr.eqns:
         values = [read(v) for v in eqn.invars]
         fixed = [is_fixed(v) for v in eqn.invars]
         outs_fixed = [all(fixed)] * len(eqn.outvars)
-        name = eqn.primitive.name
-        if name in _CALLS:
+        if eqn.primitive.name in _CALLS:
             inner = eqn.params["jaxpr"]
             constants = [True] * len(inner.consts)
             outs, outs_fixed = _evaluate(
-                inner.jaxpr,
-                (*inner.consts, *values),
-                (*constants, *fixed),
-                rules,
-                inner.jaxpr.outvars,
+                inner.jaxpr, (*inner.consts, *values), (*constants, *fixed)
             )
-        elif eqn.primitive is unpack_p and isinstance(values[0], Components):
-            places = np.moveaxis(_places(values[0]), eqn.params["axis"], 0)
-            outs = [values[0].at(np.asarray(part)) for part in places]
-        elif eqn.primitive is held_p and np.shape(values[0]) != ():
-            # What is whole is in memory anyway.
-            outs = [
-                _components(held([_whole(x)], **eqn.params)[0]) if _is_components(x) else x
-                for x in values
-            ]
         else:
-            out = _in_components(eqn, name, values, fixed, rules)
-            outs = [out] if out is not None else evaluate(jaxpr, eqn, list(map(_whole, values)))
+            outs = _in_components(jaxpr, eqn, values, fixed)
+            if outs is None:
+                outs = map(split, evaluate(jaxpr, eqn, list(map(_whole, values))))
         env.update(zip(eqn.outvars, outs, strict=True))
         loose.update(v for v, is_one in zip(eqn.outvars, outs_fixed, strict=True) if not is_one)
     return [read(v) for v in jaxpr.outvars], [is_fixed(v) for v in jaxpr.outvars]
 
 
-def _held(tree: Any, now: bool, alone: bool = True) -> Any:
-    """The same, with all single numbers through memory, but constants."""
-    leaves, structure = jtu.tree_flatten(tree, is_leaf=_is_components)
-    groups = [x.entries if _is_components(x) else (x,) for x in leaves]
-    numbers = [x for group in groups for x in group if _is_number(x)]
-    if not numbers:
-        return tree
-    new = iter(held(numbers, in_batches=True, alone=alone, now=now))
-    groups = [[next(new) if _is_number(x) else x for x in group] for group in groups]
-    leaves = [
-        Components(group, x.shape) if _is_components(x) else group[0]
-        for x, group in zip(leaves, groups, strict=True)
-    ]
-    return jtu.tree_unflatten(structure, leaves)
-
-
-def _is_number(x: Any) -> bool:
-    return isinstance(x, Tracer) and x.ndim == 0 and jnp.issubdtype(x.dtype, jnp.inexact)
-
-
-def _cuts(jaxpr: Jaxpr, rules: _Rules) -> dict[int, bool]:
-    """Before which operations a long program is cut, and whether not only in derivatives.
-
-    What is used after a cut goes through memory, also what has been held before: the derivative in
-    it is then a sum over what comes after the cut, and is held too.
-    """
-    most = _MAX_OPERATIONS[rules.matrices]
-    counts = [_operations(eqn, rules.matrices) for eqn in jaxpr.eqns]
-    # These have cuts of their own.
-    counts = [n if n <= most else 0 for n in counts]
-    segments = math.ceil(sum(counts) / most)
-    ends = sum(counts) * np.arange(1, segments) / segments
-    places = np.searchsorted(np.cumsum([0, *counts]), ends)
-    return {int(place): n % _CUTS_OF_VALUES == 0 for n, place in enumerate(places, 1)}
-
-
-def _used(jaxpr: Jaxpr, place: int, needed: Sequence[Any]) -> tuple[list[Any], list[Any]]:
-    """What an operation and those after it use for results that are needed, and else."""
-    wanted = dict.fromkeys(variables(needed))
-    others = dict.fromkeys(variables(jaxpr.outvars))
-    for eqn in reversed(jaxpr.eqns[place:]):
-        is_needed = eqn.effects or not wanted.keys().isdisjoint(eqn.outvars)
-        (wanted if is_needed else others).update(dict.fromkeys(variables(eqn.invars)))
-    return list(wanted), [v for v in others if v not in wanted]
-
-
-def _operations(eqn: JaxprEqn, matrices: bool) -> int:
-    """About how many operations on single numbers or whole arrays there will be."""
-    if eqn.primitive.name in _CALLS:
-        return sum(_operations(inner, matrices) for inner in eqn.params["jaxpr"].jaxpr.eqns)
-    if eqn.primitive.name in _MOVES or eqn.primitive in (pack_p, unpack_p):
-        return 0
-    terms = 1
-    if eqn.primitive.name == "dot_general":
-        left: Any = eqn.invars[0].aval
-        (axes, _), _ = eqn.params["dimension_numbers"]
-        terms = 2 * math.prod(left.shape[k] for k in axes)
-    shapes: list[tuple[int, ...]] = [getattr(v.aval, "shape", ()) for v in eqn.outvars]
-    return sum(terms * math.prod(x) if x == () or _is_small(x, matrices) else 1 for x in shapes)
+def _literal(v: Literal) -> Any:
+    aval: Any = v.aval
+    # Integers stay NumPy's, so that it is known which entries an index takes.
+    number = np.asarray if not jnp.issubdtype(aval.dtype, jnp.inexact) else jnp.asarray
+    return number(v.val, aval.dtype)
 
 
 def _in_components(
-    eqn: JaxprEqn, name: str, values: list[Any], fixed: Sequence[bool], rules: _Rules
-) -> Any:
-    """The result of one operation, if there is a rule for it, else None."""
-    if eqn.primitive.multiple_results:
+    jaxpr: Jaxpr, eqn: JaxprEqn, values: list[Any], fixed: Sequence[bool]
+) -> Sequence[Any] | None:
+    """The results of one operation, if there is a rule for it, else None."""
+    name = eqn.primitive.name
+    avals: list[Any] = [v.aval for v in eqn.outvars]
+    known = list(map(_known, values))
+    if not any(x is None for x in known) and not any(map(_is_inexact, avals)) and not eqn.effects:
+        with jax.ensure_compile_time_eval():
+            return list(map(np.asarray, evaluate(jaxpr, eqn, known)))
+    shapes: list[Any] = [getattr(aval, "shape", None) for aval in avals]
+    if eqn.primitive is held_p:
+        # What is whole is in memory anyway.
+        groups = [_components(x).entries if _is_components(x) else (x,) for x in values]
+        new = iter(held([x for group in groups for x in group], **eqn.params))
+        return [
+            Components([next(new) for _ in group], x.shape) if _is_components(x) else next(new)
+            for group, x in zip(groups, values, strict=True)
+        ]
+    if any(shape is None or not 1 <= math.prod(shape) <= _MAX_SIZE for shape in shapes):
         return None
-    aval: Any = eqn.outvars[0].aval
-    shape = getattr(aval, "shape", None)
-    if shape is None or not (shape == () or _is_small(shape, rules.matrices)):
+    if eqn.primitive is unpack_p or name == "split":
+        if not _is_components(values[0]):
+            return None
+        axis = eqn.params["axis"]
+        places = _places(values[0])
+        if eqn.primitive is unpack_p:
+            parts = [places.take(k, axis) for k in range(places.shape[axis])]
+        else:
+            parts = np.split(places, np.cumsum(eqn.params["sizes"])[:-1], axis)
+        return [values[0].at(np.asarray(part)) for part in parts]
+    if eqn.primitive.multiple_results or any(map(_is_whole, values)):
         return None
-    if name == "div" and fixed == [False, True] and jnp.issubdtype(aval.dtype, jnp.floating):
-        if rules.reciprocals:
-            return _by_reciprocal(values[0], values[1], shape)
-    if shape != ():
-        if name in _CHEAP or name in _EXPENSIVE:
-            rows = list(zip(*(_components(v, shape).entries for v in values), strict=True))
-            if name in _CHEAP:
-                return Components((eqn.primitive.bind(*row, **eqn.params) for row in rows), shape)
-            return _expensive(eqn, rows, shape)
-        if eqn.primitive is pack_p:
-            return _moved(values, lambda *places: np.stack(places, eqn.params["axis"]))
-        if name == "concatenate":
-            axis = eqn.params["dimension"]
-            return _moved(values, lambda *places: np.concatenate(places, axis))
-    if values and (isinstance(values[0], Components) or name == "broadcast_in_dim"):
-        if name in _MOVES:
-            return _moved(values[:1], lambda places: _MOVES[name](places, shape, eqn.params))
-        if name == "reduce_sum":
-            return _summed(values[0], eqn.params["axes"], shape)
-    if name == "dot_general" and _is_plain_product(eqn, values, fixed):
-        return _product(values[0], values[1], eqn.params["dimension_numbers"][0], shape)
+    if name == "div" and list(fixed) == [False, True]:
+        if jnp.issubdtype(avals[0].dtype, jnp.floating):
+            return [_by_reciprocal(values[0], values[1], shapes[0])]
+    if name in _MOVES:
+        if not any(map(_is_components, values)) and name not in _FROM_NUMBERS:
+            return None
+        return _moved(eqn, values, shapes[0])
+    if eqn.primitive is pack_p or name == "stack":
+        return _arranged(values, lambda *places: np.stack(places, eqn.params["axis"]))
+    if name in _SCATTERS and _is_components(values[0]):
+        return _scattered_into(_SCATTERS[name], values, eqn.params, shapes[0])
+    if shapes[0] != () and name in _ELEMENTWISE:
+        rows = zip(*(_components(v, shapes[0]).entries for v in values), strict=True)
+        return [Components((eqn.primitive.bind(*row, **eqn.params) for row in rows), shapes[0])]
+    if name in _REDUCTIONS and _is_components(values[0]):
+        return [_reduced(_REDUCTIONS[name], values[0], eqn.params["axes"], shapes[0])]
+    if name == "dot_general" and _is_plain_product(eqn):
+        return [_product(values[0], values[1], eqn.params["dimension_numbers"], shapes[0])]
     return None
 
 
@@ -398,29 +329,106 @@ def _slice(places: np.ndarray, shape: tuple[int, ...], params: dict[str, Any]) -
     return places[tuple(slice(*ends) for ends in zip(starts, limits, strides, strict=True))]
 
 
-# Operations that only move entries: what they do to an array of places.
-_MOVES: dict[str, Callable[[np.ndarray, tuple[int, ...], dict[str, Any]], np.ndarray]] = {
+# Operations that only move entries: what they do to an array of places. None: JAX itself does it,
+# which takes longer.
+_MOVES: dict[str, Callable[[np.ndarray, tuple[int, ...], dict[str, Any]], np.ndarray] | None] = {
     "broadcast_in_dim": _broadcast,
+    "concatenate": None,
+    "dynamic_slice": None,
+    "dynamic_update_slice": None,
+    "expand_dims": lambda places, shape, params: places.reshape(shape),
+    "gather": None,
+    "pad": None,
     "reshape": lambda places, shape, params: places.reshape(shape),
-    "squeeze": lambda places, shape, params: places.reshape(shape),
-    "slice": _slice,
-    "transpose": lambda places, shape, params: places.transpose(params["permutation"]),
     "rev": lambda places, shape, params: np.flip(places, params["dimensions"]),
+    "scatter": None,
+    "slice": _slice,
+    "squeeze": lambda places, shape, params: places.reshape(shape),
+    "transpose": lambda places, shape, params: places.transpose(params["permutation"]),
+}
+# Those that may make a small array from single numbers.
+_FROM_NUMBERS = frozenset(("broadcast_in_dim", "reshape", "expand_dims"))
+# Of the others: which operands are arrays whose entries are moved. The rest are indices.
+_MOVED_OPERANDS = {
+    "concatenate": slice(None),
+    "dynamic_slice": slice(1),
+    "dynamic_update_slice": slice(2),
+    "gather": slice(1),
+    "pad": slice(2),
+    "scatter": slice(0, None, 2),
 }
 
 
-def _moved(values: Sequence[Any], move: Callable[..., np.ndarray]) -> Any:
+def _moved(eqn: JaxprEqn, values: Sequence[Any], shape: tuple[int, ...]) -> Sequence[Any] | None:
+    name = eqn.primitive.name
+    move = _MOVES[name]
+    if move is not None:
+        return _arranged(values, lambda places: move(places, shape, eqn.params))
+    if name == "concatenate":
+        return _arranged(values, lambda *places: np.concatenate(places, eqn.params["dimension"]))
+    moved = range(len(values))[_MOVED_OPERANDS[name]]
+    indices = {k: _known(x) for k, x in enumerate(values) if k not in moved}
+    if any(x is None for x in indices.values()):
+        return None
+
+    def by_jax(*places: np.ndarray) -> np.ndarray:
+        given = indices | dict(zip(moved, places, strict=True))
+        operands = [jnp.asarray(given[k], int) for k in range(len(values))]
+        if name == "scatter":
+            return _scattered(operands, eqn.params)
+        return np.asarray(eqn.primitive.bind(*operands, **eqn.params))
+
+    with jax.ensure_compile_time_eval():
+        return _arranged([values[k] for k in moved], by_jax)
+
+
+def _scattered(operands: Sequence[Array], params: dict[str, Any]) -> np.ndarray:
+    names = "dimension_numbers", "indices_are_sorted", "unique_indices", "mode"
+    options: dict[str, Any] = {k: params[k] for k in names}
+    x, indices, updates = operands
+    return np.asarray(lax.scatter(x, indices, updates, **options))
+
+
+def _scattered_into(
+    combine: Callable[[Any, Any], Any],
+    values: Sequence[Any],
+    params: dict[str, Any],
+    shape: tuple[int, ...],
+) -> Sequence[Any] | None:
+    indices = _known(values[1])
+    if indices is None:
+        return None
+    x, updates = _components(values[0]), _components(values[2])
+    with jax.ensure_compile_time_eval():
+        none, places = jnp.full(shape, -1), jnp.asarray(_places(updates))
+        taken = _scattered((none, jnp.asarray(indices), places), params)
+    used = taken[taken >= 0]
+    if len(np.unique(used)) < len(updates.entries):
+        return None  # Some go to one entry, or to none.
+    outs = (
+        combine(entry, updates.entries[k]) if k >= 0 else entry
+        for entry, k in zip(x.entries, taken.flat, strict=True)
+    )
+    return [Components(outs, shape)]
+
+
+def _arranged(values: Sequence[Any], move: Callable[..., np.ndarray]) -> list[Any] | None:
+    """What results from moving entries; None if it has others too."""
     arrays = list(map(_components, values))
     entries = [entry for x in arrays for entry in x.entries]
     firsts = np.cumsum([0, *(len(x.entries) for x in arrays)])
     places = move(*(np.asarray(n + _places(x)) for n, x in zip(firsts, arrays, strict=False)))
-    return Components(entries, (len(entries),)).at(places)
+    if places.size and not (0 <= places.min() and places.max() < len(entries)):
+        return None
+    return [Components(entries, (len(entries),)).at(np.asarray(places))]
 
 
-def _summed(x: Components, axes: Sequence[SupportsIndex], shape: tuple[int, ...]) -> Any:
+def _reduced(
+    combine: Callable[[Any, Any], Any], x: Components, axes: Sequence[int], shape: tuple[int, ...]
+) -> Any:
     kept = [k for k in range(len(x.shape)) if k not in axes]
     rows = _places(x).transpose(*kept, *axes).reshape(math.prod(shape), -1)
-    return _shaped([functools.reduce(operator.add, x.at(row).entries) for row in rows], shape)
+    return _shaped([functools.reduce(combine, x.at(row).entries) for row in rows], shape)
 
 
 def _by_reciprocal(x: Any, divisor: Any, shape: tuple[int, ...]) -> Any:
@@ -432,63 +440,34 @@ def _by_reciprocal(x: Any, divisor: Any, shape: tuple[int, ...]) -> Any:
     return Components((a * b for a, b in pairs), shape)
 
 
-def _expensive(eqn: JaxprEqn, rows: Sequence[tuple], shape: tuple[int, ...]) -> Components:
-    """An operation that XLA never repeats, but writes to memory as often as it occurs.
-
-    For a single system one vector goes through memory faster than several scalars. In a batch
-    every component is a long vector of its own.
-    """
-
-    def by_component(rows):
-        return tuple(eqn.primitive.bind(*row, **eqn.params) for row in rows)
-
-    def whole(rows):
-        columns = (pack(column) for column in zip(*rows, strict=True))
-        return tuple(unpack(eqn.primitive.bind(*columns, **eqn.params)))
-
-    rows = jtu.tree_map(jnp.asarray, tuple(rows))
-    # A constant by the time XLA sees it, so only one of the two is compiled.
-    batched = _is_batched(jtu.tree_map(lambda x: x != x, rows))
-    return Components(lax.cond(batched, by_component, whole, rows), shape)
-
-
-@custom_vmap
-def _is_batched(values: PyTree) -> Array:
-    """Whether any of the values, which are not differentiable, is batched by a `vmap`."""
-    return jnp.asarray(False)
-
-
-@_is_batched.def_vmap
-def _(axis_size: int, in_batched: PyTree, values: PyTree) -> tuple[Array, bool]:
-    return jnp.asarray(True), False
-
-
-def _is_plain_product(eqn: JaxprEqn, values: Sequence[Any], fixed: Sequence[bool]) -> bool:
-    """A small product of vectors or matrices, of one dtype.
-
-    Not with a part of the state that is whole: taking that apart is slower, above all backwards.
-    """
-    contracted, batched = eqn.params["dimension_numbers"]
+def _is_plain_product(eqn: JaxprEqn) -> bool:
+    """A small product of one dtype with something to sum up."""
+    (axes, _), _ = eqn.params["dimension_numbers"]
     avals: list[Any] = [v.aval for v in (*eqn.invars, *eqn.outvars)]
-    terms = math.prod(avals[0].shape[k] for k in contracted[0])
-    return (
-        any(map(_is_components, values))
-        and all(is_one or _is_components(v) for v, is_one in zip(values, fixed, strict=True))
-        and batched == ((), ())
-        and len({aval.dtype for aval in avals}) == 1
-        and 1 <= avals[2].size * terms <= _MAX_PRODUCT
-    )
+    terms = math.prod(avals[0].shape[k] for k in axes)
+    return len({aval.dtype for aval in avals}) == 1 and 1 <= avals[2].size * terms <= _MAX_PRODUCT
 
 
-def _product(left: Any, right: Any, contracted: Any, shape: tuple[int, ...]) -> Any:
-    rows, columns = (
-        np.moveaxis(_places(x), axes, range(len(axes)))
-        .reshape(math.prod(x.shape[k] for k in axes), -1)
-        .T
-        for x, axes in zip(map(_components, (left, right)), contracted, strict=True)
-    )
-    left, right = _components(left), _components(right)
-    dots = [_dot(left.at(a).entries, right.at(b).entries) for a in rows for b in columns]
+def _product(left: Any, right: Any, dimensions: Any, shape: tuple[int, ...]) -> Any:
+    contracted, batched = dimensions
+    left, right = map(_components, (left, right))
+
+    def rows(x: Components, contracted: Sequence[int], batched: Sequence[int]) -> np.ndarray:
+        """The places, by batch, by row, by what is summed."""
+        free = [k for k in range(len(x.shape)) if k not in (*contracted, *batched)]
+        batch, terms = (math.prod(x.shape[k] for k in axes) for axes in (batched, contracted))
+        return _places(x).transpose(*batched, *free, *contracted).reshape(batch, -1, terms)
+
+    dots = [
+        _dot(left.at(a).entries, right.at(b).entries)
+        for above, below in zip(
+            rows(left, contracted[0], batched[0]),
+            rows(right, contracted[1], batched[1]),
+            strict=True,
+        )
+        for a in above
+        for b in below
+    ]
     return _shaped(dots, shape)
 
 
@@ -496,24 +475,43 @@ def _dot(a: Sequence[Any], b: Sequence[Any]) -> Any:
     return functools.reduce(operator.add, (x * y for x, y in zip(a, b, strict=True)))
 
 
-def _is_split(tree: PyTree) -> bool:
-    """Whether all of it is in components or a single number."""
-    leaves = jtu.tree_leaves(tree, is_leaf=_is_components)
-    return all(_is_components(x) or jnp.ndim(x) == 0 for x in leaves)
+def _held(tree: Any) -> Any:
+    """The same, with all single numbers through memory where this is differentiated."""
+    leaves, structure = jtu.tree_flatten(tree)
+    places = [k for k, x in enumerate(leaves) if _is_number(x)]
+    if places:
+        new = held([leaves[k] for k in places], in_batches=True, now=False)
+        for k, x in zip(places, new, strict=True):
+            leaves[k] = x
+    return jtu.tree_unflatten(structure, leaves)
 
 
-def _has_components(tree: PyTree) -> bool:
-    return any(map(_is_components, jtu.tree_leaves(tree, is_leaf=_is_components)))
+def _is_number(x: Any) -> bool:
+    return isinstance(x, Tracer) and x.ndim == 0 and jnp.issubdtype(x.dtype, jnp.inexact)
+
+
+def _is_inexact(aval: Any) -> bool:
+    return not hasattr(aval, "dtype") or jnp.issubdtype(aval.dtype, jnp.inexact)
 
 
 def _is_components(x: Any) -> bool:
     return isinstance(x, Components)
 
 
-def _is_small(shape: tuple[int, ...], matrices: bool) -> bool:
-    if matrices:
-        return len(shape) > 0 and 1 <= math.prod(shape) <= _MAX_SIZE
-    return len(shape) == 1 and 1 <= shape[0] <= _MAX_LENGTH
+def _is_whole(x: Any) -> bool:
+    return not isinstance(x, Components | np.ndarray) and np.ndim(x) > 0
+
+
+def _is_small(x: Any) -> bool:
+    """Whether this is an array to take apart. NumPy's are known while the program is made."""
+    return _is_whole(x) and 1 <= np.size(x) <= _MAX_SIZE and is_numeric(x)
+
+
+def _known(x: Any) -> np.ndarray | None:
+    if isinstance(x, Components):
+        entries = list(map(_known, x.entries))
+        return None if any(e is None for e in entries) else np.asarray(entries).reshape(x.shape)
+    return np.asarray(x) if isinstance(x, np.ndarray | np.generic) else None
 
 
 def _shaped(entries: Sequence[Any], shape: tuple[int, ...]) -> Any:
@@ -526,10 +524,12 @@ def _places(x: Components) -> np.ndarray:
 
 def _components(x: Any, shape: tuple[int, ...] = ()) -> Components:
     """An array in components; with a shape, broadcast to it."""
-    if not isinstance(x, Components):
+    if isinstance(x, np.ndarray):
+        x = Components([np.asarray(entry) for entry in x.flat], x.shape)
+    elif not isinstance(x, Components):
         x = Components(unpack(jnp.ravel(x)) if jnp.ndim(x) else [x], jnp.shape(x))
     return x if shape in ((), x.shape) else x.at(np.broadcast_to(_places(x), shape))
 
 
 def _whole(x: Any) -> Any:
-    return pack(x.entries).reshape(x.shape) if isinstance(x, Components) else x
+    return pack(list(map(jnp.asarray, x.entries))).reshape(x.shape) if _is_components(x) else x

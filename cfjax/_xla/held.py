@@ -6,12 +6,14 @@ from typing import Any
 
 import jax
 import jax.numpy as jnp
+import jax.tree_util as jtu
 from jax.experimental.xla_metadata import set_xla_metadata
 from jax.extend.core import Primitive
 from jax.interpreters import ad, batching, mlir
-from jaxtyping import Array
+from jaxtyping import Array, PyTree
 
 from .pack import pack, unpack
+from .scope import is_short, where
 
 
 def held(
@@ -24,6 +26,24 @@ def held(
     only where this is differentiated.
     """
     return held_p.bind(*entries, in_batches=in_batches, alone=alone, now=now)
+
+
+def once(tree: PyTree) -> PyTree:
+    """The same; the entries of short vectors are computed once for all that uses them."""
+    return jtu.tree_map(_once, tree)
+
+
+def once_for_sums(x: Array) -> Array:
+    """The same array, which is used several times in what follows.
+
+    Else each use would compute the step of a batch anew. Alone it is fast in our own loop, but
+    makes diffrax's too large to be one function.
+    """
+    return _once(x, in_batches=True, alone=where() == "loop")
+
+
+def _once(x: Array, **options: bool) -> Array:
+    return pack(held(unpack(x), **options)) if where() and is_short(x) else x
 
 
 held_p = Primitive("cfjax_held")

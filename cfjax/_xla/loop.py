@@ -10,16 +10,12 @@ import jax.tree_util as jtu
 from jax import lax
 from jaxtyping import Array, Int, PyTree
 
-from .components import has_few, join, split, trace
+from .components import join, split, trace
 from .operation import operation
 from .pack import pack, unpack
 
 # Beyond, the derivative gains less than copying them costs.
 _MAX_TRAVELLERS = 16
-# With more components matrices stay whole, as in `by_components`. They count twice where their sums
-# are compensated: so an attitude in SO(3) is the largest state taken apart in a derivative.
-_MOST_FORWARD = 48
-_MOST_BACKWARD = 18
 
 
 def repeat(
@@ -31,112 +27,91 @@ def repeat(
     again. It needs a Python int; an array makes one program for every number of steps.
 
     On CPU a loop of small steps is fast if XLA has few operations left after fusion, and it fuses
-    towards each result all that leads to it. So there is one result: the components of all small
-    arrays of the carry travel as one vector. In a derivative the components of the parameters,
+    towards each result all that leads to it. So where the step is taken apart there is one result:
+    the numbers of the carry travel as one vector. In a derivative the numbers among the parameters,
     that is, what `step` closes over, travel with them unchanged: in the reversed loop they are the
     sums of the derivatives, which else would be results of their own.
     """
-    program, parameters, is_straight, is_plain = trace(step, carry)
+    program = trace(step, carry, "loop")
+    if program is None:
+        return _loop(jax.checkpoint(step), carry, num_steps)
     leaves, structure = jtu.tree_flatten(carry)
-
-    def step_of_leaves(leaves: list[Any], values: list[Any], matrices: bool) -> list[Any]:
-        carry = jtu.tree_unflatten(structure, leaves)
-        return structure.flatten_up_to(program(carry, values, matrices, matrices))
-
     leaves = list(map(jnp.asarray, leaves))
-    most = (_MOST_FORWARD, _MOST_BACKWARD) if is_straight else (0, 0)
-    leaves = _repeat(
-        leaves,
-        parameters,
-        program=step_of_leaves,
-        num_steps=num_steps,
-        most=most,
-        is_plain=is_plain,
-    )
+
+    def of_leaves(leaves: list[Any], parameters: list[Any]) -> list[Any]:
+        carry = jtu.tree_unflatten(structure, leaves)
+        return structure.flatten_up_to(program.run(carry, parameters))
+
+    leaves = _repeat(leaves, program.parameters, run=of_leaves, num_steps=num_steps)
     return jtu.tree_unflatten(structure, leaves)
+
+
+def _loop(step: Callable[[PyTree], PyTree], carry: PyTree, num_steps: Any) -> PyTree:
+    if isinstance(num_steps, int):
+        return lax.scan(lambda carry, _: (step(carry), None), carry, length=num_steps)[0]
+    return lax.fori_loop(0, num_steps, lambda _, carry: step(carry), carry)
 
 
 @eqx.filter_custom_jvp
 def _repeat(
-    leaves: list[Array],
-    values: list[Array],
-    *,
-    program: Callable,
-    num_steps: int | Int[Array, ""],
-    most: tuple[int, int],
-    is_plain: bool,
+    leaves: list[Array], parameters: list[Array], *, run: Callable, num_steps: int | Array
 ) -> list[Array]:
-    matrices = has_few(leaves, most[0])
-    return _scan(program, num_steps, leaves, values, matrices, [False] * len(values), is_plain)
+    return _scan(run, num_steps, leaves, parameters, [False] * len(parameters))
 
 
 @_repeat.def_jvp
-def _(primals, tangents, *, program, num_steps, most, is_plain):
-    leaves, values = primals
-    matrices = has_few(leaves, most[1])
+def _(primals, tangents, *, run, num_steps):
     moves = [tangent is not None for tangent in tangents[1]]
-    pieces = [len(jtu.tree_leaves(split(value, matrices))) for value in values]
-    if sum(n for n, is_one in zip(pieces, moves, strict=True) if is_one) > _MAX_TRAVELLERS:
+    sizes = [len(jtu.tree_leaves(split(x))) for x in primals[1]]
+    if sum(n for n, is_one in zip(sizes, moves, strict=True) if is_one) > _MAX_TRAVELLERS:
         moves = [False] * len(moves)
     return eqx.filter_jvp(
-        lambda leaves, values: _scan(program, num_steps, leaves, values, matrices, moves, is_plain),
+        lambda leaves, parameters: _scan(run, num_steps, leaves, parameters, moves),
         primals,
         tangents,
     )
 
 
 def _scan(
-    program: Callable[[list[Any], list[Any], bool], list[Any]],
+    run: Callable[[list[Any], list[Any]], list[Any]],
     num_steps: int | Int[Array, ""],
     leaves: list[Array],
-    values: list[Array],
-    matrices: bool,
+    parameters: list[Array],
     moves: Sequence[bool],
-    is_plain: bool,
 ) -> list[Array]:
-    """The loop, where values travel that are in components, if they move."""
-    leaves, structure = jtu.tree_flatten(split(leaves, matrices))
+    """The loop, where those parameters travel that are in components, if they move."""
+    leaves, structure = jtu.tree_flatten(split(leaves))
     packed = _packed(leaves)
-    numbers, rest = _part(leaves, packed)
+    numbers, rest = _partition(leaves, packed)
     travels = [
         is_one and bool(numbers) and _is_number(piece, numbers[0].dtype)
-        for value, is_one in zip(values, moves, strict=True)
-        for piece in jtu.tree_leaves(split(value, matrices))
+        for x, is_one in zip(parameters, moves, strict=True)
+        for piece in jtu.tree_leaves(split(x))
     ]
-    values, value_structure = jtu.tree_flatten(split(values, matrices))
-    known, others = _part(values, travels)
+    pieces, parameter_structure = jtu.tree_flatten(split(parameters))
+    known, others = _partition(pieces, travels)
 
     def step(entries: list[Array], rest: list[Array], known: Any, others: Any) -> Any:
         numbers, travellers = entries[: sum(packed)], entries[sum(packed) :]
-        values = _join(
+        pieces = _merge(
             [_borrow(*pair) for pair in zip(known, travellers, strict=True)], others, travels
         )
-        leaves = jtu.tree_leaves(
-            program(
-                jtu.tree_unflatten(structure, _join(numbers, rest, packed)),
-                jtu.tree_unflatten(value_structure, values),
-                matrices,
-            )
+        leaves = run(
+            jtu.tree_unflatten(structure, _merge(numbers, rest, packed)),
+            jtu.tree_unflatten(parameter_structure, pieces),
         )
-        numbers, rest = _part(leaves, packed)
+        numbers, rest = _partition(jtu.tree_leaves(leaves), packed)
         return pack([*numbers, *travellers]) if numbers else None, rest
 
-    def body(carry: tuple[Array | None, list[Array]], _: None) -> tuple[Any, None]:
+    def body(carry: tuple[Array | None, list[Array]]) -> tuple[Array | None, list[Array]]:
         vector, rest = carry
         entries = [] if vector is None else unpack(vector)
-        if is_plain and not any(map(jnp.ndim, leaves)):
-            return operation(step, entries, rest, known, others), None
-        return jax.checkpoint(step)(entries, rest, known, others), None
+        return operation(step, entries, rest, known, others, place="loop")
 
     vector = pack([*numbers, *known]) if numbers else None
-    if isinstance(num_steps, int):
-        (vector, rest), _ = lax.scan(body, (vector, rest), length=num_steps)
-    else:
-        vector, rest = lax.fori_loop(
-            0, num_steps, lambda _, carry: body(carry, None)[0], (vector, rest)
-        )
+    vector, rest = _loop(body, (vector, rest), num_steps)
     numbers = [] if vector is None else unpack(vector)[: sum(packed)]
-    return join(jtu.tree_unflatten(structure, _join(numbers, rest, packed)))
+    return join(jtu.tree_unflatten(structure, _merge(numbers, rest, packed)))
 
 
 def _packed(leaves: list[Array]) -> list[bool]:
@@ -149,12 +124,12 @@ def _is_number(x: Array, dtype: Any) -> bool:
     return x.ndim == 0 and x.dtype == dtype and jnp.issubdtype(dtype, jnp.inexact)
 
 
-def _part(leaves: Sequence[Any], where: Sequence[bool]) -> tuple[list[Any], list[Any]]:
+def _partition(leaves: Sequence[Any], where: Sequence[bool]) -> tuple[list[Any], list[Any]]:
     pairs = list(zip(leaves, where, strict=True))
     return [x for x, is_one in pairs if is_one], [x for x, is_one in pairs if not is_one]
 
 
-def _join(ones: Sequence[Any], others: Sequence[Any], where: Sequence[bool]) -> list[Any]:
+def _merge(ones: Sequence[Any], others: Sequence[Any], where: Sequence[bool]) -> list[Any]:
     sources = iter(ones), iter(others)
     return [next(sources[0 if is_one else 1]) for is_one in where]
 

@@ -33,15 +33,17 @@ from jaxtyping import Array, PyTree
 
 from .held import held
 from .pack import pack_p, unpack_p
+from .scope import Place
 
 # What two of its functions need, XLA computes in both, and into one it puts some 2000 operations.
 # In long programs it then computes single ones exponentially often: in values never as measured, in
-# first derivatives from some 8000 operations on, counted as they are written, and in second ones
-# earlier. Those are compiled as several, though to send what they share through memory takes time.
-_WHOLE = math.inf, 6000, 3000
+# first derivatives from some 8000 operations on, counted as they are written, within diffrax's loop
+# from 4000, and in second ones earlier. Those are compiled as several, though to send what they
+# share through memory takes time.
+_WHOLE = {"loop": (math.inf, 6000, 3000), "step": (math.inf, 3500, 3000)}
 _GROUP = 1500
 # A second derivative has up to five times the operations, and should fit.
-_PIECE = 500
+_PIECE = 250
 # Of so many directions each is computed on its own.
 _FEW = 16
 
@@ -50,7 +52,7 @@ _FREE = frozenset(
 )
 
 
-def operation(fun: Callable[..., PyTree], *args: PyTree) -> PyTree:
+def operation(fun: Callable[..., PyTree], *args: PyTree, place: Place) -> PyTree:
     """`fun(*args)`, as one operation.
 
     `fun` may close over traced values, and has no effects. Reverse mode keeps the arguments and
@@ -66,6 +68,7 @@ def operation(fun: Callable[..., PyTree], *args: PyTree) -> PyTree:
         out, out_structure = jtu.tree_flatten(jtu.tree_map(jnp.asarray, out))
         return out
 
+    kind = _Kind(place)
     made = jax.make_jaxpr(of_leaves)(*leaves)
     jaxpr = without_dead_code(made.jaxpr)
     code = jaxpr.replace(
@@ -76,8 +79,10 @@ def operation(fun: Callable[..., PyTree], *args: PyTree) -> PyTree:
     program = ClosedJaxpr(code, [])
     ends = _places(code)
     if len(ends) > 2:
-        program = _program(functools.partial(_in_pieces, program, ends), *_structs(code.invars))
-    outs = operation_p.bind(*made.consts, *leaves, program=program, kind=_Kind())
+        program = _program(
+            functools.partial(_in_pieces, program, ends, kind), *_structs(code.invars)
+        )
+    outs = operation_p.bind(*made.consts, *leaves, program=program, kind=kind)
     return jtu.tree_unflatten(out_structure, outs)
 
 
@@ -115,12 +120,14 @@ def _length(eqn: JaxprEqn) -> int:
     return 0 if eqn.primitive.name in _FREE or eqn.primitive in (pack_p, unpack_p) else 1
 
 
-def _in_pieces(program: ClosedJaxpr, ends: Sequence[int], *operands: Array) -> list[Array]:
+def _in_pieces(
+    program: ClosedJaxpr, ends: Sequence[int], kind: "_Kind", *operands: Array
+) -> list[Array]:
     jaxpr = program.jaxpr
     env = dict(zip(jaxpr.invars, operands, strict=True))
     for start, stop in itertools.pairwise(ends):
         part, taken, given = _part(jaxpr, start, stop)
-        outs = operation_p.bind(*(env[v] for v in taken), program=part, kind=_Kind())
+        outs = operation_p.bind(*(env[v] for v in taken), program=part, kind=kind)
         env.update(zip(given, outs, strict=True))
     return _results(jaxpr, env)
 
@@ -195,8 +202,9 @@ def variables(atoms: Iterable[Any]) -> list[Any]:
 
 
 class _Kind(NamedTuple):
-    """How many of the last operands the program is linear in, and which derivative it is."""
+    """Where it runs, how many of the last operands it is linear in, and which derivative it is."""
 
+    place: Place
     linear: int = 0
     order: int = 0
 
@@ -207,7 +215,7 @@ operation_p.multiple_results = True
 
 @operation_p.def_impl
 def _run(*operands, program, kind):
-    groups = _groups(program, _WHOLE[min(kind.order, 2)])
+    groups = _groups(program, _WHOLE[kind.place][min(kind.order, 2)])
     # Of a second derivative there are several in one loop.
     if len(groups) == 1 and kind.order < 2:
         return _flattened(program, *operands)
@@ -337,7 +345,7 @@ def _jvp(primals, tangents, *, program, kind):
     if moving and smooth:
         derivative = _tangent(program, tuple(moving), tuple(smooth))
         moved = (tangents[k] for k in moving)
-        new = derivative.bind([*primals, *moved], kind.order + 1)
+        new = derivative.bind([*primals, *moved], kind._replace(order=kind.order + 1))
         for k, tangent in zip(derivative.gives, new, strict=True):
             out_tangents[k] = tangent
     return outs, out_tangents
@@ -372,7 +380,7 @@ def _transpose(cotangents, *operands, program, kind):
         transposed = _transposed(program, unknown, coming)
         fixed = (x for k, x in enumerate(operands) if k not in unknown)
         come = (cotangents[k] for k in coming)
-        new = transposed.bind([*fixed, *come], kind.order)
+        new = transposed.bind([*fixed, *come], kind)
         for k, x in zip(transposed.gives, new, strict=True):
             results[k] = x
     return results
@@ -407,9 +415,10 @@ class _Linear(NamedTuple):
     linear: int
     gives: list[int]
 
-    def bind(self, operands: Sequence[Any], order: int) -> list[Any]:
+    def bind(self, operands: Sequence[Any], kind: _Kind) -> list[Any]:
         taken = (operands[k] for k in self.takes)
-        return operation_p.bind(*taken, program=self.program, kind=_Kind(self.linear, order))
+        kind = kind._replace(linear=self.linear)
+        return operation_p.bind(*taken, program=self.program, kind=kind)
 
 
 def _linear(program: ClosedJaxpr, first: int, places: Sequence[int]) -> _Linear:

@@ -27,7 +27,7 @@ def plain(x, scale):
 
 
 def whole(x, scale):
-    return operation(lambda x, scale: turn(x, scale, 6), x, scale)
+    return operation(lambda x, scale: turn(x, scale, 6), x, scale, place="step")
 
 
 def size(fun):
@@ -39,7 +39,7 @@ def lengths(request, monkeypatch):
     """Compiled as they are, and in pieces."""
     if request.param == "several":
         monkeypatch.setattr(module, "_PIECE", 12)
-        monkeypatch.setattr(module, "_WHOLE", (0, 0, 0))
+        monkeypatch.setattr(module, "_WHOLE", {"step": (0, 0, 0)})
         monkeypatch.setattr(module, "_GROUP", 30)
 
 
@@ -103,7 +103,7 @@ def test_directions_that_are_many():
 
 
 def test_closing_over_traced_values():
-    fun = lambda scale: operation(lambda x: turn(x, scale, 6), X)[0]  # noqa: E731
+    fun = lambda scale: operation(lambda x: turn(x, scale, 6), X, place="step")[0]  # noqa: E731
     check(quick(jax.jacrev(fun))(SCALE), jax.jacfwd(lambda scale: plain(X, scale)[0])(SCALE))
 
 
@@ -130,5 +130,5 @@ def test_branches_and_loops_inside():
         return [jnp.where(y[0] > 0, y, x), jax.lax.cond(y[1] > 0, jnp.sin, jnp.cos, y)]
 
     both = lambda f: lambda x: jnp.sum(f(x)[0] * f(x)[1])  # noqa: E731
-    found = quick(jax.hessian(both(lambda x: operation(fun, x))))(X)
+    found = quick(jax.hessian(both(lambda x: operation(fun, x, place="step"))))(X)
     check(found, jax.hessian(both(fun))(X))
