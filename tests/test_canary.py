@@ -289,7 +289,8 @@ def test_a_program_can_be_taken_apart():
     sine, product = made.jaxpr.eqns
     literal: Any = product.invars[1]
     assert isinstance(literal, Literal) and literal.val == 2, "A number in a program is a Literal."
-    assert (literal.aval.shape, literal.aval.dtype) == ((), X.dtype), "A Literal has a dtype."
+    aval: Any = literal.aval
+    assert (aval.shape, aval.dtype) == ((), X.dtype), "A Literal has a shape and a dtype."
     assert isinstance(made.jaxpr.outvars[1], Literal), "A result that is a number is a Literal."
     assert not sine.effects, "An equation tells its effects."
     part = made.jaxpr.replace(
