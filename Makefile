@@ -45,9 +45,10 @@ test-newest:
 	$(BIN)/python -m pip install --quiet --editable '.[$(notdir $@)]'
 	touch $@
 
-# Only uv resolves to the lowest versions.
+# Only uv resolves to the lowest versions. It keeps what is installed, so from the start.
 .venv-lowest/dev: pyproject.toml
-	test -x .venv-lowest/bin/python || $(PYTHON) -m venv .venv-lowest
+	rm -rf .venv-lowest
+	$(PYTHON) -m venv .venv-lowest
 	.venv-lowest/bin/python -m pip install --quiet uv
 	.venv-lowest/bin/uv pip install --quiet --python .venv-lowest/bin/python \
 		--resolution lowest-direct --editable '.[dev]'
