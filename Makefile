@@ -1,22 +1,43 @@
 PYTHON ?= python3
 BIN := .venv/bin
+# The whole suite, in as many processes as there are cores.
+PYTEST := -m pytest --numprocesses auto --dist worksteal
+# Each solver and each field once, what the code relies on in jax, equinox and diffrax, and imports.
+QUICK := tests/test_quick.py tests/test_canary.py tests/test_public.py tests/test_architecture.py
 
-.PHONY: paper test test-all clean
+.PHONY: paper lint test test-all test-quick test-lowest test-newest clean
 
 # Tables and figures of the paper, in figures/.
 paper: .venv/paper
 	$(BIN)/python -m cfjax paper
 
-# Lint, types, tests.
-test: .venv/dev
+lint: .venv/dev
 	$(BIN)/ruff check .
 	$(BIN)/ruff format --check .
 	$(BIN)/pyright
-	$(BIN)/python -m pytest --numprocesses auto --dist worksteal
+
+# Lint, types, tests.
+test: lint
+	$(BIN)/python $(PYTEST)
 
 # The slow ones too.
 test-all: .venv/dev
-	$(BIN)/python -m pytest --numprocesses auto --dist worksteal -m "slow or not slow"
+	$(BIN)/python $(PYTEST) -m "slow or not slow"
+
+# Whether a version works at all.
+test-quick: .venv/dev
+	$(BIN)/python $(PYTEST) $(QUICK)
+
+# The tests on exactly the lowest versions in pyproject.toml.
+test-lowest: .venv-lowest/dev
+	.venv-lowest/bin/python $(PYTEST)
+
+# The tests on the newest versions of everything, looked up anew each time.
+# Another Python: make test-newest PYTHON=python3.14
+test-newest:
+	test -x .venv-newest/bin/python || $(PYTHON) -m venv .venv-newest
+	.venv-newest/bin/python -m pip install --quiet --upgrade --upgrade-strategy eager --editable '.[dev]'
+	.venv-newest/bin/python $(PYTEST)
 
 .venv/paper .venv/dev: pyproject.toml
 	test -x $(BIN)/python || $(PYTHON) -m venv .venv
@@ -24,5 +45,14 @@ test-all: .venv/dev
 	$(BIN)/python -m pip install --quiet --editable '.[$(notdir $@)]'
 	touch $@
 
+# Only uv resolves to the lowest versions. It keeps what is installed, so from the start.
+.venv-lowest/dev: pyproject.toml
+	rm -rf .venv-lowest
+	$(PYTHON) -m venv .venv-lowest
+	.venv-lowest/bin/python -m pip install --quiet uv
+	.venv-lowest/bin/uv pip install --quiet --python .venv-lowest/bin/python \
+		--resolution lowest-direct --editable '.[dev]'
+	touch $@
+
 clean:
-	rm -rf .venv figures
+	rm -rf .venv .venv-lowest .venv-newest figures

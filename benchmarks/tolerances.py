@@ -188,7 +188,7 @@ def _flows(solver: Any) -> int:
     if isinstance(solver, cfjax.Richardson):
         inner: Any = solver.solver
         return 3 * _flows(inner)
-    estimate = solver.tableau.num_companion_flows if solver.estimate else 0
+    estimate = solver.tableau.num_embedded_flows if solver.estimate else 0
     return solver.tableau.num_flows + estimate
 
 

@@ -113,7 +113,7 @@ def test_methods_with_flows_backwards_in_time_say_so():
     assert {cfjax.CF4, cfjax.CF54, cfjax.YRK135} < set(solvers)
     for solver in solvers:
         tableau = solver.tableau
-        products = (*tableau.alpha, tableau.beta, tableau.companion or ())
+        products = (*tableau.alpha, tableau.beta, tableau.embedded or ())
         sums = [float(sum(row)) for rows in products for row in rows]
         # A sum of zero is rounded.
         backwards = min(sums) < -1e-12

@@ -1,9 +1,19 @@
 """The order of a tableau, decided by its order conditions.
 
-An ordered rooted tree is the word of its children and a word is a tuple of trees, so both are
-nested tuples. A tree's order is one more than that of its children's word; a word's order is the
-sum over its trees. A commutator-free method has order q when every word up to order q has the
-weight that it has in the exact solution: Owren, J. Phys. A 39 (2006).
+The solution of a Lie group method is a sum over products of frozen fields and their derivatives,
+and an ordered rooted tree says how one such derivative is made up. Fields do not commute, so the
+order of the factors counts:
+
+- a *letter* is an ordered rooted tree. It stands for one factor;
+- a *word* is a finite sequence of letters, the first applied first. It stands for one product;
+- a *forest* is what is left of a tree when its root is taken away: the sequence of its children's
+  trees. So a forest is a word as well, and a tree is given by its forest.
+
+Here both are nested tuples: a word is the tuple of its letters, and a letter is the tuple of its
+forest's. `()` is the empty word, and as a letter the single node. A letter's order, its number of
+nodes, is one more than that of its forest; a word's order is the sum over its letters. A
+commutator-free method has order q when every word up to order q has the weight that it has in the
+exact solution: Owren, J. Phys. A 39 (2006), doi:10.1088/0305-4470/39/19/S07.
 """
 
 import math

@@ -13,7 +13,7 @@ Coefficient: TypeAlias = Fraction | float
 Row: TypeAlias = tuple[Coefficient, ...]
 Product: TypeAlias = tuple[Row, ...]
 # A product whose coefficients are polynomials without a constant term: by flow, power and stage.
-Extension: TypeAlias = tuple[Product, ...]
+ContinuousExtension: TypeAlias = tuple[Product, ...]
 
 
 def uncertainty(coefficient: Coefficient) -> Fraction:
@@ -51,26 +51,28 @@ class Tableau:
     Two more products are optional. Both may use one more field, `F_s = h f(t + h, y_1)`, which
     the next step starts with (first same as last).
 
-    - `companion[j][k]`: another end point, of an order lower by one, to estimate the error.
-    - `extension[j][i][k]`: the solution at `t + theta h` has for flow j and field F_k the
-      coefficient `sum_i extension[j][i][k] theta^(i+1)`, which is `beta`'s at theta = 1.
+    - `embedded[j][k]`: another end point, of an order lower by one, to estimate the error.
+    - `continuous_extension[j][i][k]`: the solution at `t + theta h` has for flow j and field F_k
+      the sum over i of these times `theta^(i+1)` as its coefficient, which is `beta`'s at
+      theta = 1.
 
     **Raises:** `TypeError` where the nesting or a coefficient's type is wrong; `ValueError` where
     a row is too long, the method is implicit, a coefficient is not finite, the rows of `beta` or
-    `companion` do not sum to 1, or the sums of the rows of `extension` are not those of `beta`.
+    `embedded` do not sum to 1, or the sums of the rows of `continuous_extension` are not those of
+    `beta`.
     """
 
     alpha: tuple[Product, ...]
     beta: Product
-    companion: Product | None
-    extension: Extension | None
+    embedded: Product | None
+    continuous_extension: ContinuousExtension | None
 
     def __init__(
         self,
         alpha: Iterable[Iterable[Iterable[Any]]],
         beta: Iterable[Iterable[Any]],
-        companion: Iterable[Iterable[Any]] | None = None,
-        extension: Iterable[Iterable[Iterable[Any]]] | None = None,
+        embedded: Iterable[Iterable[Any]] | None = None,
+        continuous_extension: Iterable[Iterable[Iterable[Any]]] | None = None,
     ) -> None:
         stages = _entries("alpha", alpha, "a sequence with one list of flows for each stage")
         if not stages:
@@ -82,20 +84,21 @@ class Tableau:
         )
         object.__setattr__(self, "beta", _product("beta", beta, s, s))
         _check_consistent("beta", self.beta)
-        if companion is not None:
-            companion = _product("companion", companion, s + 1, s + 1)
-            _check_consistent("companion", companion)
-        object.__setattr__(self, "companion", companion)
-        if extension is not None:
-            extension = _extension(extension, s + 1)
-            _check_end("extension", extension, self.beta)
-        object.__setattr__(self, "extension", extension)
+        if embedded is not None:
+            embedded = _product("embedded", embedded, s + 1, s + 1)
+            _check_consistent("embedded", embedded)
+        object.__setattr__(self, "embedded", embedded)
+        if continuous_extension is not None:
+            continuous_extension = _continuous_extension(continuous_extension, s + 1)
+            _check_end("continuous_extension", continuous_extension, self.beta)
+        object.__setattr__(self, "continuous_extension", continuous_extension)
 
     def __repr__(self) -> str:
         stages = ", ".join(map(_show_product, self.alpha))
-        more = "" if self.companion is None else f", companion={_show_product(self.companion)}"
-        if self.extension is not None:
-            more += f", extension=[{', '.join(map(_show_product, self.extension))}]"
+        more = "" if self.embedded is None else f", embedded={_show_product(self.embedded)}"
+        if self.continuous_extension is not None:
+            flows = ", ".join(map(_show_product, self.continuous_extension))
+            more += f", continuous_extension=[{flows}]"
         return f"Tableau(alpha=[{stages}], beta={_show_product(self.beta)}{more})"
 
     def __hash__(self) -> int:
@@ -121,19 +124,19 @@ class Tableau:
 
     @cached_property
     def first_same_as_last(self) -> bool:
-        """Whether the companion or the extension uses the field at the end of the step."""
-        return any(map(self.uses_last, (self.companion or (), *(self.extension or ()))))
+        """Whether the embedded method or the continuous extension uses the field at the end."""
+        return any(map(self.uses_last, (self.embedded or (), *(self.continuous_extension or ()))))
 
     def uses_last(self, rows: Product) -> bool:
         """Whether the rows have a coefficient for the field at the end of the step."""
         return any(any(row[self.num_stages :]) for row in rows)
 
     @cached_property
-    def companion_method(self) -> "Tableau | None":
-        """The companion as a method of its own, whose last stage is the end of the step."""
-        if self.companion is None:
+    def embedded_method(self) -> "Tableau | None":
+        """The embedded method as a method of its own, whose last stage is the end of the step."""
+        if self.embedded is None:
             return None
-        return Tableau((*self.alpha, self.beta), self.companion)
+        return Tableau((*self.alpha, self.beta), self.embedded)
 
     @cached_property
     def c(self) -> Row:
@@ -157,9 +160,9 @@ class Tableau:
         return len(self.prefixes)
 
     @property
-    def num_companion_flows(self) -> int:
-        """Flows that the companion adds to a step."""
-        method = self.companion_method
+    def num_embedded_flows(self) -> int:
+        """Flows that the embedded method adds to a step."""
+        method = self.embedded_method
         return 0 if method is None else method.num_flows - self.num_flows
 
     @cached_property
@@ -215,23 +218,25 @@ def _check_consistent(where: str, rows: Product) -> None:
         )
 
 
-def _extension(value: Any, num_stages: int) -> Extension:
+def _continuous_extension(value: Any, num_stages: int) -> ContinuousExtension:
     return tuple(
         tuple(
-            _row(f"extension[{j}][{i}]", row, num_stages)
+            _row(f"continuous_extension[{j}][{i}]", row, num_stages)
             for i, row in enumerate(
-                _entries(f"extension[{j}]", powers, "a sequence of rows, one for each power")
+                _entries(
+                    f"continuous_extension[{j}]", powers, "a sequence of rows, one for each power"
+                )
             )
         )
         for j, powers in enumerate(
-            _entries("extension", value, "a sequence with one entry for each flow")
+            _entries("continuous_extension", value, "a sequence with one entry for each flow")
         )
     )
 
 
-def _check_end(where: str, extension: Extension, beta: Product) -> None:
+def _check_end(where: str, continuous_extension: ContinuousExtension, beta: Product) -> None:
     for k in range(len(beta[0])):
-        entries = [row[k] for powers in extension for row in powers]
+        entries = [row[k] for powers in continuous_extension for row in powers]
         end = [row[k] for row in beta]
         if abs(_sum(entries) - _sum(end)) > _sum(map(uncertainty, entries + end)):
             raise ValueError(
@@ -281,15 +286,15 @@ def _show_product(rows: Product) -> str:
 def crouch_grossman(
     a: Iterable[Iterable[Any]],
     b: Iterable[Any],
-    companion: Iterable[Any] | None = None,
-    extension: Iterable[Iterable[Any]] | None = None,
+    embedded: Iterable[Any] | None = None,
+    continuous_extension: Iterable[Iterable[Any]] | None = None,
 ) -> Tableau:
     """The Crouch-Grossman method of a Runge-Kutta tableau: one flow for each coefficient.
 
     `a` holds the rows of the stages after the first, `a[i]` with the coefficients of stages
-    0..i; `b` holds one weight for each stage, and so does `companion`. `extension[k][i]` is the
-    coefficient of theta^(i+1) in the weight of stage k. Zero coefficients cost no flow. Its order
-    is in general lower than that of the Runge-Kutta method.
+    0..i; `b` holds one weight for each stage, and so does `embedded`. `continuous_extension[k][i]`
+    is the coefficient of theta^(i+1) in the weight of stage k. Zero coefficients cost no flow. Its
+    order is in general lower than that of the Runge-Kutta method.
 
     **Raises:** as `Tableau`, naming `alpha` for `a` and `beta` for `b`.
     """
@@ -300,10 +305,12 @@ def crouch_grossman(
     return Tableau(
         [[], *map(one_flow_each, a)],
         one_flow_each(b),
-        None if companion is None else one_flow_each(companion),
+        None if embedded is None else one_flow_each(embedded),
         None
-        if extension is None
-        else [[[0] * k + [power] for power in powers] for k, powers in enumerate(extension)],
+        if continuous_extension is None
+        else [
+            [[0] * k + [power] for power in powers] for k, powers in enumerate(continuous_extension)
+        ],
     )
 
 
@@ -376,13 +383,13 @@ def _family(parameter: Any, alpha: list[Any], beta: list[Any]) -> Tableau:
 _half, _third, _sixth, _twelfth = (Fraction(1, n) for n in (2, 3, 6, 12))
 
 # Order 1: the exponential Euler step of every Lie group method.
-LIE_EULER = Tableau([[]], [[1]], extension=[[[1]]])
+LIE_EULER = Tableau([[]], [[1]], continuous_extension=[[[1]]])
 
-# Order 2: the classical midpoint rule. Companion of order 1, extension of order 2.
+# Order 2: the classical midpoint rule. Embedded method of order 1, continuous extension of order 2.
 CF2 = Tableau([[], [[_half]]], [[0, 1]], [[1]], [[[1], [-1, 1]]])
 
-# Order 3: Celledoni, Marthinsen & Owren, FGCS 19 (2003), the first family at 2/3. Companion and
-# extension of order 2.
+# Order 3: Celledoni, Marthinsen & Owren, FGCS 19 (2003), the first family at 2/3. Embedded
+# method and continuous extension of order 2.
 _cf3 = third_order_a(Fraction(2, 3))
 CF3 = Tableau(
     _cf3.alpha,
@@ -391,8 +398,8 @@ CF3 = Tableau(
     [[[_third]], [[2 * _third], [Fraction(-3, 4), 0, Fraction(3, 4)]]],
 )
 
-# Order 4: Celledoni, Marthinsen & Owren, FGCS 19 (2003), equation (7). Companion, with the field
-# at the end of the step, and extension of order 3.
+# Order 4: Celledoni, Marthinsen & Owren, FGCS 19 (2003), equation (7). Embedded
+# method, with the field at the end of the step, and continuous extension of order 3.
 CF4 = Tableau(
     [[], [[_half]], [[0, _half]], [[_half], [-_half, 0, 1]]],
     [
@@ -414,7 +421,7 @@ CF4 = Tableau(
 )
 
 # Order 3: Crouch & Grossman, J. Nonlinear Sci. 3 (1993); Owren & Marthinsen, BIT 39 (1999).
-# Companion, of the same sources, and extension of order 2.
+# Embedded method, of the same sources, and continuous extension of order 2.
 CG3 = crouch_grossman(
     [[Fraction(3, 4)], [Fraction(119, 216), Fraction(17, 108)]],
     [Fraction(13, 51), Fraction(-2, 3), Fraction(24, 17)],

@@ -21,7 +21,7 @@ from .._field import (
 )
 from .._methods import pairs as _pairs
 from .._methods import tableau as _tableau
-from .._methods.extension import extension
+from .._methods.continuous_extension import continuous_extension
 from .._methods.order_conditions import order
 from .._methods.tableau import Product, Row, Tableau
 from .._xla import once
@@ -32,8 +32,8 @@ from .dense import Path
 class AbstractCommutatorFree(AbstractLieSolver):
     """Flows of linear combinations of frozen fields, and no commutator.
 
-    Where the tableau has a companion, its end point is compared with the step's: the error
-    estimate is `y1 - companion`. With `estimate="algebra"` it is the velocity at `y1` of the
+    Where the tableau has an embedded method, its end point is compared with the step's: the error
+    estimate is `y1 - embedded`. With `estimate="algebra"` it is the velocity at `y1` of the
     difference of the two, flow by flow added up: a linear combination of the stages' fields, which
     costs no flow. That is blind, whatever the commutators do, where these cancel: for fields that
     do not depend on the state and are linear in time, as in the Landau-Zener problem.
@@ -65,8 +65,8 @@ class AbstractCommutatorFree(AbstractLieSolver):
         return order(self.tableau)
 
     def error_order(self, terms) -> int | None:
-        companion = self.tableau.companion_method
-        return None if companion is None else order(companion) + 1
+        embedded = self.tableau.embedded_method
+        return None if embedded is None else order(embedded) + 1
 
     def element(self, rows: Product, fields: Sequence[PyTree], kept: dict[int, PyTree]) -> PyTree:
         """The field of the last of some rows; `kept` is for what is used again in the step."""
@@ -100,18 +100,18 @@ class AbstractCommutatorFree(AbstractLieSolver):
         end = leave(fields[0], point(stages[-1]))
         # All that follows is for error control and output within the step. It is dead code, left
         # out by the compiler, where nobody asks for them.
-        companion = None if self.estimate is None else tableau.companion
-        within = extension(tableau)
-        if any(map(tableau.uses_last, (companion or (), *within))):
+        embedded = None if self.estimate is None else tableau.embedded
+        within = continuous_extension(tableau)
+        if any(map(tableau.uses_last, (embedded or (), *within))):
             evaluate(1.0, stages[-1])
         error = None
-        if companion is not None:
+        if embedded is not None:
             if self.estimate == "algebra":
-                difference = _combined(_difference(companion, tableau.beta), fields)
+                difference = _combined(_difference(embedded, tableau.beta), fields)
                 error = tangent(difference, value(end))
             else:
-                error = minus(end, leave(fields[0], point(trimmed(companion))))
-            if tableau.uses_last(companion):
+                error = minus(end, leave(fields[0], point(trimmed(embedded))))
+            if tableau.uses_last(embedded):
                 start, last_stage = (leave(fields[0], point(x)) for x in ((), stages[-2]))
                 error = jtu.tree_map(_seen, error, minus(end, last_stage), minus(end, start))
         return Move(end, Path.of(within, value(points[()]), fields), error)
@@ -148,10 +148,10 @@ def _seen(
 ) -> Inexact[Array, "..."]:
     """The estimate, or `apart` times |apart| / (|way| + |apart|) where that is larger.
 
-    A companion that compares the fields at the end and at the last stage sees only how the field
-    changes with the state. How far these points are `apart` shows how it changes with time too. It
-    is of order 3 in the step, so with this factor of order 5, and makes no estimate of order 4
-    worse.
+    An embedded method that compares the fields at the end and at the last stage sees only how the
+    field changes with the state. How far these points are `apart` shows how it changes with time
+    too. It is of order 3 in the step, so with this factor of order 5, and makes no estimate of
+    order 4 worse.
     """
     error_square, apart_square, way_square = (
         lax.stop_gradient(jnp.sum(jnp.square(jnp.abs(x)))) for x in (error, apart, way)
@@ -166,10 +166,11 @@ class CommutatorFree(AbstractCommutatorFree):
     """The commutator-free method of a `cfjax.Tableau`.
 
     One step costs `tableau.num_evaluations` evaluations of the field and `tableau.num_flows`
-    flows. Its order is `cfjax.order(tableau)`. With a companion in the tableau there is an error
-    estimate, which costs `tableau.num_companion_flows` more. Dense output is by the tableau's
-    extension, else by one that the order conditions decide, of order one below the method's but at
-    most 4: for that a step evaluates the field at its end where the stages do not suffice.
+    flows. Its order is `cfjax.order(tableau)`. With an embedded method in the tableau there is an
+    error estimate, which costs `tableau.num_embedded_flows` more. Dense output is by the tableau's
+    continuous extension, else by one that the order conditions decide, of order one below the
+    method's but at most 4: for that a step evaluates the field at its end where the stages do not
+    suffice.
 
     **Raises** `TypeError` if `tableau` is not a `cfjax.Tableau`.
     """
@@ -199,7 +200,7 @@ class CF2(AbstractCommutatorFree):
 class CF3(AbstractCommutatorFree):
     """Celledoni, Marthinsen & Owren's method of order 3: 3 evaluations, 3 flows.
 
-    The estimate, with a companion of order 2, costs 1 flow more. Dense output of order 2.
+    The estimate, with an embedded method of order 2, costs 1 flow more. Dense output of order 2.
     `cfjax.third_order_a` and `cfjax.third_order_b` give the families it belongs to.
 
     Source: Commutator-free Lie group methods, FGCS 19 (2003), equation (6).
@@ -213,10 +214,10 @@ class CF4(AbstractCommutatorFree):
 
     In a linear space this is the classical Runge-Kutta method. The choice for most problems.
 
-    The estimate costs 1 flow more. Its companion of order 3 is first same as last. That tells from
-    how the field changes with the state, and sees nothing of how it changes with time. So where it
-    is small it is replaced by the distance of the last stage from the end, times its ratio to the
-    way from the start. Dense output of order 3.
+    The estimate costs 1 flow more. Its embedded method of order 3 is first same as last. That tells
+    from how the field changes with the state, and sees nothing of how it changes with time. So
+    where it is small it is replaced by the distance of the last stage from the end, times its ratio
+    to the way from the start. Dense output of order 3.
 
     Source: Commutator-free Lie group methods, FGCS 19 (2003), equation (7).
     """
@@ -225,7 +226,7 @@ class CF4(AbstractCommutatorFree):
 
 
 class CF43(AbstractCommutatorFree):
-    """Order 4 with a companion of order 3: 6 evaluations, 6 flows, 1 more for the estimate.
+    """Order 4 with an embedded method of order 3: 6 evaluations, 6 flows, 1 more for the estimate.
 
     Its error constant is 15 times smaller than that of `CF4`, and it is stable for undamped
     oscillations up to 3.85 and decay up to 5.84 (`CF4`: 2.83, 2.79). Dense output of order 3.
@@ -237,7 +238,7 @@ class CF43(AbstractCommutatorFree):
 
 
 class CF54(AbstractCommutatorFree):
-    """Order 5 with a companion of order 4: 7 evaluations, 9 flows, 2 more for the estimate.
+    """Order 5 with an embedded method of order 4: 7 evaluations, 9 flows, 2 more for the estimate.
 
     Stable for undamped oscillations only up to 0.86 (decay: 3.95), so for these take `CF43` at
     large steps. Dense output of order 4, which uses the field at the end of the step.
@@ -258,7 +259,7 @@ class CF54(AbstractCommutatorFree):
 class CG3(AbstractCommutatorFree):
     """Crouch & Grossman's method of order 3: 3 evaluations, 6 flows of single fields.
 
-    The estimate, with a companion of order 2, costs 3 flows more. Dense output of order 2.
+    The estimate, with an embedded method of order 2, costs 3 flows more. Dense output of order 2.
     Flows go backwards in time too: not for fields that hold strong dissipation, see `CF54`.
 
     Source: Crouch & Grossman, J. Nonlinear Sci. 3 (1993); coefficients of Owren & Marthinsen,

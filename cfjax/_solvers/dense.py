@@ -11,7 +11,7 @@ import jax.tree_util as jtu
 from jaxtyping import Array, PyTree
 
 from .._field import combine, flow, leave
-from .._methods.tableau import Extension
+from .._methods.tableau import ContinuousExtension
 from .._xla import by_components
 
 
@@ -39,7 +39,7 @@ class Interpolation(diffrax.AbstractLocalInterpolation):
 
 
 class Path(eqx.Module):
-    """The fields of a step and where it starts, with the extension that they are to go into.
+    """The fields of a step, where it starts, and the continuous extension that they go into.
 
     Arrays that occur several times are kept once: in fields on a common span most do. And the
     fields stay on a common span only if its arrays are still the same.
@@ -48,14 +48,14 @@ class Path(eqx.Module):
     arrays: tuple[Array, ...]
     places: tuple[int, ...] = eqx.field(static=True)
     structure: Any = eqx.field(static=True)
-    extension: Extension = eqx.field(static=True)
+    continuous_extension: ContinuousExtension = eqx.field(static=True)
     # Where a combination of the fields leads from a point.
     move: Callable[[PyTree, PyTree], PyTree] = eqx.field(static=True)
 
     @classmethod
     def of(
         cls,
-        extension: Extension,
+        continuous_extension: ContinuousExtension,
         start: PyTree,
         fields: list[PyTree],
         move: Callable[[PyTree, PyTree], PyTree] = flow,
@@ -64,7 +64,7 @@ class Path(eqx.Module):
         arrays = {id(leaf): leaf for leaf in leaves}
         index = {key: i for i, key in enumerate(arrays)}
         places = tuple(index[id(leaf)] for leaf in leaves)
-        return cls(tuple(arrays.values()), places, structure, extension, move)
+        return cls(tuple(arrays.values()), places, structure, continuous_extension, move)
 
     def point(self, theta: Any) -> PyTree:
         """The solution at a part `theta` of the step."""
@@ -72,7 +72,7 @@ class Path(eqx.Module):
         def end(arrays: tuple[Array, ...]) -> PyTree:
             leaves = [arrays[i] for i in self.places]
             point, fields = jtu.tree_unflatten(self.structure, leaves)
-            for powers in self.extension:
+            for powers in self.continuous_extension:
                 weights = _polynomials(powers, theta)
                 used = [(w, f) for w, f in zip(weights, fields, strict=False) if w is not None]
                 point = self.move(combine(*zip(*used, strict=True)), point)

@@ -11,7 +11,7 @@ from jax import lax
 
 from .._field import combine, enter, flow
 from .._field import value as value_of
-from .._methods.extension import extension
+from .._methods.continuous_extension import continuous_extension
 from .._methods.tableau import Product, Row, Tableau
 from .base import Move
 from .commutator_free import AbstractCommutatorFree, minus, trimmed
@@ -37,7 +37,7 @@ class AbstractLowStorage(AbstractCommutatorFree):
     def element(self, rows, fields, kept):
         i = len(rows) - 1
         if trimmed(self.tableau.beta)[: i + 1] != rows:
-            # A flow of the companion's own.
+            # A flow of the embedded method's own.
             return super().element(rows, fields, kept)
         if i not in kept:
             both = (float(self.a[i]), 1.0)
@@ -45,11 +45,9 @@ class AbstractLowStorage(AbstractCommutatorFree):
         return combine((float(self.b[i]),), (kept[i],))
 
     def move(self, field, y0):
-        companion = None if self.estimate is None else self.tableau.companion
-        penultimate = companion is not None and trimmed(companion) == trimmed(
-            self.tableau.beta[:-1]
-        )
-        other = companion is not None and not (penultimate and self.estimate == "group")
+        embedded = None if self.estimate is None else self.tableau.embedded
+        penultimate = embedded is not None and trimmed(embedded) == trimmed(self.tableau.beta[:-1])
+        other = embedded is not None and not (penultimate and self.estimate == "group")
         size = sum(jnp.size(leaf) for leaf in jtu.tree_leaves(value_of(y0)))
         if other or (len(self.b) <= _MAX_UNROLLED and size <= _LARGE):
             return super().move(field, y0)
@@ -72,12 +70,12 @@ class AbstractLowStorage(AbstractCommutatorFree):
         (_, end, before), later = lax.scan(stage, (total, after, point), coefficients)
         # Not kept where nobody asks for output within the step.
         fields = [jtu.tree_map(itemgetter(i), later) for i in range(len(self.b) - 1)]
-        path = Path.of(extension(self.tableau), value_of(y0), [value, *fields])
+        path = Path.of(continuous_extension(self.tableau), value_of(y0), [value, *fields])
         return Move(end, path, minus(end, before) if penultimate else None)
 
 
-def _tableau(a: Row, b: Row, companion: Callable[[Product], Any] | None = None) -> Tableau:
-    """The method in the usual form; `companion` is a function of the end point's rows."""
+def _tableau(a: Row, b: Row, embedded: Callable[[Product], Any] | None = None) -> Tableau:
+    """The method in the usual form; `embedded` is a function of the end point's rows."""
     rows: list[Any] = []
     total: list[Any] = []
     for factor, weight in zip(a, b, strict=True):
@@ -86,7 +84,7 @@ def _tableau(a: Row, b: Row, companion: Callable[[Product], Any] | None = None) 
         # Rounded once, where the coefficients are.
         rows.append(row if isinstance(b[0], Fraction) else list(map(float, row)))
     stages = [rows[:r] for r in range(len(rows))]
-    return Tableau(stages, rows, None if companion is None else companion(tuple(rows)))
+    return Tableau(stages, rows, None if embedded is None else embedded(tuple(rows)))
 
 
 class Williamson3(AbstractLowStorage):

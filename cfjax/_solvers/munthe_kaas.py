@@ -23,9 +23,9 @@ from .._field import (
     without_bracket,
 )
 from .._field import value as value_of
-from .._methods.extension import runge_kutta_extension
+from .._methods.continuous_extension import runge_kutta_extension
 from .._methods.order_conditions import runge_kutta_order
-from .._methods.tableau import Extension, Row
+from .._methods.tableau import ContinuousExtension, Row
 from .base import AbstractLieSolver, Move
 from .dense import Path
 
@@ -35,7 +35,7 @@ class AbstractMuntheKaas(AbstractLieSolver):
 
     b: eqx.AbstractVar[Row]
     # Of the flow of v, so that it leads to points within the step.
-    extension: eqx.AbstractVar[Extension]
+    continuous_extension: eqx.AbstractVar[ContinuousExtension]
 
     @abc.abstractmethod
     def elements(self, field: Callable[[float, PyTree], PyTree]) -> list[PyTree]:
@@ -46,7 +46,7 @@ class AbstractMuntheKaas(AbstractLieSolver):
 
     def move(self, field, y0):
         v, elements, start = self.logarithm(field, y0)
-        path = Path.of(self.extension, value_of(start), elements)
+        path = Path.of(self.continuous_extension, value_of(start), elements)
         return Move(leave(v, flow(v, start)), path)
 
     def logarithm(self, field: Callable[[float, PyTree], PyTree], y0: PyTree) -> Any:
@@ -88,7 +88,7 @@ class RKMK3(AbstractMuntheKaas):
     """
 
     b: ClassVar[Row] = _sixths(1, 4, 1, -1)
-    extension: ClassVar[Extension] = (
+    continuous_extension: ClassVar[ContinuousExtension] = (
         (_sixths(6, 0, 0, 0), _sixths(-5, 4, 1, 0), _sixths(0, 0, 0, -1)),
     )
 
@@ -112,7 +112,7 @@ class RKMK4(AbstractMuntheKaas):
     """
 
     b: ClassVar[Row] = _sixths(1, 2, 2, 1, Fraction(-1, 2))
-    extension: ClassVar[Extension] = (
+    continuous_extension: ClassVar[ContinuousExtension] = (
         (
             _sixths(6, 0, 0, 0, 0),
             _sixths(-9, 6, 6, -3, 0),
@@ -173,7 +173,7 @@ class RKMK(AbstractMuntheKaas):
         return _classical_order(self.a[1:], self.b)
 
     @property
-    def extension(self) -> Extension:
+    def continuous_extension(self) -> ContinuousExtension:
         return runge_kutta_extension(self.a, self.b)
 
     def elements(self, field):

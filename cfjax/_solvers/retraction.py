@@ -8,7 +8,7 @@ from jaxtyping import Array, Float, PyTree
 
 from .._field import combine, is_field, tangent
 from .._fields.low_rank import BorderedSkew, LowRankSkew
-from .._methods.extension import runge_kutta_extension
+from .._methods.continuous_extension import runge_kutta_extension
 from .._numerics.matmul import matmul
 from .base import AbstractLieSolver, Move
 from .dense import Path

@@ -73,8 +73,8 @@ def test_is_compared_and_hashed_by_value(tableau):
     again = Tableau(
         [list(map(list, rows)) for rows in tableau.alpha],
         tableau.beta,
-        tableau.companion,
-        tableau.extension,
+        tableau.embedded,
+        tableau.continuous_extension,
     )
     assert again is not tableau
     assert again == tableau
@@ -97,7 +97,7 @@ def test_replace_checks_again():
     assert dataclasses.replace(tableau, beta=[[HALF, HALF]]).beta == ((HALF, HALF),)
     with pytest.raises(ValueError, match="beta must sum to 1"):
         dataclasses.replace(tableau, beta=[[HALF]])
-    with pytest.raises(ValueError, match="extension must lead to the end"):
+    with pytest.raises(ValueError, match="continuous_extension must lead to the end"):
         dataclasses.replace(CF2, beta=[[HALF, HALF]])
 
 
@@ -105,7 +105,8 @@ def test_repr_is_short():
     family = third_order_a(Fraction(2, 3))
     assert repr(family) == "Tableau(alpha=[[], [(1/3)], [(0, 2/3)]], beta=[(1/3), (-1/12, 0, 3/4)])"
     assert repr(CF2) == (
-        "Tableau(alpha=[[], [(1/2)]], beta=[(0, 1)], companion=[(1)], extension=[[(1), (-1, 1)]])"
+        "Tableau(alpha=[[], [(1/2)]], beta=[(0, 1)], embedded=[(1)], "
+        "continuous_extension=[[(1), (-1, 1)]])"
     )
 
 
@@ -172,45 +173,53 @@ def test_crouch_grossman():
     assert tableau == Tableau([[], [[1]]], [[HALF], [0, HALF]])
     assert crouch_grossman([], [1]) == Tableau([[]], [[1]])
     tableau = crouch_grossman([[1]], [HALF, HALF], [1, 0], [[1, -HALF], [0, HALF]])
-    assert tableau.companion == ((1, 0, 0),)
-    assert tableau.extension == (((1, 0, 0), (-HALF, 0, 0)), ((0, 0, 0), (0, HALF, 0)))
+    assert tableau.embedded == ((1, 0, 0),)
+    assert tableau.continuous_extension == (((1, 0, 0), (-HALF, 0, 0)), ((0, 0, 0), (0, HALF, 0)))
 
 
-# Companion and extension
+# Embedded method and continuous extension
 
 
 @pytest.mark.parametrize(
-    "name, companion_flows, last", [("CF3", 1, False), ("CF4", 1, True), ("CG3", 3, False)]
+    "name, embedded_flows, last", [("CF3", 1, False), ("CF4", 1, True), ("CG3", 3, False)]
 )
-def test_what_a_companion_costs(name, companion_flows, last):
+def test_what_an_embedded_method_costs(name, embedded_flows, last):
     tableau = NAMED[name]
-    assert tableau.num_companion_flows == companion_flows
+    assert tableau.num_embedded_flows == embedded_flows
     assert tableau.first_same_as_last is last
-    assert tableau.companion_method.alpha[-1][0][: tableau.num_stages] == tableau.beta[0]
+    assert tableau.embedded_method.alpha[-1][0][: tableau.num_stages] == tableau.beta[0]
 
 
-def test_without_a_companion_there_is_no_method():
-    assert CG4.companion_method is None and CG4.num_companion_flows == 0
+def test_without_an_embedded_method_there_is_no_method():
+    assert CG4.embedded_method is None and CG4.num_embedded_flows == 0
     assert not CG4.first_same_as_last
 
 
 @pytest.mark.parametrize(
     "more, message",
     [
-        ({"companion": [[HALF]]}, r"companion must sum to 1 .* got a sum of 1/2"),
-        ({"companion": [[0, 0, 0, 1]]}, r"companion\[0\] must have at most 3 entries"),
-        ({"companion": [[float("nan"), 1]]}, r"companion\[0\]\[0\] must be finite"),
-        ({"extension": [[[1]]]}, r"extension must lead to the end.* stage 0 sum to 1, .* to 0"),
-        ({"extension": [[[0, 0, 0, 1]]]}, r"extension\[0\]\[0\] must have at most 3 entries"),
+        ({"embedded": [[HALF]]}, r"embedded must sum to 1 .* got a sum of 1/2"),
+        ({"embedded": [[0, 0, 0, 1]]}, r"embedded\[0\] must have at most 3 entries"),
+        ({"embedded": [[float("nan"), 1]]}, r"embedded\[0\]\[0\] must be finite"),
+        (
+            {"continuous_extension": [[[1]]]},
+            r"continuous_extension must lead to the end.* stage 0 sum to 1, .* to 0",
+        ),
+        (
+            {"continuous_extension": [[[0, 0, 0, 1]]]},
+            r"continuous_extension\[0\]\[0\] must have at most 3 entries",
+        ),
     ],
 )
-def test_a_mistaken_companion_or_extension(more, message):
+def test_a_mistaken_embedded_method_or_continuous_extension(more, message):
     with pytest.raises(ValueError, match=message):
         Tableau([[], [[HALF]]], [[0, 1]], **more)
 
 
-@pytest.mark.parametrize("more", [{"companion": 1}, {"extension": [1]}, {"extension": "ab"}])
-def test_a_companion_or_extension_of_wrong_type(more, no_shape_hook):
+@pytest.mark.parametrize(
+    "more", [{"embedded": 1}, {"continuous_extension": [1]}, {"continuous_extension": "ab"}]
+)
+def test_an_embedded_method_or_continuous_extension_of_wrong_type(more, no_shape_hook):
     with pytest.raises(TypeError, match=f"{next(iter(more))}.* must be a"):
         Tableau([[], [[HALF]]], [[0, 1]], **more)
 

@@ -15,7 +15,7 @@ import pytest
 import scipy.linalg
 
 import cfjax
-from cfjax._methods.extension import extension
+from cfjax._methods.continuous_extension import continuous_extension
 
 METHODS: dict[str, cfjax.CommutatorFree] = {
     "LieEuler": cfjax.LieEuler(),
@@ -337,10 +337,10 @@ def test_a_step_costs_what_its_tableau_says(solver, shape, estimate):
 
     jax.eval_shape(step, jnp.ones(shape))
     # The field at the end of the step, which the next one starts with, comes on top here.
-    last = any(map(tableau.uses_last, extension(tableau)))
+    last = any(map(tableau.uses_last, continuous_extension(tableau)))
     last |= estimate and tableau.first_same_as_last
     assert counts["evaluations"] == tableau.num_evaluations + last
-    assert counts["flows"] == tableau.num_flows + estimate * tableau.num_companion_flows
+    assert counts["flows"] == tableau.num_flows + estimate * tableau.num_embedded_flows
 
 
 # Precision

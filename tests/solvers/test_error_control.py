@@ -211,8 +211,8 @@ def test_a_pair_needs_fewer_flows_than_step_doubling(problem, estimate):
         return np.log(flows), np.log(errors)
 
     tableau = cfjax.CF4().tableau
-    companion_flows = tableau.num_companion_flows if estimate == "group" else 0
-    pair = curve(cfjax.CF4(estimate=estimate), tableau.num_flows + companion_flows)
+    embedded_flows = tableau.num_embedded_flows if estimate == "group" else 0
+    pair = curve(cfjax.CF4(estimate=estimate), tableau.num_flows + embedded_flows)
     plain = cfjax.CommutatorFree(cfjax.Tableau(tableau.alpha, tableau.beta))
     doubling = curve(cfjax.Richardson(plain), 3 * tableau.num_flows)
     # Where both curves have errors to compare.
@@ -221,7 +221,7 @@ def test_a_pair_needs_fewer_flows_than_step_doubling(problem, estimate):
     at = np.linspace(low, high, 9)
     flows = [np.interp(at, c[1][::-1], c[0][::-1]) for c in (pair, doubling)]
     ratio = np.exp(flows[0] - flows[1])
-    expected = 2 * (tableau.num_flows + companion_flows) / (3 * tableau.num_flows)
+    expected = 2 * (tableau.num_flows + embedded_flows) / (3 * tableau.num_flows)
     # Where the error is large the two have other steps.
     assert ratio.max() <= 1.05 * expected, ratio
     error_per_tolerance = pair[1] - np.log(tolerances)

@@ -11,7 +11,7 @@ import pytest
 
 import cfjax
 
-# Orders, and those of the companions.
+# Orders, and those of the embedded methods.
 METHODS: dict[str, Any] = {
     "Williamson3": (3, None),
     "BWRRK33": (3, None),
@@ -33,10 +33,10 @@ def test_the_orders_by_their_conditions(name):
     assert cfjax.order(tableau) == order
     assert tableau.num_flows == tableau.num_evaluations
     if below is None:
-        assert tableau.companion is None
+        assert tableau.embedded is None
     else:
-        assert cfjax.order(tableau.companion_method) == below
-        assert tableau.num_companion_flows == {"Luscher3": 1, "CFEES25": 1}.get(name, 0)
+        assert cfjax.order(tableau.embedded_method) == below
+        assert tableau.num_embedded_flows == {"Luscher3": 1, "CFEES25": 1}.get(name, 0)
 
 
 @names

@@ -53,15 +53,15 @@ def solve(solver, field, y0, t1, atol, args=None, dt0=0.01, t0=0.0, **kwargs):
 
 
 @pairs
-def test_the_companion_has_the_order_below(name):
+def test_the_embedded_method_has_the_order_below(name):
     tableau = PAIRS[name].tableau
-    assert cfjax.order(tableau.companion_method) == cfjax.order(tableau) - 1
+    assert cfjax.order(tableau.embedded_method) == cfjax.order(tableau) - 1
     assert PAIRS[name].error_order(None) == cfjax.order(tableau)
 
 
 @pairs
 @estimates
-def test_the_estimate_falls_with_the_order_of_the_companion(name, estimate):
+def test_the_estimate_falls_with_the_order_of_the_embedded_method(name, estimate):
     """On a group that does not commute, in state and time: like h^p."""
     # Longer steps at order 5, whose estimate would else meet rounding.
     steps = np.array([1 / 8, 1 / 16, 1 / 32]) / (1 if name == "CF54" else 4)
@@ -76,15 +76,15 @@ def test_the_estimate_falls_with_the_order_of_the_companion(name, estimate):
 
 
 @pairs
-def test_the_estimate_is_the_distance_from_the_companion(name):
-    """The companion as a method of its own takes the step from scratch."""
+def test_the_estimate_is_the_distance_from_the_embedded_method(name):
+    """The embedded method as a method of its own takes the step from scratch."""
     solver = PAIRS[name]
-    companion = cfjax.CommutatorFree(solver.tableau.companion_method)
+    embedded = cfjax.CommutatorFree(solver.tableau.embedded_method)
     problem = problems.driven_body, problems.MOMENTUM, 0.25, jnp.asarray(problems.INERTIA)
     if name == "CF4":
         problem = problems.body_in_flight, problems.FLIGHT_START, 0.25, problems.FLIGHT_ARGS
     end, error = one_step(solver, *problem)
-    expected = jtu.tree_map(jnp.subtract, end, one_step(companion, *problem)[0])
+    expected = jtu.tree_map(jnp.subtract, end, one_step(embedded, *problem)[0])
     # A few flows of entries of order 1.
     problems.assert_close(error, expected, 1e-14)
 
@@ -148,8 +148,8 @@ def test_the_estimate_in_the_algebra_is_blind_to_commutators_alone(name, landau_
     blind = one_step(solver_of(name, "algebra"), landau_zener, y0, 0.5, args)[1]
     seen = one_step(solver_of(name, "group"), landau_zener, y0, 0.5, args)[1]
     if name in ("CF2", "CF4"):
-        # The companion of the one is of order 1, and sees that the field changes at all. The other
-        # sees that its last stage is apart from the end.
+        # The embedded method of the one is of order 1, and sees that the field changes at all. That
+        # of the other sees that its last stage is apart from the end.
         assert np.linalg.norm(blind) > 1e-4
     else:
         # Rounding of coefficients up to 1.3 times a field of size 3.
@@ -163,7 +163,7 @@ def test_the_estimate_in_the_algebra_is_blind_to_commutators_alone(name, landau_
 
 @pytest.mark.parametrize("estimate", ["group", "algebra"])
 def test_a_weak_dependence_on_the_state_hides_no_error(estimate):
-    """CF4's companion sees how the field changes with the state, which here is next to nothing."""
+    """CF4's embedded method sees how the field changes with the state: here next to nothing."""
 
     def field(t, y, rate):
         return 3 * jnp.cos(5 * t) - rate * y
@@ -186,7 +186,7 @@ def test_a_weak_dependence_on_the_state_hides_no_error(estimate):
 
 
 def test_part_of_a_state_can_be_blind_to_the_last_evaluation():
-    """CF4's companion differs by f(y1) only: no help where the field does not see the state."""
+    """CF4's embedded method differs by f(y1) only: no help where the field sees no state."""
 
     def field(t, y, args):
         return {"driven": cfjax.Rotation(jnp.stack([t, jnp.cos(t), t * t])), "free": -y["free"]}

@@ -15,7 +15,7 @@ import pytest
 from scipy.integrate import solve_ivp
 
 import cfjax
-from cfjax._methods.extension import extension
+from cfjax._methods.continuous_extension import continuous_extension
 
 # The uniform order of each: at most one below that of the method.
 FLOWS: dict[str, Any] = {
@@ -71,20 +71,20 @@ def exact(word):
     return exact(word[:-1]) * exact(word[-1]) / size(word)
 
 
-def weights_at(extension, theta):
+def weights_at(continuous_extension, theta):
     return [
         [sum(a * theta ** (i + 1) for i, a in enumerate(column)) for column in zip(*p, strict=True)]
-        for p in extension
+        for p in continuous_extension
     ]
 
 
 @pytest.mark.parametrize("solver, order", FLOWS.values(), ids=FLOWS)
-def test_the_order_conditions_of_the_extension(solver, order):
+def test_the_order_conditions_of_the_continuous_extension(solver, order):
     """Its weights must be `theta^n` times those of the exact solution, for words of order n."""
     tableau = solver.tableau
-    within = extension(tableau)
+    within = continuous_extension(tableau)
     # Exact where the tableau is; Fraction(2) / 3 and 2.0 / 3 are both right below.
-    is_exact = tableau.is_exact and tableau.extension is not None
+    is_exact = tableau.is_exact and tableau.continuous_extension is not None
     number = Fraction if is_exact else float
     products = [[list(map(number, r)) for r in p] for p in (*tableau.alpha, tableau.beta)]
 
@@ -130,7 +130,7 @@ def test_the_order_conditions_of_the_extension(solver, order):
 @pytest.mark.parametrize("solver, order", SERIES.values(), ids=SERIES)
 def test_the_order_conditions_in_the_algebra(solver, order):
     """Those of continuous Runge-Kutta methods, tree by tree, at every stage by recursion."""
-    (powers,) = solver.extension
+    (powers,) = solver.continuous_extension
 
     @lru_cache
     def stages(tree):
@@ -154,12 +154,12 @@ def test_the_order_conditions_in_the_algebra(solver, order):
 
 
 def test_a_method_that_needs_the_field_at_the_end_of_the_step_evaluates_it():
-    """CG5, and no other without an extension of its own. Its stages reach order 3 only."""
+    """CG5, and no other that has no continuous extension given. Its stages reach order 3 only."""
     assert {
         name
         for name, (solver, _) in FLOWS.items()
-        if solver.tableau.extension is None
-        and any(map(solver.tableau.uses_last, extension(solver.tableau)))
+        if solver.tableau.continuous_extension is None
+        and any(map(solver.tableau.uses_last, continuous_extension(solver.tableau)))
     } == {"CG5"}
 
 
@@ -269,7 +269,7 @@ def test_derivatives_in_time(name, direction):
         t = direction * t
         h = 1e-3 / n
         found = sol.derivative(t)
-        # The velocity of the field at the point: to the order of the extension.
+        # The velocity of the field at the point: to the order of the continuous extension.
         w = problems.driven_body_ode(t, np.asarray(sol.evaluate(t)), problems.INERTIA)
         np.testing.assert_allclose(found, w, rtol=0, atol=3 * (1 / n) ** order)
         if 0 < abs(t) < 1 and t * n % 1:

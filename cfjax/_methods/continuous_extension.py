@@ -15,7 +15,7 @@ from .order_conditions import (
     word_weights,
     words,
 )
-from .tableau import Extension, Tableau
+from .tableau import ContinuousExtension, Tableau
 
 # The conditions of one order: what they multiply the coefficients of one power of theta with, and
 # what the results must be, one column for each power.
@@ -30,7 +30,7 @@ _ROUNDING = 1e-9
 
 
 @lru_cache
-def extension(tableau: Tableau) -> Extension:
+def continuous_extension(tableau: Tableau) -> ContinuousExtension:
     """The tableau's own, else one of uniform order p - 1 for a method of order p, but at most 4.
 
     It uses the field at the end of the step only where the stages do not suffice.
@@ -40,8 +40,8 @@ def extension(tableau: Tableau) -> Extension:
     stages' fields occur in that letter only, and up to order 4 one word has two such letters, whose
     weight is half the square of a letter's. Nor do the powers of theta mix.
     """
-    if tableau.extension is not None:
-        return tableau.extension
+    if tableau.continuous_extension is not None:
+        return tableau.continuous_extension
     found, reached = _solve(tableau.beta, _flow_conditions(tableau), _MAX_ORDER)
     if reached < _MAX_ORDER and reached < order(tableau) - 1:
         with_end = Tableau((*tableau.alpha, tableau.beta), tableau.beta)
@@ -50,7 +50,9 @@ def extension(tableau: Tableau) -> Extension:
 
 
 @lru_cache
-def runge_kutta_extension(a: tuple[tuple[float, ...], ...], b: tuple[float, ...]) -> Extension:
+def runge_kutta_extension(
+    a: tuple[tuple[float, ...], ...], b: tuple[float, ...]
+) -> ContinuousExtension:
     """That of a Runge-Kutta method in a linear space, from its stages alone.
 
     `a[i]` and `b[i]` belong to stage i. Of methods of order p up to 5 with as few stages as diffrax
@@ -60,7 +62,9 @@ def runge_kutta_extension(a: tuple[tuple[float, ...], ...], b: tuple[float, ...]
     return found
 
 
-def _solve(end: tuple, conditions: Iterator[Conditions], max_order: int) -> tuple[Extension, int]:
+def _solve(
+    end: tuple, conditions: Iterator[Conditions], max_order: int
+) -> tuple[ContinuousExtension, int]:
     """Coefficients by flow, power and stage that sum to `end`, and the order that they reach.
 
     Order by order; the first that cannot be reached is missed by as little as possible. Of all

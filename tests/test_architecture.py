@@ -1,0 +1,200 @@
+"""The direction of imports: what a user calls stands on what it is made of, never the reverse."""
+
+import ast
+import json
+import subprocess
+import sys
+from functools import cache
+from pathlib import Path
+
+import pytest
+
+import cfjax
+
+PACKAGE = Path(cfjax.__file__).parent
+# What `import cfjax` gives.
+FACE = "cfjax"
+# From the ground up. A file may import from its own row's folder and from the rows above it here.
+ROWS = [
+    # Contract of a field, programs as XLA wants them, and the command's signals: none of ours.
+    {"_field", "_xla", "_signals"},
+    # Its term for diffrax; functions of arrays.
+    {"_term", "_numerics"},
+    # Fields, and coefficients of methods.
+    {"_fields", "_methods"},
+    {"_solvers"},
+    {"_integrate"},
+    {"_measure"},
+    {FACE},
+    # These use the public names, as a user would.
+    {"scenes"},
+    {"_paper"},
+    {"__main__"},
+]
+AGAINST_THE_DIRECTION = {
+    (
+        "_solvers.error_control",
+        "_integrate.integrate",
+    ): "a starting step takes states and times as `integrate` does, with the same checks",
+    (
+        "_integrate.fingerprint",
+        FACE,
+    ): "the version is part of a fingerprint; it is read when one is made, not at import",
+}
+# Beyond the public names.
+PRIVATE = {
+    ("scenes.rigid_body", "_numerics.matmul"): "a rotation of a start, in full precision",
+    ("_paper", "_measure"): "reports, charts and flops are what it shows",
+    ("_paper", "scenes"): "its problems",
+    ("_paper", "_integrate.integrate"): "counts a step without what estimates its error",
+    ("_paper.stiefel", "_solvers.munthe_kaas"): "measures its element and its flow apart",
+}
+
+
+def modules():
+    for path in sorted(PACKAGE.rglob("*.py")):
+        yield (
+            path,
+            ".".join(path.relative_to(PACKAGE).with_suffix("").parts)
+            .removesuffix(".__init__")
+            .replace("__init__", FACE),
+        )
+
+
+def is_module(name):
+    path = PACKAGE.joinpath(*name.split("."))
+    return path.with_suffix(".py").exists() or (path / "__init__.py").exists()
+
+
+def imports(node, is_lazy=False):
+    """The imports of a file, but those for type checkers, each with whether a call makes it."""
+    for child in ast.iter_child_nodes(node):
+        if isinstance(child, ast.If) and ast.unparse(child.test) == "TYPE_CHECKING":
+            continue
+        if isinstance(child, ast.ImportFrom | ast.Import):
+            yield child, is_lazy
+        yield from imports(child, is_lazy or isinstance(child, ast.FunctionDef | ast.Lambda))
+
+
+@cache
+def edges():
+    """Pairs of our modules, the one that imports and the other, with whether a call does it."""
+    found = {}
+    for path, module in modules():
+        for node, is_lazy in imports(ast.parse(path.read_text())):
+            if isinstance(node, ast.Import):
+                assert not any(alias.name.startswith("cfjax") for alias in node.names), module
+                continue
+            if not node.level:
+                assert not (node.module or "").startswith("cfjax"), module
+                continue
+            folder = path.relative_to(PACKAGE).parts[:-1]
+            base = folder[: len(folder) - node.level + 1]
+            for alias in node.names:
+                parts = [*base, *(node.module or "").split("."), alias.name]
+                whole = ".".join(filter(None, parts))
+                target = whole if is_module(whole) else whole.rpartition(".")[0] or FACE
+                if target != module:
+                    found[module, target] = found.get((module, target), True) and is_lazy
+    return found
+
+
+def room(module):
+    return module.partition(".")[0]
+
+
+def row(module):
+    return next(n for n, rooms in enumerate(ROWS) if room(module) in rooms)
+
+
+def test_every_folder_has_its_place():
+    rooms = [name for rooms in ROWS for name in rooms]
+    assert sorted(rooms) == sorted({room(module) for _, module in modules()})
+
+
+def test_imports_go_one_way():
+    against = {
+        (module, target)
+        for module, target in edges()
+        if room(module) != room(target) and row(target) >= row(module)
+    }
+    assert against == AGAINST_THE_DIRECTION.keys()
+
+
+def test_scenes_and_the_paper_use_the_public_names():
+    def reason(module, target):
+        return [
+            key
+            for key in PRIVATE
+            if (module == key[0] or room(module) == key[0])
+            and (target == key[1] or room(target) == key[1])
+        ]
+
+    used = set()
+    for module, target in edges():
+        if room(module) in ("scenes", "_paper") and target != FACE:
+            if room(module) != room(target):
+                assert reason(module, target), f"{module} imports {target}, which is private."
+                used.update(reason(module, target))
+    # The table has no line too many.
+    assert used == PRIVATE.keys()
+
+
+def test_there_is_no_circle():
+    after = {}
+    for (module, target), is_lazy in edges().items():
+        if not is_lazy:
+            after.setdefault(module, []).append(target)
+    done, path = set(), []
+
+    def visit(module):
+        assert module not in path, " imports ".join([*path[path.index(module) :], module])
+        if module not in done:
+            path.append(module)
+            for target in after.get(module, []):
+                visit(target)
+            path.pop()
+            done.add(module)
+
+    for _, module in modules():
+        visit(module)
+
+
+def test_the_imports_are_found():
+    found = edges()
+    assert found["_fields.rotation", "_field"] is False
+    assert found["_integrate.fingerprint", FACE] is True
+    assert (FACE, "scenes") not in found
+    assert ("scenes.heat", FACE) in found
+
+
+@pytest.fixture(scope="module")
+def loaded():
+    """What the import loads that `import diffrax` has not."""
+    program = """
+import json, sys
+import diffrax
+before = set(sys.modules)
+import cfjax
+print(json.dumps(sorted(set(sys.modules) - before)))
+"""
+    done = subprocess.run([sys.executable, "-c", program], capture_output=True, text=True)
+    assert done.returncode == 0, done.stderr
+    return json.loads(done.stdout)
+
+
+def test_an_import_loads_what_solves_and_nothing_else(loaded):
+    late = "scipy", "matplotlib", "rich", "pandas", "IPython", "optax"
+    assert not [name for name in loaded if room(name) in late]
+    assert not [
+        name
+        for name in loaded
+        if name.startswith(("cfjax._measure", "cfjax.scenes", "cfjax._paper"))
+    ]
+
+
+def test_an_import_loads_few_modules_of_others(loaded):
+    """Time is what it is about, and a test cannot tell time. Ours are 45 small files."""
+    foreign = [name for name in loaded if room(name) != "cfjax"]
+    # Of jax, for batches over hosts and for attributes of calls; of Python, for fractions.
+    assert len(foreign) <= 10, foreign

@@ -1,0 +1,116 @@
+"""Every solver and every field once, with a gradient: minutes tell whether a version works at all.
+
+`make test-quick` runs this with the canary and the public names.
+"""
+
+import inspect
+
+import diffrax
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+import cfjax
+
+SOLVERS = {
+    name: value
+    for name, value in vars(cfjax).items()
+    if inspect.isclass(value)
+    and issubclass(value, diffrax.AbstractSolver)
+    and name not in ("CommutatorFree", "RKMK", "Richardson")
+} | {
+    "CommutatorFree": lambda: cfjax.CommutatorFree(cfjax.third_order_b(2)),
+    "RKMK": lambda: cfjax.RKMK(diffrax.Bosh3.tableau),
+    "Richardson": lambda: cfjax.Richardson(cfjax.CF2()),
+}
+ON_SPHERE = np.array([0.6, 0.0, 0.8])
+FRAME = np.linalg.qr(np.array([[1.0, 0.2], [0.5, 1.0], [0.3, -0.4]]))[0]
+
+
+def unit(t, y, args):
+    """The rotation of a vector, or of a frame that is moved by its own span."""
+    if y.ndim == 2:
+        return cfjax.LowRankSkew(args[:, None] * jnp.sin(y))
+    return cfjax.Rotation(args * y + t)
+
+
+FIELDS = {
+    "array": (lambda t, y, args: args * jnp.sin(y), ON_SPHERE),
+    "Rotation": (unit, ON_SPHERE),
+    "LeftMatrix": (lambda t, y, args: cfjax.LeftMatrix(jnp.outer(args, y)), ON_SPHERE),
+    "RightMatrix": (lambda t, y, args: cfjax.RightMatrix(jnp.outer(y, args)), ON_SPHERE),
+    "LowRankSkew": (unit, FRAME),
+    "BorderedSkew": (
+        lambda t, y, args: cfjax.BorderedSkew(
+            jnp.concatenate([jnp.array([[0.0, 0.3], [-0.3, 0.0]]), args[None, :2] * y[2:]])
+        ),
+        FRAME,
+    ),
+    "Affine": (
+        lambda t, y, args: cfjax.Affine(1.0, jnp.sin(y), -args, cfjax.SineTransform()),
+        ON_SPHERE,
+    ),
+}
+
+
+def check(solver, field, y0, has_gradient):
+    """Against a reference in plain space, and a gradient against a difference."""
+    term = cfjax.LieTerm(field)
+
+    def end(args):
+        return cfjax.integrate(term, solver, 0.0, 0.2, y0, args, num_steps=2).ys[-1]
+
+    args, direction = jnp.array([0.5, -0.4, 0.9]), jnp.array([0.3, 0.2, -0.5])
+
+    def rate(t, y):
+        return cfjax.tangent(field(t, y, args), y)
+
+    y0 = jnp.asarray(y0)
+    exact = np.asarray(y0 + 0.2 * rate(0.1, y0 + 0.1 * rate(0.0, y0)))
+    # The midpoint rule in one step, rates up to 2; and two steps of Euler's method at worst: both
+    # are off by less than 0.2 * 0.1 * 2^2 / 2.
+    np.testing.assert_allclose(np.asarray(end(args)), exact, rtol=0, atol=0.04)
+    if has_gradient:
+        weights = np.arange(1.0, 1 + y0.size).reshape(y0.shape)
+        loss = jax.jit(lambda args: jnp.sum(end(args) * weights))
+        slope = (loss(args + 1e-4 * direction) - loss(args - 1e-4 * direction)) / 2e-4
+        # The difference is off by (1e-4)^2 / 6 times a third derivative, and by 1e-16 / 1e-4.
+        found = jax.grad(loss)(args) @ direction
+        assert found == pytest.approx(float(slope), rel=1e-6, abs=1e-8)
+
+
+@pytest.mark.parametrize("name", SOLVERS)
+def test_every_solver(name):
+    check(SOLVERS[name](), unit, FRAME if name == "CayleyRK4" else ON_SPHERE, has_gradient=False)
+
+
+@pytest.mark.parametrize("name", FIELDS)
+def test_every_field(name):
+    check(cfjax.CF3(), *FIELDS[name], has_gradient=True)
+
+
+def test_none_is_left_out():
+    fields = {
+        name
+        for name, value in vars(cfjax).items()
+        if inspect.isclass(value) and issubclass(value, cfjax.AbstractFrozenField)
+    }
+    assert fields - {"AbstractFrozenField", "AbstractAlgebraElement"} == FIELDS.keys() - {"array"}
+
+
+def test_steps_that_are_controlled():
+    """By diffrax, with output within the steps."""
+    solution = diffrax.diffeqsolve(
+        cfjax.LieTerm(unit),
+        cfjax.CF43(),
+        0.0,
+        1.0,
+        0.1,
+        jnp.asarray(ON_SPHERE),
+        jnp.array([0.5, -0.4, 0.9]),
+        stepsize_controller=diffrax.PIDController(rtol=0.0, atol=1e-6),
+        saveat=diffrax.SaveAt(dense=True),
+    )
+    # Rounding of some ten steps, each of a few units.
+    np.testing.assert_allclose(jnp.linalg.norm(solution.evaluate(0.37)), 1, rtol=0, atol=1e-14)
