@@ -108,7 +108,8 @@ def _checked_part(place: str, part: Any, point: PyTree) -> Any:
         if not part.acts_on_subtree and not jtu.all_leaves([point]):
             raise TypeError(
                 f"The field returned {name} for {place}. It acts on one array, but the state has "
-                f"{describe(point)} there."
+                f"{describe(point)} there. Return one field for each array; or, if {name} acts on "
+                f"all of them, write `acts_on_subtree = True` in the class."
             )
         try:
             velocity = eqx.filter_eval_shape(type(part).tangent, part, point)
