@@ -97,12 +97,12 @@ def _checked(field: PyTree, y: PyTree) -> PyTree:
             f"state's. Got {eqx.tree_pformat(field)} for the state {describe(y)}: {error}"
         ) from error
     return treedef.unflatten(
-        _checked_part("y" + jtu.keystr(path), part, point)
+        checked_part("y" + jtu.keystr(path), part, point)
         for (path, part), point in zip(parts, points, strict=True)
     )
 
 
-def _checked_part(place: str, part: Any, point: PyTree) -> Any:
+def checked_part(place: str, part: Any, point: PyTree) -> Any:
     if is_field(part):
         name = type(part).__name__
         if not part.acts_on_subtree and not jtu.all_leaves([point]):
