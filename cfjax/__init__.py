@@ -31,6 +31,8 @@ from ._methods.stability import stability_function as stability_function
 from ._methods.tableau import Tableau as Tableau
 from ._methods.tableau import third_order_a as third_order_a
 from ._methods.tableau import third_order_b as third_order_b
+from ._numerics.expm import expm as expm
+from ._numerics.stumpff import stumpff as stumpff
 from ._numerics.transforms import AbstractTransform as AbstractTransform
 from ._numerics.transforms import CosineTransform as CosineTransform
 from ._numerics.transforms import FourierTransform as FourierTransform

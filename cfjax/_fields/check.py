@@ -15,9 +15,9 @@ from jaxtyping import PyTree
 from .._field import AbstractAlgebraElement, AbstractFrozenField, combine, describe, flow
 from .._term import checked_part
 
-# What is compared: by the text of the promise, what was found, what is expected, and a size whose
+# What is compared: the text of the promise, what was found, what is expected, and a size whose
 # rounding the difference may have.
-_Facts = dict[str, tuple[PyTree, PyTree, Any]]
+_Facts = list[tuple[str, PyTree, PyTree, Any]]
 
 
 def check_field(fields: Sequence[AbstractFrozenField], point: PyTree) -> None:
@@ -97,17 +97,15 @@ def _check_arguments(fields: Any, point: PyTree) -> None:
 @eqx.filter_jit
 def _of_start(given: Any, field: Any, start: Any, point: PyTree) -> _Facts:
     here, end = field.leave(start), given.flow(point)
-    facts = {
-        "enter and leave must lead back to the point": (here, point, _size(point)),
-        "flow must be the same before and after enter": (
-            end,
-            field.leave(field.flow(start)),
-            _size((point, end)),
-        ),
-    }
+    entered = field.leave(field.flow(start))
+    size = _size((point, end))
+    facts: _Facts = [
+        ("enter and leave must lead back to the point", here, point, size),
+        ("flow must be the same before and after enter", end, entered, size),
+    ]
     defect = type(given).defect(end)
     if defect is not None:
-        facts[f"flow must keep {defect[1]}"] = (defect[0], jnp.zeros_like(defect[0]), 1)
+        facts.append((f"flow must keep {defect[1]}", defect[0], jnp.zeros_like(defect[0]), 1))
     return facts
 
 
@@ -127,26 +125,30 @@ def _of_flow(given: Any, field: Any, first: Any, start: Any, point: PyTree) -> _
     velocity = jax.jvp(lambda t: first.leave(moved(t, start)), (0 * times[0],), (times[2],))[1]
     tangent = given.tangent(here)
     displacement = given.displacement(point)
-    facts = {
-        "flow of the zero field must be the identity": (
+    facts: _Facts = [
+        (
+            "flow of the zero field must be the identity",
             first.leave(at_zero),
             here,
             _size(here),
         ),
-        "tangent must be the derivative of the flow at time zero": (
+        (
+            "tangent must be the derivative of the flow at time zero",
             tangent,
             velocity,
             _size((here, tangent, velocity)),
         ),
-        "flow of 0.4 of a field after 0.6 of it must be that of the whole field": (
+        (
+            "flow of 0.4 of a field after 0.6 of it must be that of the whole field",
             first.leave(moved(0.4, before)),
             end,
             _size((here, end)),
         ),
-    }
+    ]
     if displacement is not None:
         expected = jtu.tree_map(jnp.subtract, given.flow(point), point)
-        facts["displacement must be flow(point) - point"] = displacement, expected, _size(point)
+        promise = "displacement must be flow(point) - point"
+        facts.append((promise, displacement, expected, _size((point, expected))))
     return facts
 
 
@@ -158,14 +160,15 @@ def _of_sum(fields: Sequence[Any], entered: Sequence[Any], start: Any) -> _Facts
     # Translations are added without the class's help.
     expected = combine(weights, parts)
     size = _size((here, parts))
-    return {
-        f"combine must be linear in {what}: the tangent of a sum must be the sum of the tangents": (
+    return [
+        (
+            f"combine must be linear {what}: the tangent of a sum must be the sum of the tangents",
             type(summed[0]).combine(weights, summed).tangent(here),
             expected,
             size,
         )
-        for what, summed in [("the fields", fields), ("fields that have entered", entered)]
-    }
+        for what, summed in [("in the fields", fields), ("in what has entered", entered)]
+    ]
 
 
 @eqx.filter_jit
@@ -173,7 +176,7 @@ def _of_bracket(entered: Sequence[Any], start: Any) -> _Facts:
     here = entered[0].leave(start)
     a, b, c = entered[0], entered[1], entered[-1]
     ab = a.bracket(b)
-    facts = {}
+    facts: _Facts = []
     for what, x, y, found in [
         ("[a, b]", a, b, ab),
         ("[b, a]", b, a, b.bracket(a)),
@@ -186,7 +189,7 @@ def _of_bracket(entered: Sequence[Any], start: Any) -> _Facts:
             f"bracket must have the sign and size of AbstractAlgebraElement (ab - ba for matrices "
             f"that act from the left), here {what}"
         )
-        facts[promise] = tangent, expected, _size((here, tangent, parts))
+        facts.append((promise, tangent, expected, _size((here, tangent, parts))))
     return facts
 
 
@@ -195,7 +198,7 @@ def _size(x: PyTree) -> Any:
 
 
 def _compare(name: str, facts: _Facts, unit: float) -> None:
-    for promise, (found, expected, size) in facts.items():
+    for promise, found, expected, size in facts:
         a, b = (
             np.concatenate([np.ravel(leaf) for leaf in jtu.tree_leaves(x)])
             for x in (found, expected)

@@ -192,7 +192,7 @@ def test_the_error_between_the_steps_falls_with_the_order_of_the_solution(solver
     @jax.jit
     def point(h, theta):
         times = jnp.asarray(0.0), h
-        info = solver.step(cfjax.LieTerm(field), *times, y0, args, None, made_jump=False)[2]
+        info = problems.first_step(solver, cfjax.LieTerm(field), *times, y0, args)[2]
         return solver.interpolation_cls(t0=times[0], t1=times[1], **info).evaluate(theta * h)
 
     errors = []
@@ -319,7 +319,7 @@ def test_the_error_between_the_steps_of_a_frame(name):
     @jax.jit
     def points(h):
         y0, times = jnp.asarray(FRAME), (jnp.asarray(0.0), h)
-        info = solver.step(cfjax.LieTerm(frame_field), *times, y0, None, None, made_jump=False)[2]
+        info = problems.first_step(solver, cfjax.LieTerm(frame_field), *times, y0, None)[2]
         path = solver.interpolation_cls(t0=times[0], t1=times[1], **info)
         return jax.vmap(path.evaluate)(h * thetas), path.evaluate(h)
 
