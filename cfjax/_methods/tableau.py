@@ -119,11 +119,6 @@ class Tableau:
         """
         return self.num_stages
 
-    @cached_property
-    def first_same_as_last(self) -> bool:
-        """Whether the companion or the extension uses the field at the end of the step."""
-        return any(map(self.uses_last, (self.companion or (), *(self.extension or ()))))
-
     def uses_last(self, rows: Product) -> bool:
         """Whether the rows have a coefficient for the field at the end of the step."""
         return any(any(row[self.num_stages :]) for row in rows)

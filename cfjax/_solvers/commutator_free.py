@@ -61,7 +61,10 @@ class AbstractCommutatorFree(AbstractLieSolver):
 
     @property
     def first_same_as_last(self) -> bool:
-        return self.estimate is not None and self.tableau.first_same_as_last
+        tableau = self.tableau
+        if self.estimate is None or tableau.companion is None:
+            return False
+        return any(map(tableau.uses_last, (tableau.companion, *extension(tableau))))
 
     def order(self, terms) -> int:
         return order(self.tableau)

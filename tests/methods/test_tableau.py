@@ -185,13 +185,12 @@ def test_crouch_grossman():
 def test_what_a_companion_costs(name, companion_flows, last):
     tableau = NAMED[name]
     assert tableau.num_companion_flows == companion_flows
-    assert tableau.first_same_as_last is last
+    assert tableau.uses_last(tableau.companion) is last
     assert tableau.companion_method.alpha[-1][0][: tableau.num_stages] == tableau.beta[0]
 
 
 def test_without_a_companion_there_is_no_method():
     assert CG4.companion_method is None and CG4.num_companion_flows == 0
-    assert not CG4.first_same_as_last
 
 
 @pytest.mark.parametrize(
