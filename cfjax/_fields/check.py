@@ -63,8 +63,7 @@ def check_field(fields: Sequence[AbstractFrozenField], point: PyTree) -> None:
     for field in fields:
         field, start = field.enter(start, entered)
         entered.append(field)
-    leaves = jtu.tree_leaves((fields, point))
-    unit = float(np.sqrt(max(jnp.finfo(jnp.result_type(leaf)).eps for leaf in leaves)))
+    unit = float(np.sqrt(max(jnp.finfo(leaf.dtype).eps for leaf in jtu.tree_leaves(point))))
 
     _compare(name, _of_start(fields[0], entered[0], start, point), unit)
     for given, field in zip(fields, entered, strict=True):
@@ -115,9 +114,8 @@ def _of_flow(given: Any, field: Any, first: Any, start: Any, point: PyTree) -> _
         return type(field).combine((t,), (field,)).flow(start)
 
     here = first.leave(start)
-    # In the field's own precision.
-    dtype = jnp.finfo(jnp.result_type(jtu.tree_leaves((field, here))[0])).dtype
-    times = jnp.asarray([0.0, 0.6, 1.0], dtype)
+    # In the precision of the point, which is that of the field.
+    times = jnp.asarray([0.0, 0.6, 1.0], jnp.finfo(jtu.tree_leaves(here)[0].dtype).dtype)
     # In a loop, so that the flow is compiled once.
     ends = lax.map(lambda t: moved(t, start), times)
     at_zero, before, end = (jtu.tree_map(itemgetter(k), ends) for k in range(3))
