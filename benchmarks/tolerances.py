@@ -24,6 +24,7 @@ from rich.table import Table
 from scipy.integrate import solve_ivp
 
 import cfjax
+from cfjax._measure.cost import Problem, calls_of_steps
 from cfjax._measure.work_precision import take_turns
 from cfjax.scenes import rigid_body
 
@@ -183,13 +184,11 @@ def _draw() -> None:
     figure.savefig(Path(__file__).with_suffix(".png"), dpi=120)
 
 
-def _flows(solver: Any) -> int:
+def _flows(solver: Any) -> float:
     """Flows in a step, with those of the estimate."""
-    if isinstance(solver, cfjax.Richardson):
-        inner: Any = solver.solver
-        return 3 * _flows(inner)
-    estimate = solver.tableau.num_embedded_flows if solver.estimate else 0
-    return solver.tableau.num_flows + estimate
+    y0, inertia = np.asarray(rigid_body.y0), np.asarray(rigid_body.inertia)
+    t0, t1, h = (jnp.asarray(t) for t in (0.0, END, 0.1))
+    return calls_of_steps(Problem(LIE, solver, t0, t1, h, y0, inertia))[1].flows
 
 
 if __name__ == "__main__":

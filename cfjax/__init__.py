@@ -16,6 +16,7 @@ from ._field import combine as combine
 from ._field import flow as flow
 from ._field import tangent as tangent
 from ._fields.affine import Affine as Affine
+from ._fields.check import check_field as check_field
 from ._fields.low_rank import BorderedSkew as BorderedSkew
 from ._fields.low_rank import LowRankSkew as LowRankSkew
 from ._fields.matrix import LeftMatrix as LeftMatrix
@@ -30,6 +31,8 @@ from ._methods.stability import stability_function as stability_function
 from ._methods.tableau import Tableau as Tableau
 from ._methods.tableau import third_order_a as third_order_a
 from ._methods.tableau import third_order_b as third_order_b
+from ._numerics.expm import expm as expm
+from ._numerics.stumpff import stumpff as stumpff
 from ._numerics.transforms import AbstractTransform as AbstractTransform
 from ._numerics.transforms import CosineTransform as CosineTransform
 from ._numerics.transforms import FourierTransform as FourierTransform

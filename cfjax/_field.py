@@ -1,6 +1,7 @@
 """Frozen vector fields: the one thing a commutator-free method needs to know of a manifold."""
 
 import abc
+import inspect
 from collections.abc import Sequence
 from typing import Any, ClassVar
 
@@ -20,12 +21,17 @@ class AbstractFrozenField(eqx.Module):
     A method needs two things of it (Celledoni, Marthinsen & Owren 2003, Section 2): its flow,
     and linear combinations with other fields of the same frame. A subclass says what they are:
 
-    - `flow(point)`: where the field carries `point` in unit time;
-    - `tangent(point)`: the velocity of that flow at `point`, as an array shaped like `point`;
+    - `flow(point)`: where the field carries `point` in unit time, shaped like `point`;
+    - `tangent(point)`: the velocity of that flow at `point`, shaped like `point`;
     - `combine(weights, fields)`: by default linear in every array of the class. Override it where
       an array is structure (a spectrum, a factor) instead of a coordinate.
 
-    `flow` and `tangent` must accept the zero field.
+    `flow` and `tangent` must accept the zero field. `cfjax.check_field` tells whether a class keeps
+    all of this.
+
+    The point is one array. A class that acts on several parts of the state together sets
+    `acts_on_subtree = True`: then its point, and what `flow` and `tangent` return, is the pytree
+    that stands in its place in the state.
 
     A class may also work in coordinates of its own within a step, where that is what makes it
     cheap. Then it overrides `enter` and `leave` too.
@@ -33,6 +39,18 @@ class AbstractFrozenField(eqx.Module):
 
     # Whether the point that the field acts on is a pytree instead of one array.
     acts_on_subtree: ClassVar[bool] = False
+
+    def __init_subclass__(cls, **kwargs: Any):
+        super().__init_subclass__(**kwargs)
+        if "acts_on_subtree" in vars(cls):
+            # With an annotation it would be a field of the dataclass, and a leaf of the pytree.
+            annotation = inspect.get_annotations(cls).get("acts_on_subtree", ClassVar)
+            if "ClassVar" not in str(annotation):
+                raise TypeError(
+                    f"{cls.__name__}.acts_on_subtree must belong to the class and not to its "
+                    "instances: write `acts_on_subtree = True`, without an annotation or with "
+                    f"`typing.ClassVar[bool]`, got the annotation {annotation!r}."
+                )
 
     @abc.abstractmethod
     def flow(self, point: Any) -> Any:
@@ -104,9 +122,14 @@ class AbstractFrozenField(eqx.Module):
 class AbstractAlgebraElement(AbstractFrozenField):
     """A frozen field from a set that is closed under the bracket: an element of a Lie algebra.
 
-    Munthe-Kaas methods accept only these. The bracket is normalised so that `y = exp(u) p` has
-    `u' = v - [u, v]/2 + [u, [u, v]]/12 - ...` for the field v at y. So a matrix that acts from the
-    left has `[a, b] = ab - ba`, and one that acts from the right `[a, b] = ba - ab`.
+    Munthe-Kaas methods accept only what is one in the coordinates of a step: these, and fields
+    whose `enter` returns one, such as `cfjax.LowRankSkew`, which has a bracket only together with
+    the point where it is frozen.
+
+    The bracket is normalised so that `y = exp(u) p` has
+    `u' = v - [u, v]/2 + [u, [u, v]]/12 - ...` for the field v at y. In terms of the tangents X_a
+    and X_b as functions of the point, `X_[a,b] = DX_a X_b - DX_b X_a`. So a matrix that acts from
+    the left has `[a, b] = ab - ba`, and one that acts from the right `[a, b] = ba - ab`.
     """
 
     @abc.abstractmethod

@@ -97,18 +97,19 @@ def _checked(field: PyTree, y: PyTree) -> PyTree:
             f"state's. Got {eqx.tree_pformat(field)} for the state {describe(y)}: {error}"
         ) from error
     return treedef.unflatten(
-        _checked_part("y" + jtu.keystr(path), part, point)
+        checked_part("y" + jtu.keystr(path), part, point)
         for (path, part), point in zip(parts, points, strict=True)
     )
 
 
-def _checked_part(place: str, part: Any, point: PyTree) -> Any:
+def checked_part(place: str, part: Any, point: PyTree) -> Any:
     if is_field(part):
         name = type(part).__name__
         if not part.acts_on_subtree and not jtu.all_leaves([point]):
             raise TypeError(
                 f"The field returned {name} for {place}. It acts on one array, but the state has "
-                f"{describe(point)} there."
+                f"{describe(point)} there. Return one field for each array; or, if {name} acts on "
+                f"all of them, write `acts_on_subtree = True` in the class."
             )
         try:
             velocity = eqx.filter_eval_shape(type(part).tangent, part, point)

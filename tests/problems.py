@@ -130,7 +130,8 @@ def many_steps(field, solver, t0, t1, y0, args, num_steps, ignore_stage_times=Fa
     """
     h = (t1 - t0) / num_steps
 
-    def step(n, y):
+    def step(n, carry):
+        y, state = carry
         start, end = t0 + n * h, t0 + (n + 1) * h
 
         def mistaken(t, y, args):
@@ -138,9 +139,17 @@ def many_steps(field, solver, t0, t1, y0, args, num_steps, ignore_stage_times=Fa
             return field(start, y, args)
 
         term = cfjax.LieTerm(mistaken if ignore_stage_times else field)
-        return solver.step(term, start, end, y, args, None, made_jump=False)[0]
+        y, _, _, state, _ = solver.step(term, start, end, y, args, state, made_jump=False)
+        return y, state
 
-    return lax.fori_loop(0, num_steps, step, y0)
+    state = solver.init(cfjax.LieTerm(field), t0, t0 + h, y0, args)
+    return lax.fori_loop(0, num_steps, step, (y0, state))[0]
+
+
+def first_step(solver, term, t0, t1, y0, args) -> Any:
+    """What `solver.step` returns for a step with a new state of the solver."""
+    state = solver.init(term, t0, t1, y0, args)
+    return solver.step(term, t0, t1, y0, args, state, made_jump=False)
 
 
 def errors(field, solver, t1, y0, args, answer, steps: Sequence[int], **kwargs) -> np.ndarray:

@@ -44,6 +44,9 @@ PROMISED = [
     "integrate",
     "ErrorNorm",
     "starting_step",
+    "check_field",
+    "expm",
+    "stumpff",
 ]
 SOLVERS = [*PROMISED[PROMISED.index("LieEuler") : PROMISED.index("RKMK")], "CayleyRK4"]
 PUBLIC = [

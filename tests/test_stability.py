@@ -55,7 +55,7 @@ def one_step(solver, z, w):
 
     t0, t1 = jnp.zeros(()), jnp.ones(())
     term = cfjax.LieTerm(field)
-    return solver.step(term, t0, t1, jnp.ones_like(z), (z, w), None, made_jump=False)[0]
+    return problems.first_step(solver, term, t0, t1, jnp.ones_like(z), (z, w))[0]
 
 
 def random_tableau():
@@ -130,7 +130,7 @@ def test_how_long_a_step_of_cf54_may_be(dtype, limit):
         spectrum = jnp.asarray([-1.0, -100.0], dtype)
         term = cfjax.LieTerm(lambda t, u, args: cfjax.Affine(1.0, jnp.cos(u), spectrum))
         times = jnp.zeros((), dtype), jnp.asarray(length / 100, dtype)
-        return solver.step(term, *times, jnp.ones(2, dtype), None, None, made_jump=False)[:2]
+        return problems.first_step(solver, term, *times, jnp.ones(2, dtype), None)[:2]
 
     assert np.isfinite(step(cfjax.CF54(), limit)).all()
     assert np.isnan(step(cfjax.CF54(), 1.03 * limit)[0][1])

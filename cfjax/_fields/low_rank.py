@@ -33,8 +33,9 @@ class LowRankSkew(AbstractSkew):
 
     Nothing of size n x n is formed. Within a step the points and fields live in the span of its
     first point and of all g so far, p columns each: a step of s stages costs about
-    `2 n p^2 (s + 1)(s + 2)` flops and `n p (s + 1)` numbers. There a field has a bracket, which
-    stays in the span, so Munthe-Kaas methods accept it too. Every step starts from
+    `2 n p^2 (s + 1)(s + 2)` flops and `n p (s + 1)` numbers. There a field is an algebra element,
+    whose brackets stay in the span, so Munthe-Kaas methods accept it. Outside of a step it has no
+    bracket, as that depends on the point y. Every step starts from
     `y (3 I - y^T y) / 2`, so that rounding does not add up.
 
     **Arguments:** `g`, shape `(n, p)` with n >= p, float32 or float64.
@@ -181,7 +182,11 @@ class _Span(eqx.Module):
         return _Span(blocks, jnp.concatenate([top, new.T]))
 
     def position(self, block: Any) -> int:
-        """Which block is the same array, or -1. By identity: equal ones would only cost more."""
+        """Which block is the same array, or -1.
+
+        By identity, as values are not known in a trace. The same object always has the same value.
+        Two with equal values make the span longer than it need be, and the field is the same.
+        """
         for i, own in enumerate(self.blocks):
             if own is block or (isinstance(own, _Corner) and isinstance(block, _Corner)):
                 return i

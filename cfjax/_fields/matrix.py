@@ -1,7 +1,7 @@
 """Matrix Lie algebras, acting from the left or from the right."""
 
-from collections.abc import Callable
-from typing import Any
+import abc
+from typing import Any, ClassVar
 
 import equinox as eqx
 import jax.numpy as jnp
@@ -14,7 +14,76 @@ from .._numerics.expm_times import expm_minus_one_times
 from .._numerics.matmul import matmul
 
 
-class LeftMatrix(AbstractAlgebraElement):
+class AbstractMatrix(AbstractAlgebraElement):
+    """An element of a matrix Lie algebra. A subclass is one of its actions on points."""
+
+    a: Inexact[Array, "n n"] = eqx.field(converter=jnp.asarray)
+    # The shapes that the matrix acts on, and which of their axes it multiplies.
+    shapes: ClassVar[str]
+    axis: ClassVar[int]
+
+    @staticmethod
+    @abc.abstractmethod
+    def act(a: Array, x: Array) -> Array:
+        """The product of a matrix with a point, from the side that this class acts from."""
+
+    def __check_init__(self):
+        if self.a.ndim != 2 or self.a.shape[0] != self.a.shape[1]:
+            raise ValueError(f"a must have shape (n, n), got {self.a.shape}.")
+        if self.a.dtype not in (jnp.float32, jnp.float64, jnp.complex64, jnp.complex128):
+            raise TypeError(
+                f"a must be float32, float64, complex64 or complex128, got {self.a.dtype}."
+            )
+
+    def flow(self, point: Inexact[Array, "..."]) -> Inexact[Array, "..."]:
+        self._check_point(point)
+        if _is_thin(self.a, point):
+            return point + self.displacement(point)
+        weight, moved = self._dense(point)
+        return weight * point + moved
+
+    def displacement(self, point: Inexact[Array, "..."]) -> Inexact[Array, "..."]:
+        self._check_point(point)
+
+        def dense() -> Array:
+            weight, moved = self._dense(point)
+            return (weight - 1) * point + moved
+
+        if not _is_thin(self.a, point):
+            return dense()
+        return expm_minus_one_times(lambda x: self.act(self.a, x), point, one_norm(self.a), dense)
+
+    def tangent(self, point: Inexact[Array, "..."]) -> Inexact[Array, "..."]:
+        self._check_point(point)
+        return self.act(self.a, point)
+
+    def bracket(self, other: Any) -> "AbstractMatrix":
+        if not isinstance(other, type(self)):
+            name = type(self).__name__
+            raise TypeError(
+                f"{name} has a bracket with another {name} only, got {type(other).__name__}."
+            )
+        # Flows from the right compose the other way round, and so do these products.
+        return type(self)(self.act(self.a, other.a) - self.act(other.a, self.a))
+
+    def _check_point(self, point: Array) -> None:
+        n = len(self.a)
+        if point.ndim not in (1, 2) or point.shape[self.axis] != n:
+            name = type(self).__name__
+            raise ValueError(
+                f"{name} with a of shape (n, n) acts on shapes {self.shapes}, got {point.shape} "
+                f"with n = {n}."
+            )
+
+    def _dense(self, point: Array) -> tuple[Array, Array]:
+        """`w, z` with `w x + z` the point that x moves to."""
+        weight, rest = expm_parts(self.a)
+        weight = weight.astype(point.dtype)
+        # With a itself the product is exact but for the rounding of its sums, which is random.
+        return weight, weight * self.act(self.a, point) + self.act(rest, point)
+
+
+class LeftMatrix(AbstractMatrix):
     """The linear field `x' = a x`, whose flow is `x -> exp(a) x`.
 
     It acts on a vector, shape `(n,)`, or a matrix, shape `(n, k)`. Any matrix Lie algebra, real
@@ -31,102 +100,27 @@ class LeftMatrix(AbstractAlgebraElement):
     **Raises** `ValueError` for a shape that is not square, `TypeError` for another dtype.
     """
 
-    a: Inexact[Array, "n n"] = eqx.field(converter=jnp.asarray)
+    shapes: ClassVar[str] = "(n,) and (n, k)"
+    axis: ClassVar[int] = 0
 
-    def __check_init__(self):
-        _check_square(self.a)
-
-    def flow(self, point: Inexact[Array, "n *k"]) -> Inexact[Array, "n *k"]:
-        return _flow(_product, self.a, point)
-
-    def displacement(self, point: Inexact[Array, "n *k"]) -> Inexact[Array, "n *k"]:
-        return _displacement(_product, self.a, point)
-
-    def tangent(self, point: Inexact[Array, "n *k"]) -> Inexact[Array, "n *k"]:
-        n = len(self.a)
-        if point.ndim not in (1, 2) or point.shape[0] != n:
-            raise ValueError(
-                f"LeftMatrix with a of shape ({n}, {n}) acts on shapes ({n},) and ({n}, k), got "
-                f"{point.shape}."
-            )
-        return _product(self.a, point)
-
-    def bracket(self, other: Any) -> "LeftMatrix":
-        _check_other(LeftMatrix, other)
-        return type(self)(_product(self.a, other.a) - _product(other.a, self.a))
+    @staticmethod
+    def act(a: Inexact[Array, "n n"], x: Inexact[Array, "n *k"]) -> Inexact[Array, "n *k"]:
+        return _product(a, x)
 
 
-class RightMatrix(AbstractAlgebraElement):
+class RightMatrix(AbstractMatrix):
     """The linear field `x' = x a`, whose flow is `x -> x exp(a)`.
 
     It acts on a row, shape `(n,)`, or a matrix, shape `(k, n)`. For an attitude matrix this is an
     angular velocity in the moving frame. All else as for `LeftMatrix`.
     """
 
-    a: Inexact[Array, "n n"] = eqx.field(converter=jnp.asarray)
+    shapes: ClassVar[str] = "(n,) and (k, n)"
+    axis: ClassVar[int] = -1
 
-    def __check_init__(self):
-        _check_square(self.a)
-
-    def flow(self, point: Inexact[Array, "*k n"]) -> Inexact[Array, "*k n"]:
-        return _flow(_product_from_right, self.a, point)
-
-    def displacement(self, point: Inexact[Array, "*k n"]) -> Inexact[Array, "*k n"]:
-        return _displacement(_product_from_right, self.a, point)
-
-    def tangent(self, point: Inexact[Array, "*k n"]) -> Inexact[Array, "*k n"]:
-        n = len(self.a)
-        if point.ndim not in (1, 2) or point.shape[-1] != n:
-            raise ValueError(
-                f"RightMatrix with a of shape ({n}, {n}) acts on shapes ({n},) and (k, {n}), got "
-                f"{point.shape}."
-            )
-        return _product(point, self.a)
-
-    def bracket(self, other: Any) -> "RightMatrix":
-        _check_other(RightMatrix, other)
-        # Flows from the right compose the other way round.
-        return type(self)(_product(other.a, self.a) - _product(self.a, other.a))
-
-
-def _check_other(side: type, other: Any) -> None:
-    if not isinstance(other, side):
-        raise TypeError(
-            f"{side.__name__} has a bracket with another {side.__name__} only, got "
-            f"{type(other).__name__}."
-        )
-
-
-def _check_square(a: Array) -> None:
-    if a.ndim != 2 or a.shape[0] != a.shape[1]:
-        raise ValueError(f"a must have shape (n, n), got {a.shape}.")
-    if a.dtype not in (jnp.float32, jnp.float64, jnp.complex64, jnp.complex128):
-        raise TypeError(f"a must be float32, float64, complex64 or complex128, got {a.dtype}.")
-
-
-def _flow(product: Callable[[Array, Array], Array], a: Array, point: Array) -> Array:
-    if _is_thin(a, point):
-        return point + _displacement(product, a, point)
-    weight, moved = _dense(product, a, point)
-    return weight * point + moved
-
-
-def _displacement(product: Callable[[Array, Array], Array], a: Array, point: Array) -> Array:
-    def dense() -> Array:
-        weight, moved = _dense(product, a, point)
-        return (weight - 1) * point + moved
-
-    if not _is_thin(a, point):
-        return dense()
-    return expm_minus_one_times(lambda x: product(a, x), point, one_norm(a), dense)
-
-
-def _dense(product: Callable[[Array, Array], Array], a: Array, point: Array) -> tuple[Array, Array]:
-    """`w, z` with `w x + z` the point that x moves to."""
-    weight, rest = expm_parts(a)
-    weight = weight.astype(point.dtype)
-    # With a itself the product is exact but for the rounding of its sums, which is random.
-    return weight, weight * product(a, point) + product(rest, point)
+    @staticmethod
+    def act(a: Inexact[Array, "n n"], x: Inexact[Array, "*k n"]) -> Inexact[Array, "*k n"]:
+        return _product(x, a)
 
 
 def _is_thin(a: Array, point: Array) -> bool:
@@ -140,7 +134,3 @@ def _product(a: Array, b: Array) -> Array:
         dtype = np.promote_types(a.dtype, b.dtype)
         a, b = a.astype(dtype), b.astype(dtype)
     return matmul(a, b)
-
-
-def _product_from_right(a: Array, x: Array) -> Array:
-    return _product(x, a)

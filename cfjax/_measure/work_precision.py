@@ -5,9 +5,8 @@ import csv
 import functools
 import os
 import time
-from collections import Counter
 from collections.abc import Callable, Iterator, Mapping, Sequence
-from typing import TYPE_CHECKING, Any, ClassVar, NamedTuple
+from typing import TYPE_CHECKING, Any, NamedTuple
 
 import diffrax
 import equinox as eqx
@@ -17,7 +16,6 @@ import jax.tree_util as jtu
 import numpy as np
 from jaxtyping import Array, Float, Int, PyTree
 
-from .._field import AbstractAlgebraElement, bracket, combine, flow, is_field, tangent
 from .._integrate.integrate import (
     as_state,
     check_own_tolerances,
@@ -29,8 +27,8 @@ from .._integrate.integrate import (
     without_estimate,
 )
 from .._integrate.progress import progress_bar
+from .cost import Problem, cost_of_steps
 from .extra import paper_extra
-from .flops import count_flops
 
 if TYPE_CHECKING:
     import matplotlib.figure
@@ -276,8 +274,8 @@ def work_precision(
             update(description=f"Compiling {name}")
             with _about(name):
                 solver = solver if is_adaptive else without_estimate(solver)
-                problem = _Problem(own_term, solver, t0, t1, dt0, y0, args)
-                cost = _cost(problem, is_adaptive)
+                problem = Problem(own_term, solver, t0, t1, dt0, y0, args)
+                cost = cost_of_steps(problem, is_adaptive)
                 executable, seconds = compiled(solve, problem, values[0])
             update(description=f"Running {name}")
             for setting, value in zip(settings, values, strict=True):
@@ -307,16 +305,6 @@ def work_precision(
     seconds[runs] = measured
     columns = dict(zip(WorkPrecision._fields[1:9], np.array(rows).T, strict=True))
     return WorkPrecision(method=tuple(names), **columns, seconds=seconds, note=tuple(notes))
-
-
-class _Problem(NamedTuple):
-    term: PyTree
-    solver: diffrax.AbstractSolver
-    t0: Array
-    t1: Array
-    dt0: Array
-    y0: PyTree
-    args: PyTree
 
 
 def compiled(fun: Callable[..., PyTree], *args: PyTree) -> tuple[Callable[[PyTree], PyTree], float]:
@@ -358,7 +346,7 @@ def take_turns(
     return np.array(rounds).T
 
 
-def _equal_steps(problem: _Problem, num_steps: Int[Array, ""]) -> tuple:
+def _equal_steps(problem: Problem, num_steps: Int[Array, ""]) -> tuple:
     term, solver, t0, t1, _, y0, args = problem
     solution = equal_steps(term, solver, t0, t1, y0, args, num_steps, None, None, throw=False)
     return _end(solution, num_steps, 0)
@@ -397,164 +385,6 @@ def _first_run(program: Callable[[], tuple]) -> tuple[PyTree, float, float, str]
     else:
         note = ""
     return y, float(num_steps), float(num_rejected), note
-
-
-# What a step costs.
-
-
-class _Cost(NamedTuple):
-    """Evaluations, flows and flops: of the first step with what comes before it, of any other."""
-
-    first: Float[np.ndarray, "3"]
-    later: Float[np.ndarray, "3"]
-
-    def of(self, num_steps: float) -> Float[np.ndarray, "3"]:
-        return self.first + (num_steps - 1) * self.later
-
-
-def _cost(problem: _Problem, is_adaptive: bool) -> _Cost:
-    if _is_implicit(problem.solver):
-        # How often its steps repeat depends on a tolerance that the controller may give it.
-        unknown = np.full(3, np.nan)
-        return _Cost(unknown, unknown)
-    # First, because it refuses a solver before anything is compiled.
-    flops = _flops(problem, is_adaptive)
-    evaluations, flows = _calls(problem)
-    first, later = zip(evaluations, flows, flops, strict=True)
-    return _Cost(np.array(first, float), np.array(later, float))
-
-
-def _is_implicit(solver: diffrax.AbstractSolver) -> bool:
-    while isinstance(solver, diffrax.AbstractWrappedSolver):
-        solver = solver.solver
-    return isinstance(solver, diffrax.AbstractImplicitSolver)
-
-
-def _flops(problem: _Problem, is_adaptive: bool) -> tuple[float, float]:
-    """Of the first step with what comes before it, and of any other."""
-    arrays, static = eqx.partition(problem, eqx.is_array)
-
-    def init(arrays):
-        term, solver, t0, _, dt0, y0, args = eqx.combine(arrays, static)
-        return solver.init(term, t0, t0 + dt0, y0, args)
-
-    state = eqx.filter_eval_shape(init, arrays)
-    state, static_state = eqx.partition(state, lambda x: isinstance(x, jax.ShapeDtypeStruct))
-
-    def start(arrays):
-        return eqx.filter(init(arrays), eqx.is_array)
-
-    def step(arrays, t1, state):
-        term, solver, t0, _, _, y0, args = eqx.combine(arrays, static)
-        state = eqx.combine(state, static_state)
-        y, y_error, _, state, _ = solver.step(term, t0, t1, y0, args, state, made_jump=False)
-        if is_adaptive and y_error is None:
-            name = type(solver).__name__
-            raise ValueError(
-                f"tolerances need a solver with an error estimate, and {name} has none: use "
-                f"diffrax.HalfSolver({name}()), or give num_steps."
-            )
-        return y, y_error if is_adaptive else None, eqx.filter(state, eqx.is_array)
-
-    try:
-        later = float(count_flops(step, arrays, problem.t0 + problem.dt0, state))
-        return count_flops(start, arrays) + later, later
-    except NotImplementedError:
-        return np.nan, np.nan
-
-
-def _calls(problem: _Problem) -> tuple[tuple[float, float], tuple[float, float]]:
-    """Evaluations, and flows: of the first step with what comes before it, and of the second."""
-    try:
-        return _counted_steps(problem, sees_flows=True)
-    except (AttributeError, TypeError, ValueError):
-        # The solver asks more of a field than a flow and a bracket.
-        evaluations, _ = _counted_steps(problem, sees_flows=False)
-        return evaluations, (np.nan, np.nan)
-
-
-def _counted_steps(
-    problem: _Problem, sees_flows: bool
-) -> tuple[tuple[float, float], tuple[float, float]]:
-    """Counted while the steps run: what a loop repeats cannot be seen in its trace."""
-    term, solver, t0, _, dt0, y0, args = problem
-    tally = _Tally()
-
-    def is_term(x: Any) -> bool:
-        # A sum of terms must be seen as one: solvers add its frozen fields themselves.
-        return isinstance(x, diffrax.AbstractTerm) and not isinstance(x, diffrax.MultiTerm)
-
-    term = jtu.tree_map(lambda t: _CountingTerm(t, tally, sees_flows), term, is_leaf=is_term)
-    step = eqx.filter_jit(functools.partial(solver.step, made_jump=False))
-    t1, t2 = t0 + dt0, t0 + 2 * dt0
-    state = eqx.filter_jit(solver.init)(term, t0, t1, y0, args)
-    y, _, _, state, _ = step(term, t0, t1, y0, args, state)
-    first = tally.read()
-    step(term, t1, t2, y, args, state)
-    later = tally.read()
-    return (first[0], later[0]), (first[1], later[1])
-
-
-class _Tally:
-    """Counts what happens while a program runs."""
-
-    def __init__(self):
-        self.counts = Counter()
-
-    def add(self, what: str) -> None:
-        jax.debug.callback(lambda: self.counts.update([what]))
-
-    def read(self) -> tuple[float, float]:
-        """Evaluations and flows since the last time."""
-        jax.effects_barrier()
-        counts = float(self.counts["evaluation"]), float(self.counts["flow"])
-        self.counts.clear()
-        return counts
-
-
-class _CountingTerm(diffrax.AbstractTerm):
-    term: diffrax.AbstractTerm
-    tally: _Tally = eqx.field(static=True)
-    sees_flows: bool = eqx.field(static=True)
-
-    def vf(self, t, y, args):
-        self.tally.add("evaluation")
-        value = self.term.vf(t, y, args)
-        has_field = any(map(is_field, jtu.tree_leaves(value, is_leaf=is_field)))
-        return _CountedField(value, self.tally) if self.sees_flows and has_field else value
-
-    def contr(self, t0, t1, **kwargs):
-        return self.term.contr(t0, t1, **kwargs)
-
-    def prod(self, vf, control):
-        return self.term.prod(vf, control)
-
-    def vf_prod(self, t, y, args, control):
-        self.tally.add("evaluation")
-        return self.term.vf_prod(t, y, args, control)
-
-
-class _CountedField(AbstractAlgebraElement):
-    """The field of a whole state, all of whose parts move in one flow."""
-
-    field: PyTree
-    tally: _Tally = eqx.field(static=True)
-
-    acts_on_subtree: ClassVar[bool] = True
-
-    def flow(self, point):
-        self.tally.add("flow")
-        return flow(self.field, point)
-
-    def tangent(self, point):
-        return tangent(self.field, point)
-
-    @classmethod
-    def combine(cls, weights, fields):
-        return cls(combine(weights, [f.field for f in fields]), fields[0].tally)
-
-    def bracket(self, other):
-        return type(self)(bracket(self.field, other.field), self.tally)
 
 
 # What the caller gives.

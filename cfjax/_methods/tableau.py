@@ -122,11 +122,6 @@ class Tableau:
         """
         return self.num_stages
 
-    @cached_property
-    def first_same_as_last(self) -> bool:
-        """Whether the embedded method or the continuous extension uses the field at the end."""
-        return any(map(self.uses_last, (self.embedded or (), *(self.continuous_extension or ()))))
-
     def uses_last(self, rows: Product) -> bool:
         """Whether the rows have a coefficient for the field at the end of the step."""
         return any(any(row[self.num_stages :]) for row in rows)

@@ -5,6 +5,7 @@ from typing import NamedTuple
 
 import jax
 import jax.numpy as jnp
+import numpy as np
 from jax import lax
 from jax.custom_batching import custom_vmap
 from jaxtyping import Array, Inexact
@@ -152,7 +153,7 @@ def _square(x: Array, s: Array) -> Array:
     return lax.cond(most > _WRITTEN_OUT, many, lambda x: x, x)
 
 
-def expm(a: Inexact[Array, "n n"]) -> Inexact[Array, "n n"]:
+def expm(a: Inexact[Array | np.ndarray, "n n"]) -> Inexact[Array, "n n"]:
     """The matrix exponential of `a`, for small dense matrices in loops, batches and derivatives.
 
     **Arguments:** `a`, shape `(n, n)`, float32, float64, complex64 or complex128.
@@ -172,15 +173,11 @@ def expm(a: Inexact[Array, "n n"]) -> Inexact[Array, "n n"]:
 
     **Raises:** `ValueError` if `a` is not a square matrix, `TypeError` for another dtype.
 
-    ??? cite "References"
-
-        The polynomials have the form of Sastre, "Efficient evaluation of matrix polynomials",
-        Linear Algebra and its Applications 539 (2018), and of Sastre and Ibáñez, "Efficient
-        evaluation of matrix polynomials beyond the Paterson-Stockmeyer method", Mathematics 9
-        (2021). Bounding the backward error by powers of a is from Al-Mohy and Higham, "A new
-        scaling and squaring algorithm for the matrix exponential", SIAM J. Matrix Anal. Appl. 31
-        (2009).
+    Source: the polynomials have the form of Sastre, Linear Algebra Appl. 539 (2018), and of Sastre
+    & Ibáñez, Mathematics 9 (2021). Bounding the backward error by powers of a is from Al-Mohy &
+    Higham, SIAM J. Matrix Anal. Appl. 31 (2009).
     """
+    a = jnp.asarray(a)
     weight, rest = expm_parts(a)
     return weight * (jnp.eye(a.shape[0], dtype=a.dtype) + a) + rest
 

@@ -7,42 +7,64 @@ from typing import NamedTuple
 
 import jax
 import jax.numpy as jnp
+import numpy as np
 from jax import lax
 from jaxtyping import Array, Float
 
 from .polynomial import polynomial
 
 
-@functools.partial(jax.custom_jvp, nondiff_argnums=(0,))
-def stumpff(n: int, s: Float[Array, "*batch"]) -> Float[Array, "*batch"]:
+def stumpff(n: int, s: Float[Array | np.ndarray, "*batch"]) -> Float[Array, "*batch"]:
     """The function `c_n(s) = sum_j (-s)^j / (n + 2j)!`, for `n >= 0` and `s >= 0`.
 
     With `s = x^2`: `c_0 = cos x`, `c_1 = sin x / x`, `c_2 = (1 - cos x) / x^2`, and
     `s c_{n+2} = 1/n! - c_n`. They are entire functions of s, with the derivatives
     `c_n' = (n c_{n+2} - c_{n+1}) / 2`. So every derivative is exact, at zero too.
 
+    Flows of rotations and rigid motions are made of them: with a the matrix of a cross product with
+    w and `s = w @ w`, `exp(a) = I + c_1 a + c_2 a^2` and `phi_1(a) = I + c_2 a + c_3 a^2`.
+
     The error is a few units of rounding of x: absolute in `x c_1` and `x^2 c_2`, relative for
     small x. So an x beyond 2^45 (2^16 in float32), which rounding leaves uncertain by a hundredth,
-    gives NaN, and so does one that is not finite. Works in float32 and float64.
+    gives NaN, and so does an s that is negative or not finite.
+
+    **Arguments:** `n`, a number; `s`, an array of any shape, float32 or float64.
+
+    **Returns:** an array like `s`.
+
+    **Raises** `TypeError` if `n` is not an int or `s` of another dtype, `ValueError` if `n` is
+    negative.
 
     Source: Stiefel & Scheifele, Linear and Regular Celestial Mechanics (1971), Section 11.
     """
+    if not isinstance(n, int) or isinstance(n, bool):
+        raise TypeError(f"n must be an int, got {n!r} of type {type(n).__name__}.")
+    if n < 0:
+        raise ValueError(f"n must be at least 0, got {n}.")
+    s = jnp.asarray(s)
+    if s.dtype not in (jnp.float32, jnp.float64):
+        raise TypeError(f"s must be float32 or float64, got {s.dtype}.")
+    return _stumpff(n, jnp.where(s >= 0, s, jnp.nan))
+
+
+@functools.partial(jax.custom_jvp, nondiff_argnums=(0,))
+def _stumpff(n: int, s: Float[Array, "*batch"]) -> Float[Array, "*batch"]:
     if n == 0:
-        return 1 - s * stumpff(2, s)
+        return 1 - s * _stumpff(2, s)
     if n <= 2:
         return stumpff_1_2(s)[n - 1]
     # The recursion loses digits to cancellation for small s, the series for large s.
     small = s < 16
     coefficients = [(-1) ** j / factorial(n + 2 * j) for j in range(18)]
     series = polynomial(coefficients, jnp.where(small, s, 0))
-    recursion = (1 / factorial(n - 2) - stumpff(n - 2, s)) / jnp.where(small, 1, s)
+    recursion = (1 / factorial(n - 2) - _stumpff(n - 2, s)) / jnp.where(small, 1, s)
     return jnp.where(small, series, recursion)
 
 
-@stumpff.defjvp
+@_stumpff.defjvp
 def _(n, primals, tangents):
     (s,), (s_dot,) = primals, tangents
-    return stumpff(n, s), (n * stumpff(n + 2, s) - stumpff(n + 1, s)) / 2 * s_dot
+    return _stumpff(n, s), (n * _stumpff(n + 2, s) - _stumpff(n + 1, s)) / 2 * s_dot
 
 
 def stumpff_1_2(s: Float[Array, "*batch"]) -> tuple[Float[Array, "*batch"], Float[Array, "*batch"]]:

@@ -86,7 +86,7 @@ class AbstractLieSolver(diffrax.AbstractSolver):
         return self
 
     def step(self, terms, t0, t1, y0, args, solver_state, made_jump):
-        lost, first, zero = (None, None, None) if solver_state is None else solver_state.parts()
+        lost, first, zero = solver_state.parts()
         if zero is not None:
             t0 = t0 + zero
         if first is not None and made_jump is not False:
@@ -132,9 +132,7 @@ class AbstractLieSolver(diffrax.AbstractSolver):
             jtu.tree_map(lambda _, pair: pair[k], lost, sums, is_leaf=_is_leaf)  # noqa: B023
             for k in range(2)
         )
-        if solver_state is not None:
-            solver_state = State(new_lost, last, solver_state.zero)
-        return y1, error, dict(path=path), solver_state, result_of(y1)
+        return y1, error, dict(path=path), State(new_lost, last, solver_state.zero), result_of(y1)
 
     def func(self, terms, t0, y0, args) -> Any:
         return terms.vf(t0, y0, args)

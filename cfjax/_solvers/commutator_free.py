@@ -4,6 +4,7 @@ import dataclasses
 from collections.abc import Sequence
 from typing import ClassVar, Literal
 
+import diffrax
 import equinox as eqx
 import jax.numpy as jnp
 import jax.tree_util as jtu
@@ -42,6 +43,8 @@ class AbstractCommutatorFree(AbstractLieSolver):
     that is first same as last carries the last field to the next step, for which a batch of small
     systems takes twice as long on CPU. `estimate=None` switches it off. (`cfjax.integrate` does.)
 
+    A class whose tableau has an embedded method is a `diffrax.AbstractAdaptiveSolver`.
+
     **Raises** `ValueError` for another `estimate`.
     """
 
@@ -59,7 +62,10 @@ class AbstractCommutatorFree(AbstractLieSolver):
 
     @property
     def first_same_as_last(self) -> bool:
-        return self.estimate is not None and self.tableau.first_same_as_last
+        tableau = self.tableau
+        if self.estimate is None or tableau.embedded is None:
+            return False
+        return any(map(tableau.uses_last, (tableau.embedded, *continuous_extension(tableau))))
 
     def order(self, terms) -> int:
         return order(self.tableau)
@@ -162,7 +168,7 @@ def _seen(
     return jnp.where(factor * factor * apart_square > error_square, other, error)
 
 
-class CommutatorFree(AbstractCommutatorFree):
+class CommutatorFree(AbstractCommutatorFree, diffrax.AbstractAdaptiveSolver):
     """The commutator-free method of a `cfjax.Tableau`.
 
     One step costs `tableau.num_evaluations` evaluations of the field and `tableau.num_flows`
@@ -171,6 +177,9 @@ class CommutatorFree(AbstractCommutatorFree):
     continuous extension, else by one that the order conditions decide, of order one below the
     method's but at most 4: for that a step evaluates the field at its end where the stages do not
     suffice.
+
+    It is a `diffrax.AbstractAdaptiveSolver` for every tableau, as a class cannot tell. diffrax
+    looks for the estimate itself, and refuses adaptive steps without one.
 
     **Raises** `TypeError` if `tableau` is not a `cfjax.Tableau`.
     """
@@ -188,7 +197,7 @@ class LieEuler(AbstractCommutatorFree):
     tableau: ClassVar[Tableau] = _tableau.LIE_EULER
 
 
-class CF2(AbstractCommutatorFree):
+class CF2(AbstractCommutatorFree, diffrax.AbstractAdaptiveSolver):
     """The midpoint rule. Order 2, 2 evaluations, 2 flows. Dense output of order 2.
 
     The estimate, with a step of `LieEuler`, costs 1 flow more.
@@ -197,7 +206,7 @@ class CF2(AbstractCommutatorFree):
     tableau: ClassVar[Tableau] = _tableau.CF2
 
 
-class CF3(AbstractCommutatorFree):
+class CF3(AbstractCommutatorFree, diffrax.AbstractAdaptiveSolver):
     """Celledoni, Marthinsen & Owren's method of order 3: 3 evaluations, 3 flows.
 
     The estimate, with an embedded method of order 2, costs 1 flow more. Dense output of order 2.
@@ -209,7 +218,7 @@ class CF3(AbstractCommutatorFree):
     tableau: ClassVar[Tableau] = _tableau.CF3
 
 
-class CF4(AbstractCommutatorFree):
+class CF4(AbstractCommutatorFree, diffrax.AbstractAdaptiveSolver):
     """Celledoni, Marthinsen & Owren's method of order 4: 4 evaluations, 5 flows.
 
     In a linear space this is the classical Runge-Kutta method. The choice for most problems.
@@ -225,7 +234,7 @@ class CF4(AbstractCommutatorFree):
     tableau: ClassVar[Tableau] = _tableau.CF4
 
 
-class CF43(AbstractCommutatorFree):
+class CF43(AbstractCommutatorFree, diffrax.AbstractAdaptiveSolver):
     """Order 4 with an embedded method of order 3: 6 evaluations, 6 flows, 1 more for the estimate.
 
     Its error constant is 15 times smaller than that of `CF4`, and it is stable for undamped
@@ -237,7 +246,7 @@ class CF43(AbstractCommutatorFree):
     tableau: ClassVar[Tableau] = _pairs.CF43
 
 
-class CF54(AbstractCommutatorFree):
+class CF54(AbstractCommutatorFree, diffrax.AbstractAdaptiveSolver):
     """Order 5 with an embedded method of order 4: 7 evaluations, 9 flows, 2 more for the estimate.
 
     Stable for undamped oscillations only up to 0.86 (decay: 3.95), so for these take `CF43` at
@@ -256,7 +265,7 @@ class CF54(AbstractCommutatorFree):
     tableau: ClassVar[Tableau] = _pairs.CF54
 
 
-class CG3(AbstractCommutatorFree):
+class CG3(AbstractCommutatorFree, diffrax.AbstractAdaptiveSolver):
     """Crouch & Grossman's method of order 3: 3 evaluations, 6 flows of single fields.
 
     The estimate, with an embedded method of order 2, costs 3 flows more. Dense output of order 2.

@@ -41,8 +41,10 @@ class Interpolation(diffrax.AbstractLocalInterpolation):
 class Path(eqx.Module):
     """The fields of a step, where it starts, and the continuous extension that they go into.
 
-    Arrays that occur several times are kept once: in fields on a common span most do. And the
-    fields stay on a common span only if its arrays are still the same.
+    Arrays that occur several times are kept once: of fields on a common span, every block of
+    columns is in all that came after it. Which are the same is seen from the objects: within one
+    trace, the same object is the same value, and a copy that is not seen costs memory only. What is
+    kept is put back in all its places, so fields on a common span know it as one again.
     """
 
     arrays: tuple[Array, ...]

@@ -5,6 +5,7 @@ from fractions import Fraction
 from operator import itemgetter
 from typing import Any, ClassVar
 
+import diffrax
 import jax.numpy as jnp
 import jax.tree_util as jtu
 from jax import lax
@@ -54,7 +55,9 @@ class AbstractLowStorage(AbstractCommutatorFree):
         value = field(0.0, y0)
         total, point = enter(value, y0, ())
         if jtu.tree_structure((total, point)) != jtu.tree_structure((value, y0)):
-            return super().move(lambda c, y: value if y is y0 else field(c, y), y0)
+            # The first stage is known.
+            known = [value]
+            return super().move(lambda c, y: known.pop() if known else field(c, y), y0)
 
         def stage(carry, coefficients):
             a, b, c = coefficients
@@ -109,7 +112,7 @@ class BWRRK33(AbstractLowStorage):
     tableau: ClassVar[Tableau] = _tableau(a, b)
 
 
-class BWRRK53(AbstractLowStorage):
+class BWRRK53(AbstractLowStorage, diffrax.AbstractAdaptiveSolver):
     """Order 3, 5 evaluations, 5 flows. The estimate, of order 2, costs nothing. Dense output
     of order 3.
 
@@ -133,7 +136,7 @@ class BWRRK53(AbstractLowStorage):
     tableau: ClassVar[Tableau] = _tableau(a, b, lambda rows: rows[:-1])
 
 
-class CK34(AbstractLowStorage):
+class CK34(AbstractLowStorage, diffrax.AbstractAdaptiveSolver):
     """Order 3, 4 evaluations, 4 flows. The estimate, of order 2, costs nothing. Dense output
     of order 3.
 
@@ -173,7 +176,7 @@ class CK54(AbstractLowStorage):
     tableau: ClassVar[Tableau] = _tableau(a, b)
 
 
-class Luscher3(AbstractLowStorage):
+class Luscher3(AbstractLowStorage, diffrax.AbstractAdaptiveSolver):
     """Order 3, 3 evaluations, 3 flows. The estimate, of order 2, costs 1 flow more, and two more
     copies of the state. Dense output of order 2.
 
@@ -226,7 +229,7 @@ class YRK135(AbstractLowStorage):
     tableau: ClassVar[Tableau] = _tableau(a, b)
 
 
-class CFEES25(AbstractLowStorage):
+class CFEES25(AbstractLowStorage, diffrax.AbstractAdaptiveSolver):
     """Order 2, 3 evaluations, 3 flows; a step back undoes it to order 5. The estimate, of order 1,
     costs 1 flow more, and one more copy of the state. Dense output of order 2.
 

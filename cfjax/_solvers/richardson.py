@@ -15,10 +15,11 @@ from jaxtyping import Array, PyTree
 class Richardson(diffrax.AbstractAdaptiveSolver, diffrax.AbstractWrappedSolver):
     """Any solver with an error estimate, by step doubling (Richardson extrapolation).
 
-    Every step is made twice: as one step, to `y1`, and as two halves, to `y2`, from which the
-    solver goes on. For a solver of order p the error of `y2` is `e = (y1 - y2) / (2^p - 1)`, up to
-    terms of higher order. The difference is taken in the ambient space: it is no tangent vector,
-    but on a manifold too it is of order `h^(p+1)`.
+    Every step is made twice: as one step, to `y1`, and as two halves, to `y2`. For a solver of
+    order p the error of `y2` is `e = (y1 - y2) / (2^p - 1)`, up to terms of higher order. The
+    solver goes on from `y2`, whose error it estimates; with `as_in_paper` from `y1`, see there. The
+    difference is taken in the ambient space: it is no tangent vector, but on a manifold too it is
+    of order `h^(p+1)`.
 
     A tolerance for `e` would be one for each step, and tighter tolerances take more steps: the
     error at the end over the tolerance would grow like `tol^(-1/(p+1))`. So the estimate is that
@@ -42,7 +43,8 @@ class Richardson(diffrax.AbstractAdaptiveSolver, diffrax.AbstractWrappedSolver):
     - `solver`: a diffrax solver for ordinary differential equations, of known order. An implicit
       one solves its equations with the controller's tolerances.
     - `as_in_paper`: whether to go on from `y1` with `e` itself, as the paper does, for its tables.
-      The error of a step is then `2^p` times the estimate.
+      The estimate is then that of a point which the solver does not take: the error of a step is
+      `2^p` times as large.
 
     With `as_in_paper` the paper's controller is, but for one point,
 

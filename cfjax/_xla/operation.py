@@ -324,6 +324,10 @@ def _evaluate(jaxpr: Jaxpr, eqn: JaxprEqn, values: Sequence[Any]) -> Sequence[An
     return evaluate(jaxpr, eqn, values)
 
 
+# Where newer versions of JAX put types of their own within, they take them out first.
+operation_p.to_lojax = lambda *operands, program, kind: jaxpr_as_fun(program)(*operands)
+
+
 def _is_inexact(x: Array) -> bool:
     return jnp.issubdtype(x.dtype, jnp.inexact)
 

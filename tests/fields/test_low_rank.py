@@ -171,7 +171,7 @@ Y0 = jnp.asarray(frame(8, 2))
 
 def one_step(solver, field, y0, t0=0.2, h=0.3):
     term = cfjax.LieTerm(field)
-    step = lambda y, args: solver.step(term, t0, t0 + h, y, args, None, made_jump=False)[0]  # noqa: E731
+    step = lambda y, args: problems.first_step(solver, term, t0, t0 + h, y, args)[0]  # noqa: E731
     return jax.jit(step)(y0, ARGS)
 
 
@@ -433,7 +433,7 @@ def test_a_point_off_the_manifold_gives_nan(cls):
     term = cfjax.LieTerm(lambda t, y, args: cls(y))
 
     def step(y):
-        return cfjax.CF4().step(term, 0.0, 0.1, jnp.asarray(y), None, None, made_jump=False)[0]
+        return problems.first_step(cfjax.CF4(), term, 0.0, 0.1, jnp.asarray(y), None)[0]
 
     # Rounded to two digits it is moved to the nearest point, up to second order of 1e-2.
     near = step(np.round(frame(6, 2), 2))

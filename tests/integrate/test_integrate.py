@@ -124,7 +124,7 @@ def test_one_step_is_one_step():
     @jax.jit
     def step(y):
         time = jnp.asarray(0.2), jnp.asarray(0.5)
-        return cfjax.CF4().step(TERM, *time, y, ARGS, None, made_jump=False)[0]
+        return problems.first_step(cfjax.CF4(), TERM, *time, y, ARGS)[0]
 
     sol = cfjax.integrate(TERM, cfjax.CF4(), 0.2, 0.5, Y0, ARGS, num_steps=1)
     assert sol.ys is not None

@@ -186,13 +186,12 @@ def test_crouch_grossman():
 def test_what_an_embedded_method_costs(name, embedded_flows, last):
     tableau = NAMED[name]
     assert tableau.num_embedded_flows == embedded_flows
-    assert tableau.first_same_as_last is last
+    assert tableau.uses_last(tableau.embedded) is last
     assert tableau.embedded_method.alpha[-1][0][: tableau.num_stages] == tableau.beta[0]
 
 
 def test_without_an_embedded_method_there_is_no_method():
     assert CG4.embedded_method is None and CG4.num_embedded_flows == 0
-    assert not CG4.first_same_as_last
 
 
 @pytest.mark.parametrize(

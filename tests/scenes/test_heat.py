@@ -161,7 +161,7 @@ def test_a_step_costs_eight_transforms():
     y0, args = jnp.asarray(heat.y0(300)), arguments(300)
 
     def step(y):
-        return cfjax.CF4().step(COEFFICIENTS, 0.0, 0.01, y, args, None, made_jump=False)[0]
+        return problems.first_step(cfjax.CF4(), COEFFICIENTS, 0.0, 0.01, y, args)[0]
 
     text = jax.jit(step).lower(y0).compile().as_text()
     assert text is not None and text.count(" fft(") == 8

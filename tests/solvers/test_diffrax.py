@@ -44,12 +44,15 @@ def by_steps(solver, times, y0=Y0, args=ARGS, field=problems.driven_body) -> Any
 
 @eqx.filter_jit
 def _by_steps(solver, times, y0, args, field):
-    def step(y, interval):
-        term = cfjax.LieTerm(field)
-        y1 = solver.step(term, *interval, y, args, None, made_jump=False)[0]
-        return y1, y1
+    term = cfjax.LieTerm(field)
 
-    _, ys = jax.lax.scan(step, y0, (times[:-1], times[1:]))
+    def step(carry, interval):
+        y, state = carry
+        y1, _, _, state, _ = solver.step(term, *interval, y, args, state, made_jump=False)
+        return (y1, state), y1
+
+    state = solver.init(term, times[0], times[1], y0, args)
+    _, ys = jax.lax.scan(step, (y0, state), (times[:-1], times[1:]))
     return jtu.tree_map(lambda first, rest: jnp.concatenate([first[None], rest]), y0, ys)
 
 

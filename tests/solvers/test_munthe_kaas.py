@@ -107,7 +107,7 @@ def test_the_order_is_the_tableaus(tableau, order):
 def one_step(solver, field, y0, t0=0.3, h=0.25, args=None, term=cfjax.LieTerm):
     @jax.jit
     def step(t0, t1, y0, args):
-        return solver.step(term(field), t0, t1, y0, args, None, made_jump=False)[0]
+        return problems.first_step(solver, term(field), t0, t1, y0, args)[0]
 
     return step(jnp.asarray(t0), jnp.asarray(t0 + h), problems.arrays(y0), problems.arrays(args))
 
@@ -226,7 +226,7 @@ def test_a_constant_field_is_followed_exactly(name):
     def step(h):
         term = cfjax.LieTerm(lambda t, y, args: cfjax.LeftMatrix(args))
         y0, args = jnp.eye(4), jnp.asarray(a)
-        return METHODS[name].step(term, 0 * h, h, y0, args, None, made_jump=False)[0]
+        return problems.first_step(METHODS[name], term, 0 * h, h, y0, args)[0]
 
     for h in (0.0, 0.25, -1.0, 8.0):
         # Brackets of an element with its multiples vanish up to rounding: |h a|^2 eps, and up to
@@ -270,7 +270,10 @@ def test_the_last_stage_is_at_the_end_exactly(name, stages):
 
     # Not a short vector, so the step runs operation by operation and the times are numbers.
     y0, time = jnp.ones((7, 7)), (jnp.asarray(t0), jnp.asarray(t1))
-    solver.step(cfjax.LieTerm(field), *time, y0, None, None, made_jump=False)
+    term = cfjax.LieTerm(field)
+    state = solver.init(term, *time, y0, None)
+    times.clear()
+    solver.step(term, *time, y0, None, state, made_jump=False)
     assert times[0] == t0
     assert max(times) <= t1
     assert times.count(t1) == stages
@@ -297,37 +300,37 @@ class Counting(cfjax.AbstractAlgebraElement):
         return type(self)(jnp.zeros_like(self.v), self.counts)
 
 
-@pytest.mark.parametrize(
-    "name, evaluations, flows, brackets",
-    [("RKMK3", 3, 3, 1), ("RKMK4", 4, 4, 2), ("Heun", 2, 2, 0), ("Bosh3", 3, 3, 2)],
-)
-@pytest.mark.parametrize("shape", [(3,), (4, 4)])
-def test_a_step_costs_what_its_docstring_says(name, evaluations, flows, brackets, shape):
-    counts = {"evaluations": 0, "flows": 0, "brackets": 0}
+def count_step(solver, y):
+    counts = dict(evaluations=0, flows=0, brackets=0)
 
     def field(t, y, args):
         counts["evaluations"] += 1
         return Counting(-y, counts)
 
     def step(y):
-        time = jnp.asarray(0.0), jnp.asarray(0.1)
-        return METHODS[name].step(cfjax.LieTerm(field), *time, y, None, None, False)[0]
+        term, time = cfjax.LieTerm(field), (jnp.asarray(0.0), jnp.asarray(0.1))
+        state = solver.init(term, *time, y, None)
+        counts.update(evaluations=0, flows=0, brackets=0)
+        return solver.step(term, *time, y, None, state, made_jump=False)[0]
 
-    jax.eval_shape(step, jnp.ones(shape))
+    jax.eval_shape(step, y)
+    return counts
+
+
+@pytest.mark.parametrize(
+    "name, evaluations, flows, brackets",
+    [("RKMK3", 3, 3, 1), ("RKMK4", 4, 4, 2), ("Heun", 2, 2, 0), ("Bosh3", 3, 3, 2)],
+)
+@pytest.mark.parametrize("shape", [(3,), (4, 4)])
+def test_a_step_costs_what_its_docstring_says(name, evaluations, flows, brackets, shape):
+    counts = count_step(METHODS[name], jnp.ones(shape))
     assert counts == {"evaluations": evaluations, "flows": flows, "brackets": brackets}
 
 
 @pytest.mark.parametrize("name", ["Dopri5", "Tsit5"])
 def test_a_method_of_order_five_keeps_within_its_brackets(name):
     """`(s - 1)(q - 2)` at most, and no evaluation for a stage without weight."""
-    counts = {"evaluations": 0, "flows": 0, "brackets": 0}
-
-    def field(t, y, args):
-        counts["evaluations"] += 1
-        return Counting(-y, counts)
-
-    time = jnp.asarray(0.0), jnp.asarray(0.1)
-    METHODS[name].step(cfjax.LieTerm(field), *time, jnp.ones((4, 4)), None, None, False)
+    counts = count_step(METHODS[name], jnp.ones((4, 4)))
     assert counts["evaluations"] == 6
     assert counts["flows"] == 6
     assert counts["brackets"] <= 5 * 3

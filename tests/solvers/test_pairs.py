@@ -37,7 +37,7 @@ def one_step(solver, field, y0, h, args=None, t0=0.3) -> Any:
     @jax.jit
     def step(y0, h):
         times = jnp.asarray(t0), jnp.asarray(t0) + h
-        return solver.step(cfjax.LieTerm(field), *times, y0, args, None, made_jump=False)[:2]
+        return problems.first_step(solver, cfjax.LieTerm(field), *times, y0, args)[:2]
 
     return step(problems.arrays(y0), jnp.asarray(h))
 

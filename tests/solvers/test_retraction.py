@@ -56,7 +56,7 @@ def test_a_step_is_rk4_in_the_tangent_space():
     k4 = rate(t + h, h * k3)
     expected = cayley(a_of(h * (k1 + 2 * k2 + 2 * k3 + k4) / 6)) @ Q
     term = cfjax.LieTerm(low_rank)
-    step = jax.jit(lambda y: cfjax.CayleyRK4().step(term, t, t + h, y, None, None, False)[0])
+    step = jax.jit(lambda y: problems.first_step(cfjax.CayleyRK4(), term, t, t + h, y, None)[0])
     # Small solves of condition 10.
     np.testing.assert_allclose(step(jnp.asarray(Q)), expected, rtol=0, atol=1e-13)
 

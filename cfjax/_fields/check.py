@@ -1,0 +1,228 @@
+"""Whether frozen fields keep what `AbstractFrozenField` promises, by numbers."""
+
+from collections.abc import Sequence
+from operator import itemgetter
+from typing import Any
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import jax.tree_util as jtu
+import numpy as np
+from jax import lax
+from jaxtyping import PyTree
+
+from .._field import AbstractAlgebraElement, AbstractFrozenField, combine, describe, flow
+from .._term import checked_part
+
+# What is compared: the text of the promise, what was found, what is expected, and a size whose
+# rounding the difference may have.
+_Facts = list[tuple[str, PyTree, PyTree, Any]]
+
+
+def check_field(fields: Sequence[AbstractFrozenField], point: PyTree) -> None:
+    """Checks by numbers that fields of a class of one's own are what the methods take them for.
+
+    For a test of the class. It compares, at one point:
+
+    - `flow` and `tangent` return what is shaped like the point;
+    - the flow of the zero field is the identity, that of 0.4 of a field after 0.6 of it is that of
+      the whole, and `tangent` is its derivative at time zero;
+    - `combine` is linear: the tangent of a sum is the sum of the tangents;
+    - `displacement`, if offered, is `flow(point) - point`; `enter` and `leave` lead back to the
+      point and to the same flow; and where `defect` says how far a point is off the manifold, the
+      flow stays on it;
+    - for algebra elements, `[a, b]` has the sign and the size that `cfjax.AbstractAlgebraElement`
+      says: its tangent is `DX_a X_b - DX_b X_a`, with the tangents of a and b as functions of the
+      point. This is compared for `[a, b]`, for `[b, a]` and for the bracket of `[a, b]` with the
+      last field, so the bracket is antisymmetric and obeys Jacobi's identity.
+
+    All derivatives are those of JAX and none a difference quotient, so what is compared differs by
+    rounding only. The tolerance is half of the digits, relative to the point and to what is
+    compared: a mistake is far larger, and a flow that loses some digits passes.
+
+    **Arguments:**
+
+    - `fields`: at least two frozen fields of one class, with coordinates of about size one and
+      without special relations, such as random ones: else a mistake may cancel. Where a class
+      carries structure, such as a spectrum, all have the same.
+    - `point`: a point on the manifold, of about size one: an array, or the part of the state that
+      a class with `acts_on_subtree` acts on. float32, float64 or complex.
+
+    **Raises** `TypeError` or `ValueError` for arguments that are something else; `ValueError` with
+    the first promise that is not kept, and by how much.
+    """
+    point = jtu.tree_map(jnp.asarray, point)
+    _check_arguments(fields, point)
+    name = type(fields[0]).__name__
+    for field in fields:
+        checked_part("point", field, point)
+        eqx.filter_eval_shape(flow, field, point)
+
+    entered, start = [], point
+    for field in fields:
+        field, start = field.enter(start, entered)
+        entered.append(field)
+    unit = float(np.sqrt(max(jnp.finfo(leaf.dtype).eps for leaf in jtu.tree_leaves(point))))
+
+    _compare(name, _of_start(fields[0], entered[0], start, point), unit)
+    for given, field in zip(fields, entered, strict=True):
+        _compare(name, _of_flow(given, field, entered[0], start, point), unit)
+    _compare(name, _of_sum(fields, entered, start), unit)
+    if all(isinstance(field, AbstractAlgebraElement) for field in entered):
+        _compare(name, _of_bracket(entered, start), unit)
+
+
+def _check_arguments(fields: Any, point: PyTree) -> None:
+    if not isinstance(fields, Sequence) or len(fields) < 2:
+        raise TypeError(
+            "fields must be a sequence of at least two frozen fields of one class, got "
+            f"{describe(fields)}."
+        )
+    is_one_class = isinstance(fields[0], AbstractFrozenField) and len(set(map(type, fields))) == 1
+    if not is_one_class:
+        names = ", ".join(type(field).__name__ for field in fields)
+        raise TypeError(f"fields must be frozen fields of one class, got {names}.")
+    for path, leaf in jtu.tree_leaves_with_path(point):
+        if not jnp.issubdtype(leaf.dtype, jnp.inexact):
+            raise TypeError(
+                f"point{jtu.keystr(path)} must be floating or complex, got {leaf.dtype}."
+            )
+    defect = type(fields[0]).defect(point)
+    if defect is not None and not defect[0] < np.sqrt(jnp.finfo(defect[0].dtype).eps):
+        raise ValueError(f"point must have {defect[1]}, and is off by {float(defect[0]):.1g}.")
+
+
+@eqx.filter_jit
+def _of_start(given: Any, field: Any, start: Any, point: PyTree) -> _Facts:
+    here, end = field.leave(start), given.flow(point)
+    entered = field.leave(field.flow(start))
+    size = _size((point, end))
+    facts: _Facts = [
+        ("enter and leave must lead back to the point", here, point, size),
+        ("flow must be the same before and after enter", end, entered, size),
+    ]
+    defect = type(given).defect(end)
+    if defect is not None:
+        facts.append((f"flow must keep {defect[1]}", defect[0], jnp.zeros_like(defect[0]), 1))
+    return facts
+
+
+@eqx.filter_jit
+def _of_flow(given: Any, field: Any, first: Any, start: Any, point: PyTree) -> _Facts:
+    def moved(t: Any, start: Any) -> Any:
+        return type(field).combine((t,), (field,)).flow(start)
+
+    here = first.leave(start)
+    # In the precision of the point, which is that of the field.
+    times = jnp.asarray([0.0, 0.6, 1.0], jnp.finfo(jtu.tree_leaves(here)[0].dtype).dtype)
+    # In a loop, so that the flow is compiled once.
+    ends = lax.map(lambda t: moved(t, start), times)
+    at_zero, before, end = (jtu.tree_map(itemgetter(k), ends) for k in range(3))
+    end = first.leave(end)
+    velocity = jax.jvp(lambda t: first.leave(moved(t, start)), (0 * times[0],), (times[2],))[1]
+    tangent = given.tangent(here)
+    displacement = given.displacement(point)
+    facts: _Facts = [
+        (
+            "flow of the zero field must be the identity",
+            first.leave(at_zero),
+            here,
+            _size(here),
+        ),
+        (
+            "tangent must be the derivative of the flow at time zero",
+            tangent,
+            velocity,
+            _size((here, tangent, velocity)),
+        ),
+        (
+            "flow of 0.4 of a field after 0.6 of it must be that of the whole field",
+            first.leave(moved(0.4, before)),
+            end,
+            _size((here, end)),
+        ),
+    ]
+    if displacement is not None:
+        expected = jtu.tree_map(jnp.subtract, given.flow(point), point)
+        promise = "displacement must be flow(point) - point"
+        facts.append((promise, displacement, expected, _size((point, expected))))
+    return facts
+
+
+@eqx.filter_jit
+def _of_sum(fields: Sequence[Any], entered: Sequence[Any], start: Any) -> _Facts:
+    here = entered[0].leave(start)
+    weights = [0.7 * (-0.6) ** k for k in range(len(fields))]
+    parts = [field.tangent(here) for field in fields]
+    # Translations are added without the class's help.
+    expected = combine(weights, parts)
+    size = _size((here, parts))
+    return [
+        (
+            f"combine must be linear {what}: the tangent of a sum must be the sum of the tangents",
+            type(summed[0]).combine(weights, summed).tangent(here),
+            expected,
+            size,
+        )
+        for what, summed in [("in the fields", fields), ("in what has entered", entered)]
+    ]
+
+
+@eqx.filter_jit
+def _of_bracket(entered: Sequence[Any], start: Any) -> _Facts:
+    here = entered[0].leave(start)
+    a, b, c = entered[0], entered[1], entered[-1]
+    ab = a.bracket(b)
+    facts: _Facts = []
+    for what, x, y, found in [
+        ("[a, b]", a, b, ab),
+        ("[b, a]", b, a, b.bracket(a)),
+        ("[[a, b], c]", ab, c, ab.bracket(c)),
+    ]:
+        # How each tangent changes along the other.
+        parts = [jax.jvp(p.tangent, (here,), (q.tangent(here),))[1] for p, q in [(x, y), (y, x)]]
+        expected, tangent = jtu.tree_map(jnp.subtract, *parts), found.tangent(here)
+        promise = (
+            f"bracket must have the sign and size of AbstractAlgebraElement (ab - ba for matrices "
+            f"that act from the left), here {what}"
+        )
+        facts.append((promise, tangent, expected, _size((here, tangent, parts))))
+    return facts
+
+
+def _size(x: PyTree) -> Any:
+    return sum(jnp.max(jnp.abs(leaf), initial=0) for leaf in jtu.tree_leaves(x))
+
+
+def _compare(name: str, facts: _Facts, unit: float) -> None:
+    for promise, found, expected, size in facts:
+        a, b = (
+            np.concatenate([np.ravel(leaf) for leaf in jtu.tree_leaves(x)])
+            for x in (found, expected)
+        )
+        atol = unit * float(size)
+        # False for NaN.
+        if np.all(np.abs(a - b) <= atol):
+            continue
+        raise ValueError(f"{name}.{promise}, but {_difference(a, b, atol)}")
+
+
+def _difference(found: np.ndarray, expected: np.ndarray, atol: float) -> str:
+    if not np.all(np.isfinite(expected)):
+        return (
+            "what is expected is not finite. A flow must be smooth at the zero field, as it is "
+            "with cfjax.stumpff."
+        )
+    if not np.all(np.isfinite(found)):
+        return "it is not finite."
+    square = np.vdot(expected, expected).real
+    factor = np.vdot(expected, found).real / square if square > 0 else 0.0
+    if abs(factor) > 0.01 and np.abs(found - factor * expected).max() <= max(1, abs(factor)) * atol:
+        if abs(factor + 1) < 0.01:
+            return "it has the opposite sign."
+        return f"it is {factor:.3g} times what is expected."
+    return (
+        f"it is off by {np.abs(found - expected).max():.1g}, with entries of up to "
+        f"{np.abs(expected).max():.1g} expected and {atol:.0g} allowed for rounding."
+    )

@@ -1,0 +1,249 @@
+"""`check_field`: every class of the package passes, and every planted mistake is named."""
+
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+import cfjax
+from cfjax import AbstractAlgebraElement, AbstractFrozenField
+
+RNG = np.random.default_rng(5)
+
+
+def random(dtype: Any, *shape: int) -> jax.Array:
+    x = RNG.standard_normal(shape)
+    if np.issubdtype(dtype, np.complexfloating):
+        x = x + 1j * RNG.standard_normal(shape)
+    return jnp.asarray(x.astype(dtype))
+
+
+def frame(dtype: Any, n: int, p: int) -> jax.Array:
+    return jnp.asarray(np.linalg.qr(RNG.standard_normal((n, p)))[0].astype(dtype))
+
+
+SPECTRUM = RNG.standard_normal(4)
+F32, F64, C64 = np.float32, np.float64, np.complex64
+BUILT_IN: dict[str, tuple[Any, Any]] = {
+    "Rotation": (lambda: cfjax.Rotation(random(F64, 3)), random(F64, 3, 2)),
+    "Rotation, float32": (lambda: cfjax.Rotation(random(F32, 3)), random(F32, 3)),
+    "LeftMatrix": (lambda: cfjax.LeftMatrix(random(C64, 2, 2)), random(C64, 2, 3)),
+    "RightMatrix": (lambda: cfjax.RightMatrix(random(F64, 2, 2)), random(F64, 2)),
+    "Affine": (
+        lambda: cfjax.Affine(random(F32), random(F32, 4), SPECTRUM.astype(F32)),
+        random(F32, 4),
+    ),
+    "Affine, transform": (
+        lambda: cfjax.Affine(random(F64), random(F64, 4), SPECTRUM, cfjax.SineTransform()),
+        random(F64, 4),
+    ),
+    "LowRankSkew": (lambda: cfjax.LowRankSkew(random(F64, 5, 2)), frame(F64, 5, 2)),
+    "BorderedSkew": (lambda: cfjax.BorderedSkew(random(F32, 5, 2)), frame(F32, 5, 2)),
+}
+
+
+@pytest.mark.parametrize("name", BUILT_IN)
+def test_every_class_of_the_package_passes(name):
+    make, point = BUILT_IN[name]
+    cfjax.check_field([make(), make()], point)
+
+
+def test_three_fields():
+    cfjax.check_field([cfjax.Rotation(random(F64, 3)) for _ in range(3)], random(F64, 3))
+
+
+class Line(AbstractAlgebraElement):
+    """Affine maps of a line, for each entry: the smallest algebra that does not commute."""
+
+    a: jax.Array
+    b: jax.Array
+
+    def flow(self, point):
+        # phi_1(a) is 1 at zero. The series is that of a few terms more than float64 needs.
+        phi = sum(self.a**k / float(np.prod(np.arange(1.0, k + 2))) for k in range(25))
+        return jnp.exp(self.a) * point + phi * self.b
+
+    def tangent(self, point):
+        return self.a * point + self.b
+
+    def bracket(self, other):
+        return type(self)(0 * self.a, self.a * other.b - other.a * self.b)
+
+
+def fields_of(cls):
+    return [cls(random(F64, 2), random(F64, 2)) for _ in range(3)]
+
+
+POINT = random(F64, 2)
+
+
+def test_a_field_of_a_users_own():
+    cfjax.check_field(fields_of(Line), POINT)
+
+
+def opposite_bracket(self, other):
+    return type(self)(0 * self.a, other.a * self.b - self.a * other.b)
+
+
+def double_bracket(self, other):
+    return type(self)(0 * self.a, 2 * (self.a * other.b - other.a * self.b))
+
+
+def other_bracket(self, other):
+    return type(self)(0 * self.a, self.a * self.b * other.a)
+
+
+def symmetric_bracket(self, other):
+    return type(self)(0 * self.a, self.a * other.b + other.a * self.b)
+
+
+def doubled(cls, weights, fields):
+    return cls(*(2 * sum(w * x for w, x in zip(weights, xs, strict=True)) for xs in ab(fields)))
+
+
+def structured(cls, weights, fields):
+    """As for a field whose a is structure, which it is not here."""
+    _, bs = ab(fields)
+    return cls(fields[0].a, sum(w * b for w, b in zip(weights, bs, strict=True)))
+
+
+def ab(fields):
+    return [f.a for f in fields], [f.b for f in fields]
+
+
+MISTAKES = {
+    "opposite bracket": (dict(bracket=opposite_bracket), r"bracket must .*, here \[a, b\], but it"),
+    "opposite sign": (dict(bracket=opposite_bracket), r"but it has the opposite sign\."),
+    "twice": (dict(bracket=double_bracket), r"but it is 2 times what is expected\."),
+    "other": (dict(bracket=other_bracket), r"bracket must .* but it is off by"),
+    "symmetric": (dict(bracket=symmetric_bracket), r"bracket must .* but it is off by"),
+    "tangent of half": (
+        dict(tangent=lambda self, point: (self.a * point + self.b) / 2),
+        r"tangent must be the derivative of the flow .* but it is 0\.5 times what is expected",
+    ),
+    "tangent without a part": (
+        dict(tangent=lambda self, point: self.a * point),
+        r"tangent must be the derivative of the flow at time zero, but it is off by",
+    ),
+    "Euler": (
+        dict(flow=lambda self, point: point + self.a * point + self.b),
+        r"flow of 0\.4 of a field after 0\.6 of it must be that of the whole field",
+    ),
+    "not at rest": (
+        dict(flow=lambda self, point: Line.flow(self, point) + 1e-3),
+        r"flow of the zero field must be the identity, but",
+    ),
+    "no derivative": (
+        dict(flow=lambda self, point: point + jnp.sqrt(self.b * self.b)),
+        r"what is expected is not finite\. .* cfjax\.stumpff",
+    ),
+    "displacement": (
+        dict(displacement=lambda self, point: self.flow(point)),
+        r"displacement must be flow\(point\) - point",
+    ),
+    "sum of twice": (dict(combine=classmethod(doubled)), "tangent must be the derivative"),
+    "structure that is a coordinate": (
+        dict(combine=classmethod(structured)),
+        "flow of the zero field must be the identity",
+    ),
+    "enter": (
+        dict(enter=lambda self, point, earlier: (self, point + 0.01)),
+        "enter and leave must lead back to the point",
+    ),
+    "defect": (
+        dict(defect=classmethod(lambda cls, p: (abs(p @ p - POINT @ POINT), "the start's length"))),
+        "flow must keep the start's length",
+    ),
+    "shape": (
+        dict(flow=lambda self, point: point[:1]),
+        r"flow must return what is shaped like its point, f64\[2\], got f64\[1\]",
+    ),
+    "dtype of the tangent": (
+        dict(tangent=lambda self, point: point.astype(jnp.float32)),
+        r"Its tangent is f32\[2\]",
+    ),
+}
+
+
+@pytest.mark.parametrize("mistake", MISTAKES)
+def test_a_planted_mistake_is_named(mistake):
+    overrides, message = MISTAKES[mistake]
+    with pytest.raises(ValueError, match=message):
+        cfjax.check_field(fields_of(type("Planted", (Line,), overrides)), POINT)
+
+
+def test_a_transposed_tangent_is_found():
+    class Transposed(cfjax.Rotation):
+        def tangent(self, point):
+            return -super().tangent(point)
+
+    fields = [Transposed(random(F64, 3)) for _ in range(2)]
+    with pytest.raises(ValueError, match=r"Transposed\.tangent must be .* the opposite sign"):
+        cfjax.check_field(fields, random(F64, 3))
+
+
+# A class that acts on a subtree.
+
+
+class Pair(AbstractFrozenField):
+    acts_on_subtree = True
+    rate: jax.Array
+
+    def flow(self, point):
+        return {"x": point["x"] + self.rate * point["y"], "y": point["y"]}
+
+    def tangent(self, point):
+        return {"x": self.rate * point["y"], "y": jnp.zeros_like(point["y"])}
+
+
+PAIR = {"x": random(F64, 2), "y": random(F64, 2)}
+
+
+def test_a_subtree():
+    cfjax.check_field([Pair(random(F64)), Pair(random(F64))], PAIR)
+
+
+def test_a_forgotten_acts_on_subtree_is_named():
+    forgetful = type("Forgetful", (Pair,), {"acts_on_subtree": False})
+    fields = [forgetful(random(F64)), forgetful(random(F64))]
+    message = r"acts on one array.* write `acts_on_subtree = True` in the class"
+    with pytest.raises(TypeError, match=message):
+        cfjax.check_field(fields, PAIR)
+    term = cfjax.LieTerm(lambda t, y, args: fields[0])
+    with pytest.raises(TypeError, match=message):
+        cfjax.integrate(term, cfjax.CF4(), 0.0, 1.0, PAIR, num_steps=1)
+
+
+def test_an_annotated_acts_on_subtree_is_named():
+    with pytest.raises(TypeError, match=r"Annotated\.acts_on_subtree .* `acts_on_subtree = True`"):
+
+        class Annotated(Pair):
+            acts_on_subtree: bool = True  # pyright: ignore[reportIncompatibleVariableOverride]
+
+
+@pytest.mark.parametrize(
+    "fields, point, error, message",
+    [
+        (Line(POINT, POINT), POINT, TypeError, "fields must be a sequence of at least two"),
+        ([Line(POINT, POINT)], POINT, TypeError, "fields must be a sequence of at least two"),
+        ([POINT, POINT], POINT, TypeError, "fields must be frozen fields of one class, got Arr"),
+        (
+            [Line(POINT, POINT), cfjax.Rotation(np.ones(3))],
+            POINT,
+            TypeError,
+            "of one class, got Line, Rotation",
+        ),
+        ([Line(POINT, POINT)] * 2, np.ones(2, int), TypeError, "point must be floating or comp"),
+        (
+            [cfjax.BorderedSkew(np.ones((3, 1)))] * 2,
+            np.ones((3, 1)),
+            ValueError,
+            "point must have orthonormal columns .*, and is off by 2",
+        ),
+    ],
+)
+def test_wrong_arguments(no_shape_hook, fields, point, error, message):
+    with pytest.raises(error, match=message):
+        cfjax.check_field(fields, point)
