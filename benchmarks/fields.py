@@ -174,15 +174,7 @@ def compiled(program: Callable[..., Any], systems: int) -> Callable[[], Any]:
         state = jax.tree.map(lambda x: x[0], state)
     else:
         program = jax.vmap(program, in_axes=(0, None))
-    executable = jax.jit(program).lower(state, inertia).compile()
-
-    def run():
-        # A solve of a single system is too short for the clock.
-        for _ in range(REPEATS[systems] - 1):
-            jax.block_until_ready(executable(state, inertia))
-        return executable(state, inertia)
-
-    return run
+    return results.compiled(program, state, inertia, repeats=REPEATS[systems])
 
 
 def measure(quick: bool) -> Iterator[results.Row]:

@@ -38,7 +38,9 @@ def measure(quick: bool) -> Iterator[results.Row]:
             batch = {"C": _c_batch(library), **batch}
         for systems, programs, steps in ((1, single, STEPS), (BATCH, batch, BATCH * BATCH_STEPS)):
             base = "C" if library is not None else "diffrax, Tsit5"
-            times = _take_turns(programs, rounds=5 if quick else 25)
+            runs = list(programs.values())
+            rounds = take_turns(runs, repeats=3 if quick else 25)
+            times = dict(zip(programs, rounds, strict=True))
             for name, seconds in times.items():
                 yield {
                     "program": name,
@@ -86,7 +88,7 @@ def _single_programs() -> dict[str, Callable[[], object]]:
         "diffrax, Tsit5": lambda y, i: _solve(ode, diffrax.Tsit5(), y, i, STEPS),
         "diffrax, Dopri5": lambda y, i: _solve(ode, diffrax.Dopri5(), y, i, STEPS),
     }
-    return {name: _compiled(program, y0, inertia) for name, program in programs.items()}
+    return {name: results.compiled(program, y0, inertia) for name, program in programs.items()}
 
 
 def _batch_programs() -> dict[str, Callable[[], object]]:
@@ -108,12 +110,7 @@ def _batch_programs() -> dict[str, Callable[[], object]]:
         "diffrax, Tsit5": vmap(lambda y, i: _solve(ode, diffrax.Tsit5(), y, i, n)),
         "diffrax, Dopri5": vmap(lambda y, i: _solve(ode, diffrax.Dopri5(), y, i, n)),
     }
-    return {name: _compiled(program, y0, inertia) for name, program in programs.items()}
-
-
-def _compiled(program, *args) -> Callable[[], object]:
-    executable = jax.jit(program).lower(*args).compile()
-    return lambda: jax.block_until_ready(executable(*args))
+    return {name: results.compiled(program, y0, inertia) for name, program in programs.items()}
 
 
 def _compile_c(folder: Path) -> ctypes.CDLL | None:
@@ -163,12 +160,6 @@ def _check(c, ours) -> None:
     # Both make the same steps; what differs is rounding, which the flow lets grow with time.
     if not np.allclose(c, ours, atol=1e-9, rtol=0):
         raise RuntimeError(f"C and cfjax disagree: {c} and {ours}.")
-
-
-def _take_turns(programs: dict[str, Callable[[], object]], rounds: int) -> dict[str, np.ndarray]:
-    for program in programs.values():
-        program()  # warm-up
-    return dict(zip(programs, take_turns(list(programs.values()), repeats=rounds), strict=True))
 
 
 if __name__ == "__main__":
