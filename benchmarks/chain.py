@@ -129,7 +129,7 @@ def _peak() -> int:
 def measure(quick: bool) -> Iterator[results.Row]:
     for what in WHAT:
         for program in PROGRAMS:
-            for bodies in BODIES[: 3 if quick else None]:
+            for bodies in BODIES[: 2 if quick else None]:
                 row = {"program": program, "what": what, "bodies": bodies}
                 found = _in_process(program, what, bodies, 3 if quick else 20)
                 yield row | found

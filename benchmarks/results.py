@@ -125,8 +125,15 @@ def digits(value: Any) -> float:
 
 def cell(spread: list[float]) -> str:
     """The median, and the middle half if that is wider than the two digits shown."""
-    _, low, middle, high, _ = (_two_digits(value) for value in spread)
+    _, low, middle, high, _ = (two_digits(value) for value in spread)
     return middle if low == high else f"{middle} ({low} to {high})"
+
+
+def in_units(seconds: float) -> str:
+    for unit, size in (("s", 1.0), ("ms", 1e-3), ("µs", 1e-6)):
+        if seconds >= size:
+            return f"{two_digits(seconds / size)} {unit}"
+    return f"{two_digits(seconds / 1e-9)} ns"
 
 
 def show(name: str) -> None:
@@ -135,15 +142,17 @@ def show(name: str) -> None:
     from rich.table import Table
 
     rows = load(name)["rows"]
-    kinds = dict.fromkeys(tuple(row) for row in rows)
-    for kind in kinds:
+    console = Console()
+    # In a log nothing wraps.
+    console = console if console.is_terminal else Console(width=200)
+    for kind in dict.fromkeys(tuple(row) for row in rows):
         table = Table(title=name, title_justify="left")
         for heading in kind:
             table.add_column(heading)
         for row in rows:
             if tuple(row) == kind:
-                table.add_row(*map(_text, row.values()))
-        Console().print(table)
+                table.add_row(*(_text(key, value) for key, value in row.items()))
+        console.print(table)
 
 
 def _json(value: Any) -> Any:
@@ -155,17 +164,19 @@ def _json(value: Any) -> Any:
     return None if isinstance(value, float) and not math.isfinite(value) else value
 
 
-def _text(value: Any) -> str:
+def _text(key: str, value: Any) -> str:
+    if isinstance(value, list) and len(value) != 5:
+        return f"{len(value)} numbers"
     if isinstance(value, list):
-        return cell(value) if len(value) == 5 else f"{len(value)} numbers"
+        return in_units(value[2]) if key.startswith("seconds") else cell(value)
     return f"{value:.3g}" if isinstance(value, float) else str(value)
 
 
-def _two_digits(value: float) -> str:
+def two_digits(value: float) -> str:
     """`value` with two digits, or as an integer from 10 on."""
     rounded = float(f"{value:.2g}")
     if rounded >= 10:
-        return f"{value:,.0f}".replace(",", " ")
+        return f"{value:,.0f}".replace(",", " ") if value >= 10_000 else f"{value:.0f}"
     return (
         f"{rounded:.2g}" if rounded < 1e-3 else f"{rounded:.{1 - math.floor(math.log10(rounded))}f}"
     )
