@@ -293,7 +293,7 @@ def chain() -> list[list[str]]:
             last = pick(rows, program=program, what=what)[-1]
             return f"not in {last['ended']} for {last['bodies']} bodies"
         (row,) = found
-        compiling = f"{in_units(row['compile seconds'])}, {row['compile MiB']:.3g} MiB"
+        compiling = f"{in_units(row['compile CPU seconds'])}, {row['compile MiB']:.3g} MiB"
         return f"{compiling}; {in_units(row['run seconds'][2])}"
 
     head = ["", *(f"{what}, {bodies} bodies" for what, bodies in cases)]
