@@ -162,13 +162,15 @@ def draw() -> dict[str, Figure]:
         f"A chain of coupled rigid bodies, {STEPS} steps in float64, each program in a process of "
         f"its own. A line ends where the next chain took more than {LIMIT:g} seconds.",
     )
-    for axes, what in zip(figure.subplots(1, 2, sharey=True), WHAT, strict=True):
+    whats = list(dict.fromkeys(row["what"] for row in rows))
+    panels = figure.subplots(1, len(whats), sharey=True, squeeze=False)[0]
+    for axes, what in zip(panels, whats, strict=True):
         for program, style in PROGRAMS.items():
             found = [r for r in results.pick(rows, program=program, what=what) if "ended" not in r]
             label = program if what == "solve" else None
             bodies, seconds = ([r[key] for r in found] for key in ("bodies", "compile CPU seconds"))
             axes.plot(bodies, seconds, label=label, markersize=5, **style)
-        axes.set(xlabel="bodies", yscale="log", title=what)
+        axes.set(xlabel="bodies", yscale="log", title=what, xticks=BODIES, xlim=(0, 32))
     figure.axes[0].set(ylabel="processor seconds to compile")
     _style.finish(figure, columns=2)
     return {"chain": figure}
