@@ -107,7 +107,7 @@ def measure(quick: bool) -> Iterator[results.Row]:
     for gradient in (False, True):
         for name, ours, sizes in PROGRAMS:
             norms = NORMS[:1] if quick else NORMS
-            cases = itertools.product(sizes, BATCHES, norms)
+            cases = itertools.product(sizes[: 1 if quick else None], BATCHES, norms)
             for n, batch, norm in cases:
                 row = {"program": name, "n": n, "batch": batch, "norm": norm, "gradient": gradient}
                 yield row | compare(ours, n, batch, norm, gradient, 3 if quick else 15)
