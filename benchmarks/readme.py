@@ -28,7 +28,7 @@ def main() -> None:
     text = README.read_text(encoding="utf-8")
     new = render(text)
     if is_check:
-        sys.exit("README differs from the stored results: run `make readme`." * (new != text))
+        sys.exit("README is not of the stored results: run `make readme`." if new != text else 0)
     README.write_text(new, encoding="utf-8")
     for path in draw():
         print(f"Wrote {path.relative_to(HERE.parent)}")
