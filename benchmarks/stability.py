@@ -170,7 +170,7 @@ def single_precision(axes: Axes) -> None:
         [],
         color="0.3",
         linestyle=":",
-        label="3 units of rounding · √steps, as without compensation",
+        label="3 units of rounding · √steps",
     )
     axes.set(
         title="Rigid body at t = 10: a smaller step gains\nnothing where rounding takes over",
