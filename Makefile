@@ -5,7 +5,7 @@ PYTEST := -m pytest --numprocesses auto --dist worksteal
 # Each solver and each field once, what the code relies on in jax, equinox and diffrax, and imports.
 QUICK := tests/test_quick.py tests/test_canary.py tests/test_public.py tests/test_architecture.py
 
-.PHONY: paper lint test test-all test-quick test-lowest test-newest clean
+.PHONY: paper lint test test-all test-quick test-lowest test-newest benchmarks readme clean
 
 # Tables and figures of the paper, in figures/.
 paper: .venv/paper
@@ -38,6 +38,17 @@ test-newest:
 	test -x .venv-newest/bin/python || $(PYTHON) -m venv .venv-newest
 	.venv-newest/bin/python -m pip install --quiet --upgrade --upgrade-strategy eager --editable '.[dev]'
 	.venv-newest/bin/python $(PYTEST)
+
+# Measures everything anew, one after the other, for README. ARGS=--quick is rough, and quicker.
+BENCHMARKS := rigid_body tolerances gradients fields compile chain expm heat batch charts stability
+benchmarks: .venv/dev
+	@$(BIN)/python benchmarks/results.py
+	for name in $(BENCHMARKS); do $(BIN)/python benchmarks/$$name.py $(ARGS) || exit 1; done
+	$(MAKE) readme
+
+# README's tables, numbers and pictures, from what has been measured.
+readme: .venv/dev
+	$(BIN)/python benchmarks/readme.py
 
 .venv/paper .venv/dev: pyproject.toml
 	test -x $(BIN)/python || $(PYTHON) -m venv .venv

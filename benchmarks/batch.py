@@ -1,28 +1,22 @@
 """Time and memory of many solves at once: the rigid body, 100 steps of CF4.
 
-Run as `python benchmarks/batch.py`. It writes `batch.png` next to itself. `cfjax.map_batch` with
-several chunk sizes and one plain `jax.vmap` over the whole batch take turns in one run, from NumPy
-arrays to NumPy arrays. Then come gradients of a batch, over the time of its values.
+`cfjax.map_batch` with several chunk sizes and one plain `jax.vmap` over the whole batch take turns
+in one run, from NumPy arrays to NumPy arrays. The picture shows trajectories per second.
 """
 
-import argparse
-import statistics
 import time
-from collections.abc import Callable
-from pathlib import Path
+from collections.abc import Callable, Iterator
 from typing import Any, NamedTuple
 from unittest import mock
 
-import diffrax
 import jax
 import jax.numpy as jnp
-import matplotlib.figure
 import numpy as np
+from matplotlib.figure import Figure
 from matplotlib.ticker import EngFormatter
-from rich.console import Console
-from rich.table import Table
 
 import cfjax
+import results
 from cfjax._integrate import batch as _batch
 from cfjax._measure import style as _style
 from cfjax._measure.work_precision import take_turns
@@ -31,7 +25,6 @@ from cfjax.scenes import rigid_body
 STEPS, END = 100, 10.0
 SIZES = (1000, 10_000, 100_000, 1_000_000)
 CHUNKS = (1000, 10_000, 100_000)
-GRADIENTS = 10_000
 TERM = cfjax.LieTerm(rigid_body.field)
 STYLES: dict[str, dict[str, Any]] = {
     "chunks of 1000": dict(color="#D55E00", linestyle="--", marker="s"),
@@ -48,30 +41,20 @@ class Program(NamedTuple):
     compile_seconds: float
 
 
-def main() -> None:
-    parser = argparse.ArgumentParser(description=__doc__)
-    parser.add_argument("--rounds", type=int, default=9, help="turns of every program")
-    parser.add_argument("--budget", type=float, default=120.0, help="seconds for each batch")
-    parser.add_argument("--largest", type=int, default=SIZES[-1], help="batch, up to 10000000")
-    options = parser.parse_args()
-    jax.config.update("jax_enable_x64", True)
-    console = Console(width=110)
-    device = f"{jax.device_count()} x {jax.devices()[0].device_kind}"
-    console.print(f"{device}, jax {jax.__version__}")
-
-    table = _table("Values", "members")
-    found: dict[str, dict[int, np.ndarray]] = {name: {} for name in STYLES}
-    for size in (n for n in (*SIZES, 10 * SIZES[-1]) if n <= options.largest):
+def measure(quick: bool) -> Iterator[results.Row]:
+    rounds, budget = (3, 10.0) if quick else (9, 120.0)
+    for size in SIZES:
         members = _members(size)
         programs = {f"chunks of {n}": _in_chunks(members, n) for n in CHUNKS if n <= size}
-        programs["one jax.vmap"] = _whole(jax.vmap(_solve), members)
-        for name, times in _measure(programs, options).items():
-            found[name][size] = times / size
-            _add_row(table, f"{size}", name, times / size, programs[name])
-        table.add_section()
-    console.print(table)
-    console.print(_gradients(options))
-    _chart(found, device).savefig(Path(__file__).with_suffix(".png"), dpi=120)
+        programs["one jax.vmap"] = _whole(members)
+        for name, seconds in _times(programs, rounds, budget).items():
+            yield {
+                "members": size,
+                "program": name,
+                "seconds a trajectory": results.spread(seconds / size),
+                "MiB": results.digits(programs[name].memory / 2**20),
+                "compile seconds": results.digits(programs[name].compile_seconds),
+            }
 
 
 def _members(size: int) -> Member:
@@ -102,11 +85,11 @@ def _in_chunks(members: Member, chunk_size: int) -> Program:
     return Program(run, _memory(executable), compile_seconds)
 
 
-def _whole(function: Callable[[Member], Any], members: Member) -> Program:
+def _whole(members: Member) -> Program:
     start = time.perf_counter()
-    executable = jax.jit(function).lower(members).compile()
+    executable = jax.jit(jax.vmap(_solve)).lower(members).compile()
     compile_seconds = time.perf_counter() - start
-    run = lambda: jax.tree.map(np.asarray, executable(members))  # noqa: E731
+    run = lambda: np.asarray(executable(members))  # noqa: E731
     return Program(run, _memory(executable), compile_seconds)
 
 
@@ -116,100 +99,37 @@ def _memory(executable: jax.stages.Compiled) -> int:
     return plan.temp_size_in_bytes + plan.argument_size_in_bytes + plan.output_size_in_bytes
 
 
-def _measure(programs: dict[str, Program], options: argparse.Namespace) -> dict[str, np.ndarray]:
+def _times(programs: dict[str, Program], rounds: int, budget: float) -> dict[str, np.ndarray]:
     runs = [program.run for program in programs.values()]
     first, *others = (run() for run in runs)
     # The same steps; what differs is rounding, which the flow lets grow with time.
-    if not all(jax.tree.all(jax.tree.map(_is_close, first, other)) for other in others):
+    if not all(np.allclose(first, other, atol=1e-9, rtol=1e-9) for other in others):
         raise RuntimeError("Programs disagree.")
-    times = take_turns(runs, repeats=options.rounds, budget=options.budget)
-    return dict(zip(programs, times, strict=True))
+    return dict(zip(programs, take_turns(runs, repeats=rounds, budget=budget), strict=True))
 
 
-def _is_close(a: np.ndarray, b: np.ndarray) -> bool:
-    return np.allclose(a, b, atol=1e-9, rtol=1e-9)
-
-
-def _gradients(options: argparse.Namespace) -> Table:
-    """In the initial value and the moments of inertia, of one number for each trajectory."""
-    space = diffrax.ODETerm(lambda t, y, inertia: jnp.cross(y, y / inertia))
-
-    def by_diffrax(term, solver):
-        def solve(member):
-            sol = diffrax.diffeqsolve(
-                term,
-                solver,
-                0.0,
-                END,
-                END / STEPS,
-                *member,
-                max_steps=STEPS + 1,  # rounding of the times may make a step more
-                adjoint=diffrax.RecursiveCheckpointAdjoint(),
-            )
-            return jnp.asarray(sol.ys)[-1]
-
-        return solve
-
-    solves = {
-        "cfjax.integrate, CF4": _solve,
-        "diffrax, CF4": by_diffrax(TERM, cfjax.CF4()),
-        "diffrax, CF4, no estimate": by_diffrax(TERM, cfjax.CF4(estimate=None)),
-        "diffrax, Tsit5": by_diffrax(space, diffrax.Tsit5()),
-    }
-    table = _table(f"Gradients of {GRADIENTS} trajectories", "gradient / values")
-    members = _members(GRADIENTS)
-    for name, solve in solves.items():
-        value = lambda member, solve=solve: jnp.sum(jnp.sin(solve(member)))  # noqa: E731
-        values = _whole(jax.vmap(value), members)
-        gradients = _whole(jax.vmap(jax.grad(value)), members)
-        # In turns, so that the ratio means something on a busy machine.
-        times = take_turns(
-            [values.run, gradients.run], repeats=options.rounds, budget=options.budget
-        )
-        ratio = f"{statistics.median(times[1] / times[0]):.1f}"
-        _add_row(table, "", f"{name}, values", times[0] / GRADIENTS, values)
-        _add_row(table, ratio, f"{name}, gradients", times[1] / GRADIENTS, gradients)
-        table.add_section()
-    return table
-
-
-def _table(title: str, first: str) -> Table:
-    table = Table(title=title, title_justify="left")
-    for heading in (first, "program", "µs a trajectory", "middle half", "memory", "compile"):
-        table.add_column(heading, justify="left" if heading == "program" else "right")
-    return table
-
-
-def _add_row(table: Table, first: str, name: str, times: np.ndarray, program: Program) -> None:
-    low, middle, high = np.quantile(1e6 * times, (0.25, 0.5, 0.75))
-    table.add_row(
-        first,
-        name,
-        f"{middle:.3g}",
-        f"{low:.3g} to {high:.3g}",
-        f"{program.memory / 2**20:.1f} MiB",
-        f"{program.compile_seconds:.1f} s",
-    )
-
-
-def _chart(found: dict[str, dict[int, np.ndarray]], device: str) -> matplotlib.figure.Figure:
+def draw() -> dict[str, Figure]:
+    found = results.load("batch")
     figure = _style.new_figure(
         (6.5, 4.2),
-        f"The rigid body, {STEPS} steps of CF4 a trajectory, in float64 on {device}. Median of "
-        "runs in turns; bars reach from the lower to the upper quartile. Without compilation.",
+        f"The rigid body, {STEPS} steps of CF4 a trajectory, in float64 on "
+        f"{found['machine']['cores']} cores. Median of runs in turns; bars reach from the lower to "
+        "the upper quartile. Without compilation.",
     )
     axes = figure.subplots()
     for name, style in STYLES.items():
-        rows = found[name]
-        rates = np.array([np.quantile(1 / times, (0.25, 0.5, 0.75)) for times in rows.values()])
+        rows = results.pick(found["rows"], program=name)
+        # The quickest quarter of the runs has the largest rates.
+        rates = np.array([1 / np.array(row["seconds a trajectory"])[3:0:-1] for row in rows])
         spread = np.abs(rates[:, ::2] - rates[:, 1:2]).T
-        axes.errorbar(list(rows), rates[:, 1], spread, label=name, capsize=2, markersize=5, **style)
+        sizes = [row["members"] for row in rows]
+        axes.errorbar(sizes, rates[:, 1], spread, label=name, capsize=2, markersize=5, **style)
     axes.set(ylabel="trajectories per second", ylim=(0, None))
     axes.yaxis.set_major_formatter(EngFormatter())
     _style.logarithmic(axes, "members of the batch")
     _style.finish(figure, columns=2)
-    return figure
+    return {"batch": figure}
 
 
 if __name__ == "__main__":
-    main()
+    results.run(__file__, __doc__, measure)

@@ -3,30 +3,28 @@
 The dense `expm` for several sizes, the flow of a matrix field on one vector, and the closed form
 for rotations of space against the dense exponential of the 3 x 3 matrix.
 
-Run `python benchmarks/expm.py`. Both are timed in turns in one process, so the ratios carry over to
-other machines and the times do not.
+Both are timed in turns in one process, so the ratios carry over to other machines and the times do
+not.
 """
 
 import itertools
-import statistics
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 
 import jax
 import jax.numpy as jnp
 import numpy as np
 from jax import Array, lax
-from rich.console import Console
-from rich.table import Table
 
 import cfjax
+import results
+from cfjax._measure.work_precision import take_turns
 from cfjax._numerics.expm import expm
 from cfjax._numerics.rotate import rotate
 
 SIZES = (3, 8, 32)
-BATCHES = (1, 100, 1000)
+BATCHES = (1, 1000)
 NORMS = (0.1, 0.5, 3.0)
-REPEATS = 7
 FLOPS = 2e7  # Products per timed call, n³·batch·steps: some 10 to 100 milliseconds.
 
 
@@ -78,53 +76,42 @@ def loop(action: Callable[[Array, Array], Array], steps: int, gradient: bool) ->
 
 
 def compare(
-    name: str,
     ours: Callable[[Array, Array], Array],
     n: int,
     batch: int,
     norm: float,
     gradient: bool,
-) -> list[str]:
-    """One row of the table for the exponential `ours`."""
+    repeats: int,
+) -> results.Row:
+    """Our times, and how many times longer theirs are."""
     a, v = matrices(n, batch, norm)
     steps = max(10, min(1000, int(FLOPS / (n**3 * batch) / (10 if gradient else 3))))
-    programs, compiling, times = [], [], ([], [])
+    programs, compiling = [], []
     for action in (ours, apply_theirs):
         lowered = loop(action, steps, gradient).lower(a, v)
         start = time.perf_counter()
-        programs.append(lowered.compile())
-        compiling.append(time.perf_counter() - start)
-    for repeat in range(REPEATS + 1):
-        for program, taken in zip(programs, times, strict=True):
-            start = time.perf_counter()
-            jax.block_until_ready(program(a, v))
-            if repeat > 0:  # The first call warms up.
-                taken.append(time.perf_counter() - start)
-    ratios = [t / o for o, t in zip(*times, strict=True)]
-    return [
-        "gradient" if gradient else "forward",
-        name,
-        *(str(x) for x in (n, batch, norm)),
-        f"{statistics.median(times[0]) / steps / batch * 1e6:.2f}",
-        f"{statistics.median(ratios):.1f}",
-        f"{min(ratios):.1f} to {max(ratios):.1f}",
-        f"{compiling[0]:.2f} / {compiling[1]:.2f}",
-    ]
+        executable = lowered.compile()
+        compiling.append(results.digits(time.perf_counter() - start))
+        programs.append(lambda executable=executable: executable(a, v))
+        jax.block_until_ready(programs[-1]())  # warm-up
+    seconds, theirs = take_turns(programs, repeats=repeats)
+    return {
+        "seconds": results.spread(seconds / steps / batch),
+        "times faster": results.ratios(theirs, seconds),
+        "compile": compiling[0],
+        "compile theirs": compiling[1],
+    }
 
 
-def main() -> None:
-    jax.config.update("jax_enable_x64", True)
-    table = Table(title="Exponentials against jax.scipy.linalg.expm, float64")
-    columns = ("", "ours", "n", "batch", "norm", "µs each", "times faster", "spread", "compile, s")
-    for column in columns:
-        table.add_column(column, justify="right")
+def measure(quick: bool) -> Iterator[results.Row]:
     for gradient in (False, True):
         for name, ours, sizes in PROGRAMS:
-            for n, batch, norm in itertools.product(sizes, BATCHES, NORMS):
-                table.add_row(*compare(name, ours, n, batch, norm, gradient))
-        table.add_section()
-    Console(width=100).print(table)
+            norms = NORMS[:1] if quick else NORMS
+            cases = itertools.product(sizes[: 1 if quick else None], BATCHES, norms)
+            for n, batch, norm in cases:
+                row = {"program": name, "n": n, "batch": batch, "norm": norm, "gradient": gradient}
+                yield row | compare(ours, n, batch, norm, gradient, 3 if quick else 15)
 
 
 if __name__ == "__main__":
-    main()
+    results.run(__file__, __doc__, measure)

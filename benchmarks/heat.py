@@ -1,24 +1,21 @@
 """Time of one CF4 step of the heat problem against NumPy and SciPy.
 
-Run as `python benchmarks/heat.py`. Two programs make the same steps with `scipy.fft`, and compute
+Two programs make the same steps with `scipy.fft`, and compute
 the exponentials of a step of fixed size once, before the loop: one as the paper writes the method,
 with grid values as the state and three transforms for each flow, the other with the sine
 coefficients as the state, as cfjax does, so with 8 transforms a step instead of 15. All programs
 take turns in one run, so that the ratios mean something on a busy machine.
 """
 
-import argparse
-import statistics
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 
 import jax
 import jax.numpy as jnp
 import numpy as np
 import scipy.fft
-from rich.console import Console
-from rich.table import Table
 
 import cfjax
+import results
 from cfjax._measure.work_precision import take_turns
 from cfjax.scenes import heat
 
@@ -28,14 +25,7 @@ STEP = 1e-3
 INTERVALS_PER_TURN = 2_000_000  # steps times intervals: some tenths of a second
 
 
-def main() -> None:
-    parser = argparse.ArgumentParser(description=__doc__)
-    parser.add_argument("--rounds", type=int, default=15, help="turns of every program")
-    rounds = parser.parse_args().rounds
-    jax.config.update("jax_enable_x64", True)
-    table = Table(title="One CF4 step of the heat problem", title_justify="left")
-    for heading in ("N", "program", "µs a step", "over grid values", "over coefficients"):
-        table.add_column(heading, justify="left" if heading == "program" else "right")
+def measure(quick: bool) -> Iterator[results.Row]:
     for size in SIZES:
         steps = max(20, min(2000, INTERVALS_PER_TURN // size))
         programs = {
@@ -43,30 +33,17 @@ def main() -> None:
             "NumPy and SciPy, coefficients": lambda size=size, steps=steps: on_coefficients(
                 size, steps
             ),
-            "cfjax.integrate, CF4": compiled(size, steps, spectral=True),
-            "the same with grid values as the state": compiled(size, steps, spectral=False),
+            "cfjax, coefficients": compiled(size, steps, spectral=True),
+            "cfjax, grid values": compiled(size, steps, spectral=False),
         }
         check(*(program() for program in programs.values()))
-        times = dict(
-            zip(programs, take_turns(list(programs.values()), repeats=rounds), strict=True)
-        )
+        seconds = take_turns(list(programs.values()), repeats=3 if quick else 15)
+        times = dict(zip(programs, seconds, strict=True))
         for name, values in times.items():
-            table.add_row(
-                str(size),
-                name,
-                f"{1e6 * statistics.median(values) / steps:.1f}",
-                *(ratio(values, times[f"NumPy and SciPy, {state}"]) for state in STATES),
-                end_section=name == list(times)[-1],
-            )
-    console = Console(width=110)
-    console.print(f"{jax.devices()[0].device_kind}, jax {jax.__version__}, {rounds} rounds")
-    console.print(table)
-
-
-def ratio(times: np.ndarray, base: np.ndarray) -> str:
-    """The median of the ratios turn by turn, and the middle half of them."""
-    low, middle, high = statistics.quantiles(times / base, n=4)
-    return f"{middle:.2f} ({low:.2f} to {high:.2f})"
+            yield {"N": size, "program": name, "seconds a step": results.spread(values / steps)} | {
+                f"over {state}": results.ratios(values, times[f"NumPy and SciPy, {state}"])
+                for state in STATES
+            }
 
 
 def grid_field(t, u, args: heat.Diffusivity) -> cfjax.Affine:
@@ -164,4 +141,4 @@ def check(reference: np.ndarray, *others: np.ndarray) -> None:
 
 
 if __name__ == "__main__":
-    main()
+    results.run(__file__, __doc__, measure)

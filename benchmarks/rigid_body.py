@@ -1,27 +1,23 @@
 """Time of one CF4 step of the rigid body against diffrax and against C written by hand.
 
-Run as `python benchmarks/rigid_body.py`. All programs take turns in one run, so that the ratios
-mean something on a busy machine. Without a C compiler the ratios are to diffrax's Tsit5.
+All programs take turns in one run, so that the ratios mean something on a busy machine. Without a C
+compiler the ratios are to diffrax's Tsit5.
 """
 
-import argparse
 import ctypes
 import shutil
-import statistics
 import subprocess
 import tempfile
-import time
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from pathlib import Path
 
 import diffrax
 import jax
 import jax.numpy as jnp
 import numpy as np
-from rich.console import Console
-from rich.table import Table
 
 import cfjax
+import results
 from cfjax._measure.work_precision import take_turns
 from cfjax.scenes import rigid_body
 
@@ -33,24 +29,25 @@ BATCH_STEPS = 50
 FIXED = cfjax.CF4(estimate=None)
 
 
-def main() -> None:
-    parser = argparse.ArgumentParser(description=__doc__)
-    parser.add_argument("--rounds", type=int, default=15, help="turns of every program")
-    rounds = parser.parse_args().rounds
-    jax.config.update("jax_enable_x64", True)
-
+def measure(quick: bool) -> Iterator[results.Row]:
     single, batch = _single_programs(), _batch_programs()
     with tempfile.TemporaryDirectory() as folder:
         library = _compile_c(Path(folder))
         if library is not None:
-            single = {"C, libm, one system": _c_single(library), **single}
-            batch = {"C, vectors of eight": _c_batch(library), **batch}
-        console = Console()
-        console.print(f"{jax.devices()[0].device_kind}, jax {jax.__version__}, {rounds} rounds")
-        console.print(_table("One system", _take_turns(single, rounds), STEPS))
-        work = BATCH * BATCH_STEPS
-        console.print(_table(f"{BATCH} systems", _take_turns(batch, rounds), work))
-    console.print(_compile_times())
+            single = {"C": _c_single(library), **single}
+            batch = {"C": _c_batch(library), **batch}
+        for systems, programs, steps in ((1, single, STEPS), (BATCH, batch, BATCH * BATCH_STEPS)):
+            base = "C" if library is not None else "diffrax, Tsit5"
+            runs = list(programs.values())
+            rounds = take_turns(runs, repeats=3 if quick else 25)
+            times = dict(zip(programs, rounds, strict=True))
+            for name, seconds in times.items():
+                yield {
+                    "program": name,
+                    "systems": systems,
+                    "seconds a step": results.spread(seconds / steps),
+                    f"over {base}": results.ratios(seconds, times[base]),
+                }
 
 
 def _term() -> cfjax.LieTerm:
@@ -86,12 +83,12 @@ def _single_programs() -> dict[str, Callable[[], object]]:
     y0, inertia = _initial()
     programs = {
         "cfjax.integrate, CF4": lambda y, i: _integrate(y, i, STEPS),
-        "diffrax, CF4, no estimate": lambda y, i: _solve(_term(), FIXED, y, i, STEPS),
+        "diffrax, CF4(estimate=None)": lambda y, i: _solve(_term(), FIXED, y, i, STEPS),
         "diffrax, CF4": lambda y, i: _solve(_term(), cfjax.CF4(), y, i, STEPS),
         "diffrax, Tsit5": lambda y, i: _solve(ode, diffrax.Tsit5(), y, i, STEPS),
         "diffrax, Dopri5": lambda y, i: _solve(ode, diffrax.Dopri5(), y, i, STEPS),
     }
-    return {name: _compiled(program, y0, inertia) for name, program in programs.items()}
+    return {name: results.compiled(program, y0, inertia) for name, program in programs.items()}
 
 
 def _batch_programs() -> dict[str, Callable[[], object]]:
@@ -108,17 +105,12 @@ def _batch_programs() -> dict[str, Callable[[], object]]:
     programs = {
         "cfjax.integrate, CF4": vmap(lambda y, i: _integrate(y, i, n)),
         "cfjax.integrate, CF4, chunks of 1000": chunks,
-        "diffrax, CF4, no estimate": vmap(lambda y, i: _solve(_term(), FIXED, y, i, n)),
+        "diffrax, CF4(estimate=None)": vmap(lambda y, i: _solve(_term(), FIXED, y, i, n)),
         "diffrax, CF4": vmap(lambda y, i: _solve(_term(), cfjax.CF4(), y, i, n)),
         "diffrax, Tsit5": vmap(lambda y, i: _solve(ode, diffrax.Tsit5(), y, i, n)),
         "diffrax, Dopri5": vmap(lambda y, i: _solve(ode, diffrax.Dopri5(), y, i, n)),
     }
-    return {name: _compiled(program, y0, inertia) for name, program in programs.items()}
-
-
-def _compiled(program, *args) -> Callable[[], object]:
-    executable = jax.jit(program).lower(*args).compile()
-    return lambda: jax.block_until_ready(executable(*args))
+    return {name: results.compiled(program, y0, inertia) for name, program in programs.items()}
 
 
 def _compile_c(folder: Path) -> ctypes.CDLL | None:
@@ -170,56 +162,5 @@ def _check(c, ours) -> None:
         raise RuntimeError(f"C and cfjax disagree: {c} and {ours}.")
 
 
-def _take_turns(programs: dict[str, Callable[[], object]], rounds: int) -> dict[str, np.ndarray]:
-    for program in programs.values():
-        program()  # warm-up
-    return dict(zip(programs, take_turns(list(programs.values()), repeats=rounds), strict=True))
-
-
-def _table(title: str, times: dict[str, np.ndarray], steps: int) -> Table:
-    """Ratios are taken round by round to the first program, or to Tsit5 if that is not C."""
-    first = next(iter(times))
-    base = first if first.startswith("C") else "diffrax, Tsit5"
-    table = Table(title=title, title_justify="left")
-    table.add_column("program")
-    table.add_column("ns a step", justify="right")
-    table.add_column(f"over {base}", justify="right")
-    table.add_column("middle half", justify="right")
-    for name, values in times.items():
-        ratios = [a / b for a, b in zip(values, times[base], strict=True)]
-        low, middle, high = statistics.quantiles(ratios, n=4)
-        nanoseconds = 1e9 * statistics.median(values) / steps
-        table.add_row(name, f"{nanoseconds:.1f}", f"{middle:.2f}", f"{low:.2f} to {high:.2f}")
-    return table
-
-
-def _compile_times() -> Table:
-    y0, inertia = _initial()
-    ode = diffrax.ODETerm(_ode)
-    programs = {
-        "cfjax.integrate, CF4": lambda y, i: _integrate(y, i, 100),
-        "cfjax.integrate, CG5 (9 stages, 43 flows)": lambda y, i: (
-            cfjax.integrate(_term(), cfjax.CG5(), 0.0, 1.0, y, i, num_steps=100).ys
-        ),
-        "diffrax, CF4, no estimate": lambda y, i: _solve(_term(), FIXED, y, i, 100),
-        "diffrax, CF4": lambda y, i: _solve(_term(), cfjax.CF4(), y, i, 100),
-        "diffrax, Tsit5": lambda y, i: _solve(ode, diffrax.Tsit5(), y, i, 100),
-    }
-    table = Table(title="Trace and compile one solve", title_justify="left")
-    table.add_column("program")
-    table.add_column("seconds, first", justify="right")
-    table.add_column("again, median of 5", justify="right")
-    for name, program in programs.items():
-        times = []
-        for _ in range(6):
-            # A new function each time, or jax would remember the old program.
-            fresh = jax.jit(lambda y, i, program=program: program(y, i))
-            start = time.perf_counter()
-            fresh.lower(y0, inertia).compile()
-            times.append(time.perf_counter() - start)
-        table.add_row(name, f"{times[0]:.2f}", f"{statistics.median(times[1:]):.2f}")
-    return table
-
-
 if __name__ == "__main__":
-    main()
+    results.run(__file__, __doc__, measure)

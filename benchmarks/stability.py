@@ -1,9 +1,10 @@
-"""Where methods fail: draws stability.png beside this file.
+"""Where methods fail: regions of stability, and errors of steps that are too large or too close.
 
-Run as `python benchmarks/stability.py`; takes about a minute.
+The picture has a panel for each.
 """
 
-from pathlib import Path
+import itertools
+from collections.abc import Iterator
 from typing import Any
 
 import diffrax
@@ -14,6 +15,7 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
 import cfjax
+import results
 from cfjax._paper import heat as paper_heat
 from cfjax.scenes import heat, rigid_body
 
@@ -22,9 +24,17 @@ TERM = cfjax.LieTerm(rigid_body.field)
 # The same field in space, for methods that know nothing of the sphere.
 SPACE = diffrax.ODETerm(lambda t, y, args: jnp.cross(y, y / args))
 
+Curves = Iterator[tuple[Any, ...]]  # a label, a list of places, and lists of values over it
 
-def main() -> None:
-    jax.config.update("jax_enable_x64", True)
+
+def measure(quick: bool) -> Iterator[results.Row]:
+    for name, panel in MEASURED.items():
+        for label, x, *values in panel():
+            lists = [[results.digits(v) for v in row] for row in (x, *values)]
+            yield {"panel": name, "curve": label, "x": lists[0], "y": lists[1:]}
+
+
+def draw() -> dict[str, Figure]:
     figure = Figure(figsize=(17, 8), layout="constrained")
     grid = figure.subplots(2, 4)
     for axes in grid.flat[len(PANELS) :]:
@@ -34,9 +44,13 @@ def main() -> None:
         axes.title.set_fontsize(10)
         axes.grid(color="0.9", linewidth=0.6)
         axes.set_axisbelow(True)
-    path = Path(__file__).with_suffix(".png")
-    figure.savefig(path, dpi=100)
-    print(f"Wrote {path}")
+    return {"stability": figure}
+
+
+def curves(panel: str) -> Curves:
+    for row in results.pick(results.load("stability")["rows"], panel=panel):
+        # What was not finite has no number in the file.
+        yield row["curve"], row["x"], *(np.array(y, float) for y in row["y"])
 
 
 def regions_of_cf3(axes: Axes) -> None:
@@ -67,26 +81,32 @@ def _regions(axes: Axes, solver: Any, name: str) -> None:
     axes.legend(fontsize=8, loc="upper right")
 
 
-def large_rotations(axes: Axes) -> None:
+def rotations() -> Curves:
     """Error and distance from the sphere after t = 100, in ever larger steps."""
     counts = np.unique(np.geomspace(2, 20_000, 24).astype(int))
     exact, radius = rigid_body.reference(100.0), np.linalg.norm(rigid_body.y0)
     methods = {
-        "CF3": (TERM, cfjax.CF3(), GREEN),
-        "CF4": (TERM, cfjax.CF4(), BLUE),
-        "RKMK4": (TERM, cfjax.RKMK4(), RED),
-        "RK4 in space": (SPACE, cfjax.CF4(), GREY),
+        "CF3": (TERM, cfjax.CF3()),
+        "CF4": (TERM, cfjax.CF4()),
+        "RKMK4": (TERM, cfjax.RKMK4()),
+        "RK4 in space": (SPACE, cfjax.CF4()),
     }
-    for name, (term, solver, color) in methods.items():
+    for name, (term, solver) in methods.items():
         ends = np.array([_rigid_body_end(term, solver, 100.0, n) for n in counts])
         # In space the largest steps overflow.
         ends[np.abs(ends).max(axis=1) > 1e10] = np.nan
         error = np.linalg.norm(ends - exact, axis=1)
-        axes.loglog(100 / counts, error, color=color, label=name)
         off = np.abs(np.linalg.norm(ends, axis=1) - radius)
+        yield name, 100 / counts, error, off
+
+
+def large_rotations(axes: Axes) -> None:
+    colors = (GREEN, BLUE, RED, GREY)
+    for (name, h, error, off), color in zip(curves("rotations"), colors, strict=True):
+        axes.loglog(h, error, color=color, label=name)
         # Zero has no place on a logarithmic axis.
-        axes.loglog(100 / counts, np.maximum(off, 1e-16), color=color, linestyle=":")
-    axes.axhline(2 * float(radius), color="0.6", linewidth=0.8)
+        axes.loglog(h, np.maximum(off, 1e-16), color=color, linestyle=":")
+    axes.axhline(2 * float(np.linalg.norm(rigid_body.y0)), color="0.6", linewidth=0.8)
     axes.plot([], [], color="0.3", linestyle=":", label="distance from the sphere")
     axes.set(
         title="Rigid body at t = 100: on the sphere at every step,\n"
@@ -98,19 +118,24 @@ def large_rotations(axes: Axes) -> None:
     axes.legend(fontsize=8, loc="center right")
 
 
-def near_singular_parameters(axes: Axes) -> None:
+def families() -> Curves:
     """The error of 32 steps of the third-order families close to excluded parameters."""
     distances = np.geomspace(0.1, 1e-9, 17)
-    families = [
-        ("first family at 1/3 + d", cfjax.third_order_a, 1 / 3, 1, BLUE),
-        ("second family at 1 - d", cfjax.third_order_b, 1.0, -1, RED),
-    ]
-    for label, family, singular, side, color in families:
+    for label, family, singular, side in (
+        ("first family at 1/3 + d", cfjax.third_order_a, 1 / 3, 1),
+        ("second family at 1 - d", cfjax.third_order_b, 1.0, -1),
+    ):
         solvers = [cfjax.CommutatorFree(family(singular + side * d)) for d in distances]
-        for dtype, style in ((np.float64, "-"), (np.float32, "--")):
+        for dtype in (np.float64, np.float32):
             errors = [_driven_error(solver, 32, dtype) for solver in solvers]
-            name = f"{label}, {np.dtype(dtype).name}"
-            axes.loglog(distances, errors, color=color, linestyle=style, label=name)
+            yield f"{label}, {np.dtype(dtype).name}", distances, errors
+
+
+def near_singular_parameters(axes: Axes) -> None:
+    looks = itertools.product((BLUE, RED), ("-", "--"))
+    for (name, distances, errors), (color, style) in zip(curves("families"), looks, strict=True):
+        axes.loglog(distances, errors, color=color, linestyle=style, label=name)
+    distances = np.array([0.1, 1e-9])
     for eps in (2.0**-24, 2.0**-53):
         walk = eps / (2 * distances) / np.sqrt(32)
         axes.loglog(distances, walk, color="0.6", linewidth=0.8, linestyle=":")
@@ -126,31 +151,45 @@ def near_singular_parameters(axes: Axes) -> None:
     axes.legend(fontsize=8, loc="upper left")
 
 
-def single_precision(axes: Axes) -> None:
-    """The error at t = 10 in both precisions, with the walk of roundings."""
+def precisions() -> Curves:
+    """The error at t = 10 in both precisions."""
     counts = np.geomspace(20, 100_000, 18).astype(int)
     exact = rigid_body.reference(10.0)
-    for dtype, color in ((np.float32, RED), (np.float64, BLUE)):
+    for dtype in (np.float32, np.float64):
         ends = np.array([_rigid_body_end(TERM, cfjax.CF4(), 10.0, n, dtype) for n in counts])
-        error = np.linalg.norm(ends - exact, axis=1)
-        axes.loglog(10 / counts, error, color=color, label=f"CF4, {np.dtype(dtype).name}")
-        unit = np.finfo(dtype).eps / 2
-        walk = 3 * unit * np.sqrt(counts)
-        axes.loglog(10 / counts, walk, color=color, linestyle=":", linewidth=1)
-    axes.plot([], [], color="0.3", linestyle=":", label="3 units of rounding · √steps")
+        yield np.dtype(dtype).name, 10 / counts, np.linalg.norm(ends - exact, axis=1)
+
+
+def single_precision(axes: Axes) -> None:
+    for (dtype, h, error), color in zip(curves("precisions"), (RED, BLUE), strict=True):
+        axes.loglog(h, error, color=color, label=f"CF4, {dtype}")
+        walk = 3 * np.finfo(dtype).eps / 2 * np.sqrt(10 / np.array(h))
+        axes.loglog(h, walk, color=color, linestyle=":", linewidth=1)
+    axes.plot(
+        [],
+        [],
+        color="0.3",
+        linestyle=":",
+        label="3 units of rounding · √steps",
+    )
     axes.set(
-        title="Rigid body at t = 10: below h = 0.03\na smaller step gains nothing in float32",
+        title="Rigid body at t = 10: a smaller step gains\nnothing where rounding takes over",
         xlabel="step h",
         ylabel="error",
     )
     axes.legend(fontsize=8, loc="upper left")
 
 
-def heat_steps(axes: Axes) -> None:
+def stiffness() -> Curves:
     """Steps that the heat problem needs at tolerance 1e-3, against the number of intervals."""
     sizes = (30, 100, 300, 1000)
-    for name, color in zip(("RK4", "RKMK4", "CF4"), (GREY, RED, BLUE), strict=True):
+    for name in ("RK4", "RKMK4", "CF4"):
         steps = [paper_heat.adaptive(paper_heat.METHODS[name], 1e-3, n).num_steps for n in sizes]
+        yield name, sizes, steps
+
+
+def heat_steps(axes: Axes) -> None:
+    for (name, sizes, steps), color in zip(curves("stiffness"), (GREY, RED, BLUE), strict=True):
         axes.loglog(sizes, steps, color=color, marker="o", label=name)
     axes.set(
         title="Heat, tolerance 1e-3: explicit methods\nand commutators pay for stiffness",
@@ -160,13 +199,12 @@ def heat_steps(axes: Axes) -> None:
     axes.legend(fontsize=8)
 
 
-def heat_contrast(axes: Axes) -> None:
+def contrast() -> Curves:
     """The heat problem with less and less of the diffusivity in the exact part."""
     full = heat.diffusivity()
     ratios = np.linspace(0.4, 3.0, 66)
     exact = heat.reference(heat.t1, np.asarray(full.mu))
-    for name, color in (("RKMK4", RED), ("CF4", BLUE)):
-        solver = {"CF4": cfjax.CF4(), "RKMK4": cfjax.RKMK4()}[name]
+    for name, solver in (("RKMK4", cfjax.RKMK4()), ("CF4", cfjax.CF4())):
 
         def error(constant, solver=solver):
             sol = cfjax.integrate(
@@ -182,7 +220,11 @@ def heat_contrast(axes: Axes) -> None:
             last = jax.tree.map(lambda ys: ys[-1], sol.ys)
             return jnp.linalg.norm(heat.to_grid(last) - exact)
 
-        errors = jax.vmap(error)(np.max(full.mu) / ratios)
+        yield name, ratios, jax.vmap(error)(np.max(full.mu) / ratios)
+
+
+def heat_contrast(axes: Axes) -> None:
+    for (name, ratios, errors), color in zip(curves("contrast"), (RED, BLUE), strict=True):
         axes.semilogy(ratios, errors, color=color, label=f"{name}, h = 1/400")
     axes.axvline(2.0995, color="0.5", linewidth=1, linestyle=":", label="linear theory of CF4")
     axes.set(
@@ -194,6 +236,7 @@ def heat_contrast(axes: Axes) -> None:
     axes.legend(fontsize=8)
 
 
+MEASURED = {f.__name__: f for f in (rotations, families, precisions, stiffness, contrast)}
 PANELS = (
     regions_of_cf3,
     regions_of_cf4,
@@ -231,4 +274,4 @@ def _driven_error(solver: Any, num_steps: int, dtype: Any) -> float:
 
 
 if __name__ == "__main__":
-    main()
+    results.run(__file__, __doc__, measure)

@@ -1,29 +1,25 @@
 """What error control costs: error against tolerance and against flows, and time to an error.
 
-Run as `python benchmarks/tolerances.py`. The problem is the rigid body to t = 10, and every method
-runs with `diffrax.PIDController(rtol=0, atol=tolerance)`. It draws `tolerances.png`, with every
-embedded pair, next to itself, and prints steps, errors and times at equal tolerance and at equal
-error, beside diffrax's solvers in plain space. All programs of a table take turns in one run, so
-that the ratios mean something on a busy machine.
+The problem is the rigid body to t = 10, and every method runs with
+`diffrax.PIDController(rtol=0, atol=tolerance)`. Steps, errors and times at equal tolerance and at
+equal error, beside diffrax's solvers in plain space, in turns in one run, so that the ratios mean
+something on a busy machine. The picture shows every embedded pair.
 """
 
-import argparse
-import statistics
 from collections.abc import Callable, Iterator
-from pathlib import Path
 from typing import Any, NamedTuple
 
 import diffrax
 import jax
 import jax.numpy as jnp
-import matplotlib
 import numpy as np
 from jaxtyping import Array
-from rich.console import Console
-from rich.table import Table
+from matplotlib.figure import Figure
 from scipy.integrate import solve_ivp
 
 import cfjax
+import results
+from cfjax._measure import style as _style
 from cfjax._measure.cost import Problem, calls_of_steps
 from cfjax._measure.work_precision import take_turns
 from cfjax.scenes import rigid_body
@@ -37,28 +33,37 @@ BATCH = 1000
 LIE = cfjax.LieTerm(rigid_body.field)
 SPACE = diffrax.ODETerm(lambda t, y, inertia: jnp.cross(y, y / inertia))
 METHODS: dict[str, tuple[Any, diffrax.AbstractSolver]] = {
-    "Tsit5 in space": (SPACE, diffrax.Tsit5()),
-    "Dopri8 in space": (SPACE, diffrax.Dopri8()),
+    "diffrax, Tsit5, in plain space": (SPACE, diffrax.Tsit5()),
+    "diffrax, Dopri8, in plain space": (SPACE, diffrax.Dopri8()),
     "CF4": (LIE, cfjax.CF4()),
     "CF43": (LIE, cfjax.CF43()),
     "CF54": (LIE, cfjax.CF54()),
     "Richardson(CF4)": (LIE, cfjax.Richardson(cfjax.CF4(estimate=None))),
 }
+# In the picture.
+NAMES = [*PAIRS, "Richardson(CF4)"]
 
 
-def main() -> None:
-    parser = argparse.ArgumentParser(description=__doc__)
-    parser.add_argument("--rounds", type=int, default=25, help="turns of every program")
-    rounds = parser.parse_args().rounds
-    jax.config.update("jax_enable_x64", True)
-    _draw()
-    console = Console()
-    console.print(f"{jax.devices()[0].device_kind}, jax {jax.__version__}, {rounds} rounds")
+def measure(quick: bool) -> Iterator[results.Row]:
+    yield from _curves()
     for y0 in (np.asarray(rigid_body.y0), _batch()):
         programs = {name: Program(*method, y0) for name, method in METHODS.items()}
         for target in TARGETS:
-            for table in _tables(programs, target, rounds):
-                console.print(table)
+            yield from _rows(programs, target, rounds=3 if quick else 25)
+
+
+def _curves() -> Iterator[results.Row]:
+    for name in NAMES:
+        solver = METHODS[name][1] if name in METHODS else getattr(cfjax, name)()
+        program = Program(LIE, solver, np.asarray(rigid_body.y0))
+        for tolerance in TOLERANCES:
+            run = program.run(tolerance)
+            yield {
+                "method": name,
+                "tolerance": tolerance,
+                "error": results.digits(run.error),
+                "flows": _flows(solver) * run.num_steps,
+            }
 
 
 class Program:
@@ -111,11 +116,8 @@ class Run(NamedTuple):
     num_steps: int
 
 
-def _tables(programs: dict[str, Program], target: float, rounds: int) -> Iterator[Table]:
-    """The time is that of the fastest round, which other work on the machine disturbs least.
-
-    Ratios are taken round by round to the first program.
-    """
+def _rows(programs: dict[str, Program], target: float, rounds: int) -> Iterator[results.Row]:
+    """Each program at the tolerance `target` and at that error, over the first."""
     runs = [[p.run(target) for p in programs.values()]]
     runs.append([p.to_error(target) for p in programs.values()])
     # One kind after the other, so that no program follows itself and finds its own caches.
@@ -124,27 +126,22 @@ def _tables(programs: dict[str, Program], target: float, rounds: int) -> Iterato
         for row in runs
         for p, run in zip(programs.values(), row, strict=True)
     ]
-    members = next(iter(programs.values())).exact.size // 3
+    systems = next(iter(programs.values())).exact.size // 3
     # A single system takes a tenth of a millisecond, a batch a tenth of a second.
-    repeats = rounds if members > 1 else 20 * rounds
+    repeats = rounds if systems > 1 else 20 * rounds
     seconds = take_turns(timed, repeats=repeats).reshape(2, len(programs), -1)
-    what = "one system" if members == 1 else f"{members} systems, each"
     for same, row, measured in zip(("tolerance", "error"), runs, seconds, strict=True):
-        table = Table(title=f"Equal {same}, {target:g}: {what}", title_justify="left")
-        table.add_column("method")
-        for column in ("steps", "error", "µs", "over Tsit5", "middle half"):
-            table.add_column(column, justify="right")
         for name, run, times in zip(programs, row, measured, strict=True):
-            low, middle, high = statistics.quantiles(times / measured[0], n=4)
-            table.add_row(
-                name,
-                f"{run.num_steps}",
-                f"{run.error:.1e}",
-                f"{1e6 * np.min(times) / members:.3g}",
-                f"{middle:.2f}",
-                f"{low:.2f} to {high:.2f}",
-            )
-        yield table
+            yield {
+                "method": name,
+                "systems": systems,
+                "equal": same,
+                "to": target,
+                "error": results.digits(run.error),
+                "steps": run.num_steps,
+                "seconds": results.spread(times / systems),
+                "over Tsit5": results.ratios(times, measured[0]),
+            }
 
 
 def _batch() -> np.ndarray:
@@ -161,27 +158,22 @@ def _reference(y0: np.ndarray) -> np.ndarray:
     return answer.y[:, -1].reshape(y0.shape)
 
 
-def _draw() -> None:
-    matplotlib.use("Agg")
-    import matplotlib.pyplot as plt
-
-    figure, axes = plt.subplots(1, 2, figsize=(10, 4), layout="constrained", sharey=True)
-    solvers = {name: getattr(cfjax, name)() for name in PAIRS}
-    solvers["Richardson(CF4)"] = METHODS["Richardson(CF4)"][1]
-    for name, solver in solvers.items():
-        program = Program(LIE, solver, np.asarray(rigid_body.y0))
-        runs = [program.run(tolerance) for tolerance in TOLERANCES]
-        errors, steps = (np.array(column) for column in list(zip(*runs, strict=True))[1:])
-        axes[0].loglog(TOLERANCES, errors, "o-", markersize=3, label=name)
-        axes[1].loglog(_flows(solver) * steps, errors, "o-", markersize=3)
-        per_tolerance = errors / TOLERANCES
-        print(f"{name:16} error / tolerance {per_tolerance.min():.2g} to {per_tolerance.max():.2g}")
-    axes[0].loglog(TOLERANCES, TOLERANCES, "k:", label="error = tolerance")
-    axes[0].set_xlabel("tolerance")
-    axes[1].set_xlabel("flows")
-    axes[0].set_ylabel(f"error at t = {END:g}")
-    axes[0].legend(fontsize="small")
-    figure.savefig(Path(__file__).with_suffix(".png"), dpi=120)
+def draw() -> dict[str, Figure]:
+    rows = results.load("tolerances")["rows"]
+    curves = {name: [r for r in results.pick(rows, method=name) if "flows" in r] for name in NAMES}
+    figure = _style.new_figure((10, 4))
+    left, right = figure.subplots(1, 2, sharey=True)
+    for name, curve in curves.items():
+        tolerances, errors, flows = (
+            [row[k] for row in curve] for k in ("tolerance", "error", "flows")
+        )
+        left.loglog(tolerances, errors, "o-", markersize=3, label=name)
+        right.loglog(flows, errors, "o-", markersize=3)
+    left.loglog(TOLERANCES, TOLERANCES, "k:", label="error = tolerance")
+    left.set(xlabel="tolerance", ylabel=f"error at t = {END:g}")
+    right.set(xlabel="flows")
+    _style.finish(figure, columns=5)
+    return {"tolerances": figure}
 
 
 def _flows(solver: Any) -> float:
@@ -192,4 +184,4 @@ def _flows(solver: Any) -> float:
 
 
 if __name__ == "__main__":
-    main()
+    results.run(__file__, __doc__, measure)

@@ -29,3 +29,22 @@ def test_pictures_exist():
     assert pictures
     for picture in pictures:
         assert (ROOT / picture).stat().st_size > 0
+
+
+def test_measured_tables_and_numbers_are_those_stored():
+    command = [sys.executable, "benchmarks/readme.py", "--check"]
+    done = subprocess.run(command, capture_output=True, text=True, cwd=ROOT)
+    assert done.returncode == 0, done.stderr
+
+
+def test_no_measured_table_is_typed_in():
+    typed = re.sub(r"<!-- table: .*?<!-- end -->", "", README, flags=re.DOTALL)
+    # What a field returns, and which method: facts.
+    assert re.findall(r"^\| ?(.*?) ?\|.*\n\| -", typed, flags=re.MULTILINE) == ["return", "solver"]
+
+
+def test_every_benchmark_has_stored_results():
+    (names,) = re.findall(r"^BENCHMARKS := (.*)$", (ROOT / "Makefile").read_text(), re.MULTILINE)
+    stored = {path.stem for path in (ROOT / "benchmarks" / "results").glob("*.json")}
+    assert stored == set(names.split())
+    assert all((ROOT / "benchmarks" / f"{name}.py").exists() for name in stored)

@@ -364,9 +364,9 @@ _ARITHMETIC = (
 _FREE = (
     "argmax argmin bitcast_convert_type broadcast_in_dim ceil cfjax_held cfjax_is_finite "
     "cfjax_pack cfjax_unpack clamp complex concatenate conj convert_element_type copy copy_p "
-    "dynamic_slice dynamic_update_slice eq expand_dims floor gather ge gt imag is_finite le lt max "
-    "min ne neg optimization_barrier pad real reduce_max reduce_min reshape rev round scatter "
-    "select_n sign slice split squeeze stack stop_gradient transpose"
+    "dynamic_slice dynamic_update_slice eq expand_dims floor gather ge gt imag iota is_finite le "
+    "lt max min ne neg optimization_barrier pad real reduce_max reduce_min reshape rev round "
+    "scatter select_n sign slice split squeeze stack stop_gradient transpose"
 )
 _COSTS: dict[str, Callable[[JaxprEqn], int]] = {
     **dict.fromkeys(_ARITHMETIC.split(), _each_entry),

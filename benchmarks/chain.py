@@ -1,0 +1,186 @@
+"""A larger system must not choke: a chain of bodies, each coupled to its neighbours.
+
+Every body is an attitude in SO(3) with its angular momentum, each a part of the state of its own.
+Springs align neighbours, friction and a motor on the first body act. Seconds and memory to compile,
+and seconds to run, of a solve and of its gradient: CF4 with cfjax's rewriting of programs and
+without, and Tsit5 in plain space. Each case is a process of its own, with a time limit: in larger
+chains a program that ran past it does not run. The picture shows the time to compile.
+"""
+
+import argparse
+import itertools
+import json
+import os
+import resource
+import subprocess
+import sys
+import time
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any
+
+import diffrax
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Float
+from matplotlib.figure import Figure
+
+import cfjax
+import results
+from cfjax._measure import style as _style
+
+BODIES = (2, 5, 10, 20, 30)
+STEP, STEPS = 0.01, 100
+LIMIT = 120.0  # seconds of a process
+INERTIA = np.array([1.0, 1.2, 0.4])
+PROGRAMS: dict[str, dict[str, Any]] = {
+    "cfjax.integrate, CF4": dict(color="#0072B2", linestyle="-", marker="o"),
+    "cfjax.integrate, CF4, no rewriting": dict(color="#56B4E9", linestyle="-", marker="D"),
+    "diffrax, CF4": dict(color="#D55E00", linestyle="--", marker="s"),
+    "diffrax, CF4, no rewriting": dict(color="#E69F00", linestyle="--", marker="P"),
+    "diffrax, Tsit5": dict(color="#000000", linestyle=":", marker="^"),
+}
+WHAT = ("solve", "gradient")
+
+State = list[dict[str, Array]]
+
+
+def rates(t: Any, state: State) -> list[tuple[Array, Array]]:
+    """The angular velocity and the torque of every body, in the fixed frame."""
+    torques = [-0.1 * body["momentum"] for body in state]
+    torques[0] = torques[0] + jnp.stack([jnp.sin(t), jnp.cos(t), 0.5 * jnp.cos(2 * t)])
+    for k, (body, following) in enumerate(itertools.pairwise(state)):
+        spring = sum(
+            jnp.cross(body["attitude"][:, j], following["attitude"][:, j]) for j in range(3)
+        )
+        torques[k] += spring
+        torques[k + 1] -= spring
+    turns = [body["attitude"] for body in state]
+    omegas = [
+        r @ ((r.T @ body["momentum"]) / INERTIA) for r, body in zip(turns, state, strict=True)
+    ]
+    return list(zip(omegas, torques, strict=True))
+
+
+def field(t: Any, state: State, args: Any) -> Any:
+    return [
+        {"attitude": cfjax.Rotation(omega), "momentum": torque} for omega, torque in rates(t, state)
+    ]
+
+
+def velocity(t: Any, state: State, args: Any) -> State:
+    return [
+        {"attitude": jnp.cross(omega, body["attitude"], axisb=0, axisc=0), "momentum": torque}
+        for (omega, torque), body in zip(rates(t, state), state, strict=True)
+    ]
+
+
+def start(bodies: int) -> State:
+    momenta = np.random.default_rng(0).normal(size=(bodies, 3))
+    return [{"attitude": jnp.eye(3), "momentum": jnp.asarray(m)} for m in momenta]
+
+
+def last(program: str, state: State) -> State:
+    end = STEP * STEPS
+    if program.startswith("cfjax"):
+        sol = cfjax.integrate(cfjax.LieTerm(field), cfjax.CF4(), 0.0, end, state, num_steps=STEPS)
+    else:
+        lie = cfjax.LieTerm(field), cfjax.CF4()
+        method = lie if "CF4" in program else (diffrax.ODETerm(velocity), diffrax.Tsit5())
+        sol = diffrax.diffeqsolve(*method, 0.0, end, STEP, state, max_steps=STEPS + 1)
+    return jax.tree.map(lambda ys: ys[-1], sol.ys)
+
+
+def loss(program: str, state: State) -> Float[Array, ""]:
+    ends = jax.tree.leaves(last(program, state))
+    return jnp.sum(jnp.stack([jnp.sum(jnp.sin(x)) for x in ends]))
+
+
+def case(program: str, what: str, bodies: int, repeats: int) -> results.Row:
+    """Compiles and runs one program, in this process."""
+    jax.config.update("jax_enable_x64", True)
+    state = start(bodies)
+    function = {"solve": last, "gradient": jax.grad(loss, argnums=1)}[what]
+    before, begin, begin_cpu = _peak(), time.perf_counter(), time.process_time()
+    executable = jax.jit(lambda state: function(program, state)).lower(state).compile()
+    compiling, compiling_cpu = time.perf_counter() - begin, time.process_time() - begin_cpu
+    peak, plan = _peak(), executable.memory_analysis()
+    assert plan is not None
+    seconds = []
+    for _ in range(repeats + 1):
+        begin = time.perf_counter()
+        jax.block_until_ready(executable(state))
+        seconds.append(time.perf_counter() - begin)
+    return {
+        "compile seconds": results.digits(compiling),
+        "compile CPU seconds": results.digits(compiling_cpu),
+        "compile MiB": results.digits((peak - before) / 2**10),
+        "run MiB": results.digits(plan.temp_size_in_bytes / 2**20),
+        "run seconds": results.spread(seconds[1:]),
+    }
+
+
+def _peak() -> int:
+    """KiB of memory that this process has had at once."""
+    return resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
+
+
+def measure(quick: bool) -> Iterator[results.Row]:
+    for what in WHAT[: 1 if quick else None]:
+        for program in PROGRAMS:
+            for bodies in BODIES[: 2 if quick else None]:
+                row = {"program": program, "what": what, "bodies": bodies}
+                found = _in_process(program, what, bodies, 3 if quick else 20)
+                yield row | found
+                if "ended" in found:
+                    break
+
+
+def _in_process(program: str, what: str, bodies: int, repeats: int) -> results.Row:
+    rewrites = "0" if "no rewriting" in program else "1"
+    arguments = json.dumps([program, what, bodies, repeats])
+    try:
+        done = subprocess.run(
+            [sys.executable, __file__, "--case", arguments],
+            stdout=subprocess.PIPE,
+            timeout=LIMIT,
+            check=True,
+            env=os.environ | {"CFJAX_REWRITE": rewrites},
+        )
+    except subprocess.TimeoutExpired:
+        return {"ended": f"{LIMIT:g} s"}
+    except subprocess.CalledProcessError as error:
+        return {"ended": f"exit status {error.returncode}"}
+    return json.loads(done.stdout)
+
+
+def draw() -> dict[str, Figure]:
+    rows = results.load("chain")["rows"]
+    figure = _style.new_figure(
+        (7.0, 3.8),
+        f"A chain of coupled rigid bodies, {STEPS} steps in float64, each program in a process of "
+        f"its own. A line ends where the next chain took more than {LIMIT:g} seconds.",
+    )
+    whats = list(dict.fromkeys(row["what"] for row in rows))
+    panels = figure.subplots(1, len(whats), sharey=True, squeeze=False)[0]
+    for axes, what in zip(panels, whats, strict=True):
+        for program, style in PROGRAMS.items():
+            found = [r for r in results.pick(rows, program=program, what=what) if "ended" not in r]
+            label = program if what == "solve" else None
+            bodies, seconds = ([r[key] for r in found] for key in ("bodies", "compile CPU seconds"))
+            axes.plot(bodies, seconds, label=label, markersize=5, **style)
+        axes.set(xlabel="bodies", yscale="log", title=what, xticks=BODIES, xlim=(0, 32))
+    figure.axes[0].set(ylabel="processor seconds to compile")
+    _style.finish(figure, columns=2)
+    return {"chain": figure}
+
+
+if __name__ == "__main__":
+    parser = argparse.ArgumentParser(add_help=False)
+    parser.add_argument("--case", type=json.loads)
+    chosen = parser.parse_known_args()[0].case
+    if chosen:
+        print(json.dumps(case(*chosen)))
+    else:
+        results.run(Path(__file__).name, __doc__, measure)

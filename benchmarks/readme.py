@@ -1,0 +1,342 @@
+"""README's tables, measured numbers and pictures, from what the benchmarks have stored.
+
+Nothing is measured. In README a table or a number stands between `<!-- table: NAME -->` or
+`<!-- number: NAME -->` and `<!-- end -->`, where NAME is that of a function below, with hyphens.
+"""
+
+import argparse
+import itertools
+import re
+import sys
+from collections.abc import Callable, Iterable
+from pathlib import Path
+
+import results
+from results import Row, cell, in_units, load, one, pick, two_digits
+
+HERE = Path(__file__).parent
+README = HERE.parent / "README.md"
+MARKED = re.compile(r"(<!-- (table|number): ([\w-]+) -->)(.*?)(<!-- end -->)", flags=re.DOTALL)
+# Those that draw, and how fine.
+PICTURES = {"batch": 120, "chain": 120, "charts": 200, "stability": 100, "tolerances": 120}
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(description=__doc__)
+    parser.add_argument("--check", action="store_true", help="only tell whether it changes README")
+    is_check = parser.parse_args().check
+    text = README.read_text(encoding="utf-8")
+    new = render(text)
+    if is_check:
+        sys.exit("README is not of the stored results: run `make readme`." if new != text else 0)
+    README.write_text(new, encoding="utf-8")
+    for path in draw():
+        print(f"Wrote {path.relative_to(HERE.parent)}")
+
+
+def render(text: str) -> str:
+    def renewed(match: re.Match[str]) -> str:
+        begin, kind, name, _, end = match.groups()
+        lines = RENDERED[kind, name]()
+        return begin + (f"\n{lines}\n" if kind == "table" else lines) + end
+
+    return MARKED.sub(renewed, text)
+
+
+def draw() -> Iterable[Path]:
+    # Not at import: rendering the text needs no matplotlib and no jax.
+    import importlib
+
+    import jax
+
+    jax.config.update("jax_enable_x64", True)
+    for module, dpi in PICTURES.items():
+        for name, figure in importlib.import_module(module).draw().items():
+            path = HERE / f"{name}.png"
+            figure.savefig(path, dpi=dpi)
+            yield path
+
+
+RENDERED: dict[tuple[str, str], Callable[[], str]] = {}
+
+
+def table(function: Callable[[], list[list[str]]]) -> None:
+    """Registers a table: the heading and the rows, as cells."""
+
+    def lines() -> str:
+        head, *rows = function()
+        return "\n".join(f"| {' | '.join(row)} |" for row in (head, ["---"] * len(head), *rows))
+
+    RENDERED["table", _name(function)] = lines
+
+
+def number(function: Callable[[], str]) -> None:
+    RENDERED["number", _name(function)] = function
+
+
+def _name(function: Callable[..., object]) -> str:
+    return function.__name__.replace("_", "-")
+
+
+def between(values: Iterable[float]) -> str:
+    """The smallest and the largest."""
+    values = list(values)
+    ends = dict.fromkeys(two_digits(value) for value in (min(values), max(values)))
+    return " to ".join(ends)
+
+
+def power(value: float) -> str:
+    return f"{value:.0e}".replace("e-0", "e-")
+
+
+def systems(count: int) -> str:
+    return "one system" if count == 1 else f"each of {two_digits(count)}"
+
+
+def values(rows: Iterable[Row], key: str) -> list:
+    """What the rows have as `key`, without repetition."""
+    return list(dict.fromkeys(row[key] for row in rows if key in row))
+
+
+def code(program: str) -> str:
+    """The name of a program with its code marked up: `"diffrax, CF4"` has two words of code."""
+    return re.sub(
+        r"cfjax\.integrate|CF\d+(\([\w=]+\))?|(Richardson|RKMK)\(\w+\)", r"`\g<0>`", program
+    )
+
+
+@number
+def machine() -> str:
+    found = [load(name) for name in results.names()]
+    kinds = dict.fromkeys(
+        "{cores} cores of {processor}, {instructions}, Python {python}, jax {jax}, "
+        "diffrax {diffrax}, cfjax {cfjax}".format_map(results["machine"])
+        for results in found
+    )
+    days = [results["machine"]["date"] for results in found]
+    when = " to ".join(dict.fromkeys((min(days), max(days))))
+    rough = any(results["quick"] for results in found)
+    return f"{'; '.join(kinds)}; {when}" + ", with `--quick`, so rough" * rough
+
+
+@table
+def tolerances() -> list[list[str]]:
+    rows = pick(load("tolerances")["rows"], equal="error")
+    same = pick(load("tolerances")["rows"], equal="tolerance", systems=1)
+    cases = list(itertools.product(values(rows, "systems"), values(rows, "to")))
+
+    def at_error(row: Row) -> str:
+        text = f"{row['steps']}, {cell(row['over Tsit5'])}"
+        is_met = 0.8 < row["error"] / row["to"] < 1.25
+        return text if is_met else f"{text}, to {power(row['error'])}"
+
+    tolerance = values(same, "to")[0]
+    head = ["", f"tolerance {power(tolerance)}"]
+    head += [f"error {power(error)}, {systems(count)}" for count, error in cases]
+    table = [head]
+    for method in values(rows, "method"):
+        row = one(same, method=method, to=tolerance)
+        cells = [code(method), f"{row['steps']}, to {power(row['error'])}"]
+        cells += [at_error(one(rows, method=method, systems=n, to=e)) for n, e in cases]
+        table.append(cells)
+    return table
+
+
+@number
+def richardson() -> str:
+    rows = pick(load("tolerances")["rows"], method="Richardson(CF4)")
+    return between(row["error"] / row["tolerance"] for row in rows if "flows" in row)
+
+
+@table
+def gradients() -> list[list[str]]:
+    rows = load("gradients")["rows"]
+    cases = list(itertools.product(values(rows, "state"), values(rows, "systems")))
+    head = ["", *(f"{state}, {systems(count)}" for state, count in cases)]
+    return [head] + [
+        [code(program)]
+        + [
+            cell(one(rows, program=program, state=state, systems=count)["gradient over solve"])
+            for state, count in cases
+        ]
+        for program in values(rows, "program")
+    ]
+
+
+@table
+def batch() -> list[list[str]]:
+    rows = load("batch")["rows"]
+    programs = ["chunks of 10000", "one jax.vmap"]
+    head = ["members", *(f"{program}: a trajectory, memory" for program in programs)]
+    table = [
+        [
+            *head[:1],
+            *(h.replace("10000", "10 000").replace("jax.vmap", "`jax.vmap`") for h in head[1:]),
+        ]
+    ]
+    for size in values(pick(rows, program="chunks of 10000"), "members"):
+        found = [one(rows, program=program, members=size) for program in programs]
+        cells = [f"{in_units(r['seconds a trajectory'][2])}, {r['MiB']:.3g} MiB" for r in found]
+        table.append([two_digits(size), *cells])
+    return table
+
+
+@number
+def batch_compile() -> str:
+    rows = pick(load("batch")["rows"], program="chunks of 10000")
+    return between(row["compile seconds"] for row in rows)
+
+
+@number
+def chart_compile() -> str:
+    rows = [row for row in load("charts")["rows"] if "/" in row["chart"]]
+    # One program for all settings of a method.
+    programs = {(row["chart"], row["method"]): row["compile_seconds"] for row in rows}
+    return between(
+        sum(seconds for (name, _), seconds in programs.items() if name == chart)
+        for chart in values(rows, "chart")
+    )
+
+
+@table
+def speed() -> list[list[str]]:
+    rows = load("rigid_body")["rows"]
+    counts = values(rows, "systems")
+
+    def text(program: str, count: int) -> str:
+        found = pick(rows, program=program, systems=count)
+        if not found:  # Chunks are of a batch only.
+            return ""
+        (row,) = found
+        key = next(key for key in row if key.startswith("over"))
+        is_base = key == f"over {program}"
+        return f"1 ({in_units(row['seconds a step'][2])})" if is_base else cell(row[key])
+
+    return [["", *map(systems, counts)]] + [
+        ["C by hand" if program == "C" else code(program), *(text(program, n) for n in counts)]
+        for program in values(rows, "program")
+    ]
+
+
+@table
+def exponentials() -> list[list[str]]:
+    rows = load("expm")["rows"]
+    names = {
+        "rotate": "a rotation in closed form",
+        "expm": "the dense exponential, n = {n}",
+        "flow": "`LeftMatrix(a)` on a vector, n = {n}",
+    }
+    counts = (1, max(values(rows, "batch")))
+    cases = list(itertools.product((False, True), counts))
+    head = ["", *("gradient, " * gradient + systems(count) for gradient, count in cases)]
+    table = [head]
+    for program, n in dict.fromkeys((row["program"], row["n"]) for row in rows):
+        cells = [names[program].format(n=n)]
+        for gradient, count in cases:
+            found = pick(rows, program=program, n=n, batch=count, gradient=gradient)
+            cells.append(between(row["times faster"][2] for row in found))
+        table.append(cells)
+    return table
+
+
+@table
+def heat() -> list[list[str]]:
+    rows = pick(load("heat")["rows"], program="cfjax, coefficients")
+    keys = [key for key in rows[0] if key.startswith("over")]
+    return [["N", "a step", *(f"over NumPy and SciPy, {key[5:]}" for key in keys)]] + [
+        [
+            two_digits(row["N"]),
+            in_units(row["seconds a step"][2]),
+            *(cell(row[key]) for key in keys),
+        ]
+        for row in rows
+    ]
+
+
+@table
+def fields() -> list[list[str]]:
+    rows = load("fields")["rows"]
+    cases = list(itertools.product(values(rows, "program"), values(rows, "systems")))
+    found = {
+        (loop, case): pick(rows, loop=loop, program=case[0], systems=case[1])
+        for loop in values(rows, "loop")
+        for case in cases
+    }
+    ours = {case: found["cfjax.integrate", case] for case in cases}
+    table = [["", *(f"{code(program)}, {systems(count)}" for program, count in cases)]]
+    for k, way in enumerate(values(rows, "way")):
+        table.append([way, *(cell(ours[case][k]["over the best"]) for case in cases)])
+    best = [min(row["seconds a step"][2] for row in ours[case]) for case in cases]
+    table.append(["the best, a step", *map(in_units, best)])
+    slowest = [max(row["over the solve"][2] for row in ours[case]) for case in cases]
+    is_gradient = ["gradient" in program for program, _ in cases]
+    table.append(
+        ["gradient over solve, at most"]
+        + [two_digits(x) if g else "" for x, g in zip(slowest, is_gradient, strict=True)]
+    )
+    for loop in values(rows, "loop")[1:]:
+        worst = [max(row["over the best"][2] for row in found[loop, case]) for case in cases]
+        table.append([f"`{loop}`, at most", *map(two_digits, worst)])
+    return table
+
+
+@table
+def chain() -> list[list[str]]:
+    rows = load("chain")["rows"]
+    counts = values(rows, "bodies")
+    shown = dict.fromkeys((counts[len(counts) // 2], counts[-1]))
+    cases = list(itertools.product(values(rows, "what"), shown))
+
+    def text(program: str, what: str, bodies: int) -> str:
+        found = pick(rows, program=program, what=what, bodies=bodies)
+        if not found or "ended" in found[0]:
+            last = pick(rows, program=program, what=what)[-1]
+            return f"not in {last['ended']} for {last['bodies']} bodies"
+        (row,) = found
+        compiling = f"{in_units(row['compile CPU seconds'])}, {row['compile MiB']:.3g} MiB"
+        return f"{compiling}; {in_units(row['run seconds'][2])}"
+
+    head = ["", *(f"{what}, {bodies} bodies" for what, bodies in cases)]
+    return [head] + [
+        [code(program), *(text(program, *case) for case in cases)]
+        for program in values(rows, "program")
+    ]
+
+
+@table
+def compiling() -> list[list[str]]:
+    rows = load("compile")["rows"]
+    ways, methods = values(rows, "way"), values(rows, "method")
+    seconds = {way: pick(rows, method="Tsit5", way=way) for way in ways}
+    table = [["", *ways]]
+    table.append(["diffrax, Tsit5"])
+    table[1] += [f"1 ({between(r['CPU seconds'][2] for r in seconds[way])} s)" for way in ways]
+    for method in methods[1:]:
+        found = [pick(rows, method=method, way=way) for way in ways]
+        cells = [between(r["over Tsit5"][2] for r in few) if few else "" for few in found]
+        table.append([f"`{method}`", *cells])
+    return table
+
+
+def _seconds_of(derivative: str) -> str:
+    row = one(load("compile")["rows"], derivative=derivative)
+    return two_digits(row["CPU seconds"][2])
+
+
+@number
+def compile_gradient() -> str:
+    return _seconds_of("gradient")
+
+
+@number
+def compile_product() -> str:
+    return _seconds_of("product")
+
+
+@number
+def compile_hessian() -> str:
+    return _seconds_of("Hessian")
+
+
+if __name__ == "__main__":
+    main()
