@@ -1,5 +1,6 @@
 """Commutator-free methods: one step for every tableau."""
 
+import contextlib
 import dataclasses
 from collections.abc import Sequence
 from typing import ClassVar, Literal
@@ -28,6 +29,7 @@ from .._methods.tableau import Product, Row, Tableau
 from .._xla import once
 from .base import AbstractLieSolver, Move
 from .dense import Path
+from .stages import FieldVaries, Flow, can_loop, run
 
 
 class AbstractCommutatorFree(AbstractLieSolver):
@@ -98,8 +100,20 @@ class AbstractCommutatorFree(AbstractLieSolver):
             fields.append(entered)
 
         stages = [trimmed(rows) for rows in (*tableau.alpha, tableau.beta)]
-        for c, rows in zip(tableau.c, stages[:-1], strict=True):
-            evaluate(float(c), rows)
+        times = list(map(float, tableau.c))
+        evaluate(times[0], stages[0])
+        flows = _flows(stages, times)
+        is_looped = False
+        is_usual = type(self).element is AbstractCommutatorFree.element
+        # Two stages at one point would be one flow with two times.
+        if is_usual and len({*stages[:-1]}) == len(times) and can_loop(fields[0]):
+            with contextlib.suppress(FieldVaries):
+                made, fields[:] = run(flows, len(times), fields[0], points[()], field)
+                points |= zip(_products(stages), made, strict=True)
+                is_looped = True
+        if not is_looped:
+            for c, rows in zip(times[1:], stages[1:-1], strict=True):
+                evaluate(c, rows)
         if self.first_same_as_last:
             # Two results of the step, the state and the last field, need its end.
             points[stages[-1]] = once(point(stages[-1]))
@@ -121,6 +135,24 @@ class AbstractCommutatorFree(AbstractLieSolver):
                 start, last_stage = (leave(fields[0], point(x)) for x in ((), stages[-2]))
                 error = jtu.tree_map(_seen, error, minus(end, last_stage), minus(end, start))
         return Move(end, Path.of(within, value(points[()]), fields), error)
+
+
+def _products(stages: Sequence[Product]) -> list[Product]:
+    """The products of flows that lead to the points of a step, each after those that it begins."""
+    return list(dict.fromkeys(rows[:n] for rows in stages for n in range(len(rows) + 1)))
+
+
+def _flows(stages: Sequence[Product], times: Sequence[float]) -> list[Flow]:
+    """The flows of a step, each to a point of its own; the last of `stages` is its end."""
+    products = _products(stages)
+    found = {product: k for k, product in enumerate(products)}
+    evaluated = {rows: k for k, rows in enumerate(stages[:-1])}
+    flows = []
+    for product in products[1:]:
+        stage = evaluated.get(product)
+        c = times[stage] if stage is not None else 0.0
+        flows.append(Flow(found[product[:-1]], product[-1], found[product], stage, c))
+    return flows
 
 
 def _combined(row: Row, fields: Sequence[PyTree]) -> PyTree:

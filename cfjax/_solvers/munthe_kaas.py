@@ -1,6 +1,7 @@
 """Munthe-Kaas methods: one flow for each stage, paid for with commutators."""
 
 import abc
+import contextlib
 import functools
 from collections.abc import Callable
 from fractions import Fraction
@@ -28,6 +29,7 @@ from .._methods.order_conditions import runge_kutta_order
 from .._methods.tableau import ContinuousExtension, Row
 from .base import AbstractLieSolver, Move
 from .dense import Path
+from .stages import FieldVaries, can_loop, elements
 
 
 class AbstractMuntheKaas(AbstractLieSolver):
@@ -178,11 +180,17 @@ class RKMK(AbstractMuntheKaas):
 
     def elements(self, field):
         degree = self.order(None) - 2
-        stages: list[PyTree] = []
-        for c, row in zip(self.c, self.a, strict=True):
+
+        def element(c: Any, u: PyTree) -> PyTree:
+            return _dexpinv(u, field(c, u), degree)
+
+        stages = [field(0.0, None)]
+        if all(map(any, self.a[1:])) and can_loop(stages[0]):
+            with contextlib.suppress(FieldVaries):
+                return elements(stages[0], self.a, self.c, element)
+        for c, row in zip(self.c[1:], self.a[1:], strict=True):
             u = _combine_nonzero(row, stages) if any(row) else None
-            value = field(c, u)
-            stages.append(value if u is None else _dexpinv(u, value, degree))
+            stages.append(field(c, None) if u is None else element(c, u))
         return stages
 
 

@@ -3,7 +3,7 @@
 - `by_components`, `repeat`: a step, and many equal ones, on single numbers.
 - `once`, `once_for_sums`: values that several results need, computed once.
 - `pack`: `jnp.stack` in a form that XLA fuses.
-- `rewriting`: the switch that turns it all off.
+- `rewriting`: the switch that turns it all off; `is_rewritten`: what there is around.
 
 Nothing outside may import from the files within. `README.md` here says what each trick buys.
 """
@@ -13,4 +13,5 @@ from .held import once as once
 from .held import once_for_sums as once_for_sums
 from .loop import repeat as repeat
 from .pack import pack as pack
+from .scope import is_rewritten as is_rewritten
 from .scope import rewriting as rewriting

@@ -70,6 +70,11 @@ def where() -> Place | None:
     return _place.get()
 
 
+def is_rewritten() -> bool:
+    """Whether this is part of a program that is taken apart."""
+    return _place.get() is not None
+
+
 def is_short(x: Any) -> bool:
     """Whether this is a vector that is taken apart."""
     return np.ndim(x) == 1 and 1 <= np.size(x) <= _MAX_LENGTH and is_numeric(x)

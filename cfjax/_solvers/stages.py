@@ -1,0 +1,182 @@
+"""The stages of a step as one loop, so that a program has the field and its flow once."""
+
+import contextlib
+from collections.abc import Callable, Iterator, Sequence
+from contextvars import ContextVar
+from typing import Any, NamedTuple
+
+import jax.numpy as jnp
+import jax.tree_util as jtu
+from jax import lax
+from jaxtyping import Array, PyTree, Real
+
+from .._field import AbstractFrozenField, Displaced, combine, flow, is_displaced, is_field
+from .._xla import is_rewritten
+
+_is_written_out: ContextVar[bool] = ContextVar("is_written_out", default=False)
+
+
+@contextlib.contextmanager
+def written_out() -> Iterator[None]:
+    """Within, no stages are traced as a loop: every flow is seen, and counted, on its own."""
+    token = _is_written_out.set(True)
+    try:
+        yield
+    finally:
+        _is_written_out.reset(token)
+
+
+class Flow(NamedTuple):
+    """One flow of a step: from which point, along which combination of the fields, to which point;
+    and the stage that is evaluated there, if any, with its time.
+    """
+
+    source: int
+    row: Sequence[Any]
+    target: int
+    stage: int | None
+    c: float
+
+
+class FieldVaries(Exception):
+    """The field has not one structure, shape and dtype at all stages."""
+
+
+def can_loop(field: PyTree) -> bool:
+    """Whether a loop over the stages pays: where there are flows, written for one point as for all.
+
+    A step that is rewritten for XLA is faster written out. So are fields that combine in a way of
+    their own or work in coordinates of the step, whose arrays grow from stage to stage.
+    """
+    parts = [type(part) for part in jtu.tree_leaves(field, is_leaf=is_field) if is_field(part)]
+    return (
+        not is_rewritten()
+        and not _is_written_out.get()
+        and bool(parts)
+        and all(map(_is_plain, parts))
+    )
+
+
+def _is_plain(cls: Any) -> bool:
+    usual: Any = AbstractFrozenField
+    return (
+        cls.combine.__func__ is usual.combine.__func__
+        and cls.enter is usual.enter
+        and cls.leave is usual.leave
+    )
+
+
+def elements(
+    first: PyTree,
+    rows: Sequence[Sequence[float]],
+    times: Sequence[float],
+    element: Callable[[Real[Array, ""], PyTree], PyTree],
+) -> list[PyTree]:
+    """The stages `k[i] = element(times[i], sum_j rows[i][j] k[j])`, where `k[0] = first`.
+
+    **Raises** `FieldVaries` as `run`.
+    """
+    n = len(rows)
+
+    def body(stages: PyTree, x: Any) -> Any:
+        k, row, c = x
+        along = jtu.tree_map(lambda f: _combination(row, f), stages)
+        return _put(stages, k, _like(first, element(c, along))), None
+
+    padded = [[*row, *[0.0] * (n - len(row))] for row in rows]
+    xs = jnp.arange(1, n), jnp.asarray(padded[1:]), jnp.asarray(times[1:])
+    stages, _ = lax.scan(body, _stack(first, n), xs)
+    return [_at(stages, k) for k in range(n)]
+
+
+def run(
+    flows: Sequence[Flow],
+    num_stages: int,
+    first: PyTree,
+    start: PyTree,
+    field: Callable[[Real[Array, ""], PyTree], PyTree],
+) -> tuple[list[PyTree], list[PyTree]]:
+    """The points of a step, of which `start` is the first, and its fields, of which `first` is.
+
+    **Raises** `FieldVaries` where they cannot be in one array each.
+    """
+    moving, rest = _stripped(start)
+
+    def body(carry: Any, x: Any) -> Any:
+        points, fields = carry
+        source, row, target, stage, c = x
+        along = jtu.tree_map(lambda f: _combination(row, f[:num_stages]), fields)
+        point = flow(along, _dressed(_at(points, source), rest))
+
+        value = lax.cond(
+            stage < num_stages,
+            lambda: _like(first, field(c, point)),
+            lambda: jtu.tree_map(jnp.zeros_like, first),
+        )
+        return (_put(points, target, _stripped(point)[0]), _put(fields, stage, value)), None
+
+    # One more row for what is no stage.
+    carry = _stack(moving, len(flows) + 1), _stack(first, num_stages + 1)
+    rows = [[*map(float, f.row), *[0.0] * (num_stages - len(f.row))] for f in flows]
+    xs = (
+        jnp.asarray([f.source for f in flows]),
+        jnp.asarray(rows),
+        jnp.asarray([f.target for f in flows]),
+        jnp.asarray([num_stages if f.stage is None else f.stage for f in flows]),
+        jnp.asarray([f.c for f in flows]),
+    )
+    (points, fields), _ = lax.scan(body, carry, xs)
+    return (
+        [_dressed(_at(points, k), rest) for k in range(len(flows) + 1)],
+        [_at(fields, k) for k in range(num_stages)],
+    )
+
+
+def _like(first: PyTree, value: PyTree) -> PyTree:
+    if jtu.tree_structure(value) != jtu.tree_structure(first):
+        combine((1.0, 1.0), (first, value))  # Which says what is wrong, if it is.
+        raise FieldVaries
+    if _types(value) != _types(first):
+        raise FieldVaries
+    # Only a weak type may be left over.
+    return jtu.tree_map(lambda v, f: jnp.asarray(v, f.dtype), value, first)
+
+
+def _stack(tree: PyTree, n: int) -> PyTree:
+    """The first of n."""
+    return jtu.tree_map(lambda x: jnp.zeros((n, *jnp.shape(x)), x.dtype).at[0].set(x), tree)
+
+
+def _combination(row: Array, fields: Array) -> Array:
+    weights = row.astype(fields.dtype).reshape(-1, *[1] * (fields.ndim - 1))
+    return jnp.sum(weights * fields, axis=0)
+
+
+def _at(tree: PyTree, k: Any) -> PyTree:
+    return jtu.tree_map(lambda x: lax.dynamic_index_in_dim(x, k, keepdims=False), tree)
+
+
+def _put(tree: PyTree, k: Any, values: PyTree) -> PyTree:
+    return jtu.tree_map(lambda x, v: lax.dynamic_update_index_in_dim(x, v, k, 0), tree, values)
+
+
+def _types(tree: PyTree) -> list[tuple[tuple[int, ...], Any]]:
+    return [(jnp.shape(x), jnp.result_type(x)) for x in jtu.tree_leaves(tree)]
+
+
+def _stripped(point: PyTree) -> tuple[PyTree, PyTree]:
+    """What differs between the points of a step, and what does not: starts of displacements."""
+    leaves = lambda f: jtu.tree_map(f, point, is_leaf=is_displaced)  # noqa: E731
+    return (
+        leaves(lambda p: p.displacement if is_displaced(p) else p),
+        leaves(lambda p: p.start if is_displaced(p) else None),
+    )
+
+
+def _dressed(moving: PyTree, rest: PyTree) -> PyTree:
+    return jtu.tree_map(
+        lambda start, p: p if start is None else Displaced(start, p),
+        rest,
+        moving,
+        is_leaf=lambda x: x is None,
+    )
