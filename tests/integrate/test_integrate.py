@@ -42,6 +42,7 @@ LINEAR: Any = [
 ]
 
 
+@pytest.mark.representatives(4)
 @pytest.mark.parametrize(
     "term, solver",
     [(TERM, s) for s in LIE] + [(diffrax.ODETerm(ode), s) for s in LINEAR],
@@ -74,6 +75,7 @@ def test_it_takes_the_steps_of_diffeqsolve(term, solver, t1):
 # Output
 
 
+@pytest.mark.representatives(5)
 @pytest.mark.parametrize("t0, t1", [(0.0, 1.0), (0.1, 0.7), (0.3, -2.6), (1e9, 1e9 + 1)])
 @pytest.mark.parametrize("save_every", [None, 1, 3, 12])
 def test_the_shape_and_the_times_of_the_output(t0, t1, save_every):
@@ -143,6 +145,7 @@ def test_there_and_back():
 # Precision
 
 
+@pytest.mark.representatives(3)
 @pytest.mark.parametrize("dtype", [np.float32, np.float64])
 @pytest.mark.parametrize("time", [float, np.float64, jnp.float32, int])
 def test_the_state_decides_the_precision(dtype, time):
@@ -277,6 +280,7 @@ def test_inside_jit_and_vmap():
 STEP, DIFFERENCE_ERROR = 1e-3, 1e-9
 
 
+@pytest.mark.representatives(2)
 @pytest.mark.parametrize("k", range(4), ids=["t0", "t1", "y0", "args"])
 def test_gradients_in_every_argument(k):
     weights = jnp.asarray([1.0, -2.0, 3.0])
@@ -402,6 +406,7 @@ def test_the_memory_backwards_grows_with_the_root_of_the_steps_on_request():
     assert 3 * 90 <= states(100) - states(10) <= 3.1 * 90
 
 
+@pytest.mark.representatives(2)
 @pytest.mark.parametrize("checkpoint_every, save_every", [(1, None), (5, None), (4, 6), (30, 6)])
 def test_fewer_checkpoints_give_the_same_numbers(checkpoint_every, save_every):
     def run(y0, **options):
@@ -485,6 +490,7 @@ def test_integers_and_half_precision_become_the_default_dtype(dtype):
     problems.assert_close(ours, theirs, atol=1e-14)
 
 
+@pytest.mark.representatives(8)
 @pytest.mark.parametrize("y0", [None, {}, {"a": None, "b": jnp.ones(2)}, {"b": jnp.zeros((0, 3))}])
 @pytest.mark.parametrize(
     "solver",
@@ -630,6 +636,7 @@ def test_a_start_that_is_not_finite_is_in_the_result():
     assert explosion(np.nan, throw=False).result == diffrax.RESULTS.nonfinite
 
 
+@pytest.mark.representatives(3)
 @pytest.mark.parametrize(
     "field, y0",
     [
@@ -723,6 +730,7 @@ STEADY = {
 }
 
 
+@pytest.mark.representatives(1)
 @pytest.mark.parametrize("shape", STEADY)
 def test_a_steady_rotation_over_a_million_steps(shape):
     field, y0, most = STEADY[shape]

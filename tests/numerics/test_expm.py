@@ -137,6 +137,7 @@ def test_theta_is_where_the_backward_error_reaches_the_unit_roundoff(scheme, deg
     assert backward(scheme.theta) <= unit < backward(scheme.theta * 1.001)
 
 
+@pytest.mark.representatives(20)
 @pytest.mark.parametrize("dtype", DTYPES)
 @pytest.mark.parametrize(
     ("kind", "norm"),
@@ -163,6 +164,7 @@ def test_accuracy(kind, norm, dtype):
     assert error(got, reference(a)) <= bound
 
 
+@pytest.mark.representatives(3)
 @pytest.mark.parametrize("scheme", [_DEGREE_15_DOUBLE, _DEGREE_21])
 @pytest.mark.parametrize("dtype", [np.float64, np.complex128])
 @pytest.mark.parametrize("relative", [0.999, 1.001])
@@ -177,6 +179,7 @@ def test_accuracy_on_both_sides_of_theta(relative, dtype, scheme):
     assert error(compiled(jnp.asarray(a)), reference(a)) <= bound
 
 
+@pytest.mark.representatives(6)
 @pytest.mark.parametrize("n", [0, 1, 2, 3, 4, 5, 7, 8, 9, 33])
 @pytest.mark.parametrize("dtype", [np.float32, np.complex128])
 def test_every_size(n, dtype):
@@ -191,6 +194,7 @@ def test_every_size(n, dtype):
     assert error(got, reference(a)) <= 2 * (n + 2) * np.finfo(dtype).eps
 
 
+@pytest.mark.representatives(5)
 @pytest.mark.parametrize("dtype", DTYPES)
 @pytest.mark.parametrize("n", [1, 3, 6, 8])
 def test_exact_at_zero(n, dtype):
@@ -234,6 +238,7 @@ def test_each_member_of_a_batch_has_its_own_scaling():
         assert error(x, reference(a)) <= 4 * 5 * 2.3e-16 * max(1.0, norm)
 
 
+@pytest.mark.representatives(3)
 @pytest.mark.parametrize("n", [1, 3, 6, 9])
 @pytest.mark.parametrize("dtype", [np.float32, np.complex128])
 def test_not_finite_gives_nan_and_stays_with_its_member(n, dtype):
@@ -296,6 +301,7 @@ def both_derivatives(a, direction):
     return pushed, jax.vjp(expm, a)[1](direction)[0]
 
 
+@pytest.mark.representatives(5)
 @pytest.mark.parametrize("norm", [0.0, 1e-8, 0.5, 5.0, 200.0])
 @pytest.mark.parametrize(("n", "dtype"), [(3, np.float64), (6, np.float64), (3, np.complex128)])
 def test_derivative_is_the_frechet_derivative(n, dtype, norm):
@@ -332,6 +338,7 @@ def second_derivatives(a, v):
     return forward_over_reverse, jax.grad(slope)(a), reverse_over_reverse
 
 
+@pytest.mark.representatives(2)
 @pytest.mark.parametrize("member", range(4))
 def test_second_derivatives(member):
     a, v = BATCH[member], jnp.asarray(random("general", 3, 1.0, seed=3))
@@ -417,6 +424,7 @@ def test_refuses_other_dtypes(dtype):
         inspect.unwrap(expm)(jnp.zeros((2, 2), dtype))
 
 
+@pytest.mark.representatives(1)
 @pytest.mark.parametrize("norm", [0.0, 0.3, 1.0])
 def test_second_derivative_of_a_size_with_two_schemes(norm):
     # d²/dx² exp(x·a) = a²·exp(x·a).

@@ -80,6 +80,7 @@ def test_which_points_are_thin():
     assert not _is_thin(jnp.zeros((7, 7)), jnp.zeros(7))
 
 
+@pytest.mark.representatives(4)
 @BOTH
 @pytest.mark.parametrize(
     ("kind", "dtype", "point_dtype"),
@@ -134,6 +135,7 @@ def forward(cls, a, direction, point):
     return jax.jvp(lambda a: cls(a).flow(point), (a,), (direction,))[1]
 
 
+@pytest.mark.representatives(3)
 @BOTH
 @pytest.mark.parametrize("norm", [0.0, 0.5, 2.0, 30.0])
 def test_derivatives(cls, norm):

@@ -49,6 +49,7 @@ def derivatives(z):
     return jnp.stack([value, first, second, third])
 
 
+@pytest.mark.representatives(2)
 @pytest.mark.parametrize("dtype", [np.float32, np.float64, np.complex64, np.complex128])
 def test_value_and_three_derivatives(dtype):
     directions = DIRECTIONS if np.issubdtype(dtype, np.complexfloating) else REAL

@@ -79,6 +79,7 @@ def answers():
 # Output
 
 
+@pytest.mark.representatives(1)
 @directions
 @solvers
 def test_the_end_is_the_solution(answers, solver, direction):
@@ -90,6 +91,7 @@ def test_the_end_is_the_solution(answers, solver, direction):
     close(sol.ys[-1], by_steps(solver, nodes(direction))[-1])
 
 
+@pytest.mark.representatives(1)
 @directions
 @solvers
 def test_save_every_kind_at_once(solver, direction):
@@ -123,6 +125,7 @@ def test_save_every_kind_at_once(solver, direction):
     close(ys["energy"]["E"], np.sum(np.asarray(exact)[2::2] ** 2 / problems.INERTIA, axis=1) / 2)
 
 
+@pytest.mark.representatives(1)
 @directions
 @solvers
 def test_save_at_times_that_the_steps_end_at(solver, direction):
@@ -143,6 +146,7 @@ def test_save_at_times_that_the_steps_end_at(solver, direction):
     close(sol.ys, by_steps(solver, ts))
 
 
+@pytest.mark.representatives(1)
 @solvers
 def test_save_at_nodes_of_a_regular_grid(solver):
     """Times that the steps meet up to rounding only."""
@@ -152,6 +156,7 @@ def test_save_at_nodes_of_a_regular_grid(solver):
     close(sol.ys, by_steps(solver, nodes())[np.round(ts * STEPS).astype(int)])
 
 
+@pytest.mark.representatives(1)
 @directions
 def test_dense_output_is_that_of_the_steps_at_nodes(direction):
     solver, saveat = cfjax.RKMK4(), diffrax.SaveAt(dense=True)
@@ -168,6 +173,7 @@ def test_dense_output_is_that_of_the_steps_at_nodes(direction):
 # Fields and states
 
 
+@pytest.mark.representatives(1)
 @solvers
 def test_a_product_of_manifolds(flight_problem, solver):
     field, y0, args, answer = flight_problem
@@ -179,6 +185,7 @@ def test_a_product_of_manifolds(flight_problem, solver):
     assert np.linalg.norm(problems.flat(end) - answer) < ERROR
 
 
+@pytest.mark.representatives(1)
 @pytest.mark.filterwarnings("ignore:Complex dtype support in Diffrax:UserWarning")
 @solvers
 def test_a_complex_state(solver):
@@ -203,6 +210,7 @@ def test_a_complex_state(solver):
     assert np.linalg.norm(y1.conj().T @ y1 - np.eye(3)) < 1e-13
 
 
+@pytest.mark.representatives(1)
 @solvers
 def test_single_precision_stays_single(solver):
     y0, args = Y0.astype(jnp.float32), ARGS.astype(jnp.float32)
@@ -214,6 +222,7 @@ def test_single_precision_stays_single(solver):
     close(sol.ys[-1], by_steps(solver, nodes())[-1].astype(jnp.float32), atol=5e-6)
 
 
+@pytest.mark.representatives(1)
 @solvers
 def test_a_jump_in_the_field_costs_no_order_when_steps_end_there(solver):
     """A field that changes at t = 0.37 for another one. Order measured across the jump."""
@@ -259,6 +268,7 @@ def test_a_jump_in_the_field_costs_no_order_when_steps_end_there(solver):
 # Events
 
 
+@pytest.mark.representatives(1)
 @solvers
 def test_a_boolean_event_ends_on_the_step_where_it_holds(solver):
     exact = np.asarray(by_steps(solver, nodes(n=40)))
@@ -276,6 +286,7 @@ def test_a_boolean_event_ends_on_the_step_where_it_holds(solver):
     close((sol.ts[-1], sol.ys[-1]), (nodes(n=40)[first], exact[first]))
 
 
+@pytest.mark.representatives(1)
 @solvers
 def test_a_continuous_event_ends_on_the_step_where_its_sign_changes(solver):
     exact = np.asarray(by_steps(solver, nodes(n=40)))
@@ -352,6 +363,7 @@ ADJOINTS = {
 DIFFERENCE_STEP, DIFFERENCE_ERROR = 1e-3, 2e-9
 
 
+@pytest.mark.representatives(1)
 @pytest.mark.parametrize(
     "name, adjoint",
     [
@@ -381,6 +393,7 @@ def test_derivatives_in_start_args_and_field(name, adjoint):
             np.testing.assert_allclose(found, expected, rtol=0, atol=DIFFERENCE_ERROR)
 
 
+@pytest.mark.slow
 def test_batches_of_gradients_and_gradients_of_batches():
     fun = lambda x: functional(cfjax.CF4(), ADJOINTS["checkpointed"], x)  # noqa: E731
     batch = jtu.tree_map(lambda x: jnp.stack([x, 0.5 * x, x + 0.1]), X)
@@ -428,6 +441,7 @@ def in_the_times(adjoint, t0, t1):
     return jnp.sum(jnp.sin(sol.ys[-1]))
 
 
+@pytest.mark.representatives(1)
 @pytest.mark.parametrize("adjoint", ADJOINTS)
 def test_derivatives_in_the_times(adjoint):
     fun = lambda times: in_the_times(ADJOINTS[adjoint], *times)  # noqa: E731
@@ -444,6 +458,7 @@ def test_derivatives_in_the_times(adjoint):
     np.testing.assert_allclose(found, expected, rtol=0, atol=DIFFERENCE_ERROR)
 
 
+@pytest.mark.representatives(1)
 @pytest.mark.parametrize("adjoint", ["checkpointed", "direct"])
 def test_hessian_vector_products(adjoint):
     """The same steps as `cfjax.integrate`, whose products are tested against differences."""
@@ -474,6 +489,7 @@ def test_hessian_vector_products(adjoint):
         close(reverse_over_forward(by_diffrax), expected, atol=1e-13)
 
 
+@pytest.mark.representatives(1)
 @pytest.mark.parametrize(
     "adjoint, derivative, message",
     [
@@ -492,6 +508,7 @@ def test_what_an_adjoint_cannot_do_is_an_error(adjoint, derivative, message):
 # Transformations
 
 
+@pytest.mark.representatives(1)
 @solvers
 def test_a_batch_of_starts_and_args(solver):
     @jax.jit
@@ -507,6 +524,7 @@ def test_a_batch_of_starts_and_args(solver):
     close(jax.vmap(end, (None, 0))(Y0, args), jnp.stack([end(Y0, a) for a in args]))
 
 
+@pytest.mark.representatives(1)
 @solvers
 def test_one_program_serves_all_values(solver):
     @eqx.debug.assert_max_traces(max_traces=1)
@@ -523,6 +541,7 @@ def test_one_program_serves_all_values(solver):
 # What does not fit
 
 
+@pytest.mark.representatives(1)
 @solvers
 def test_too_few_steps(solver):
     with pytest.raises(eqx.EquinoxRuntimeError, match="maximum number of solver steps"):
@@ -537,6 +556,7 @@ def explosion(solver, y0, rate=1.0, **kwargs):
     return diffrax.diffeqsolve(term, solver, 0.0, 3.0, 0.1, y0, **kwargs)
 
 
+@pytest.mark.representatives(1)
 @solvers
 def test_a_blow_up_with_constant_steps_is_a_result(solver):
     y0 = jnp.asarray([1.0, 0.2])
@@ -564,6 +584,7 @@ def test_a_gradient_beside_the_check_of_finiteness():
     np.testing.assert_allclose(slopes, 1 / 0.49, rtol=1e-5)
 
 
+@pytest.mark.representatives(1)
 @plain_solvers
 def test_error_control_without_an_estimate_is_refused(solver):
     controller = diffrax.PIDController(rtol=0, atol=1e-6)
@@ -571,6 +592,7 @@ def test_error_control_without_an_estimate_is_refused(solver):
         solve(solver, stepsize_controller=controller)
 
 
+@pytest.mark.representatives(1)
 @solvers
 def test_step_doubling_gives_an_estimate(answers, solver):
     """The tolerance governs the error, and the manifold is kept. `atol` alone: see the README."""
@@ -591,6 +613,7 @@ def test_step_doubling_gives_an_estimate(answers, solver):
     assert tight < loose / 100 and few < many
 
 
+@pytest.mark.representatives(2)
 @pytest.mark.parametrize(
     "solver",
     [diffrax.Bosh3(), diffrax.Tsit5(), diffrax.ReversibleHeun(), diffrax.Kvaerno3()],
@@ -621,6 +644,7 @@ def still(t, y, args):
     return cfjax.LowRankSkew(jnp.zeros_like(y))
 
 
+@pytest.mark.representatives(3)
 @pytest.mark.parametrize("bad", ["t0", "t1"])
 @pytest.mark.parametrize(
     ("term", "solver", "y0"),
@@ -641,6 +665,7 @@ def test_a_time_that_is_nan_is_an_error(bad, term, solver, y0):
         diffrax.diffeqsolve(term, solver, t0, t1, 0.5, y0, ARGS)
 
 
+@pytest.mark.representatives(1)
 @pytest.mark.parametrize("solver", [diffrax.Tsit5(), diffrax.Heun()])
 def test_solvers_of_linear_spaces_take_translations(solver):
     def field(t, y, args):

@@ -181,7 +181,11 @@ def dense(solver, n, field, y0, args, t1=1.0, **kwargs):
 # The errors of Dopri8 are at rounding after two of these steps.
 @pytest.mark.parametrize(
     "solver, order",
-    [pytest.param(*case, id=name) for name, case in EXTENDED.items() if name != "Dopri8"],
+    [
+        pytest.param(*case, id=name, marks=[pytest.mark.slow] * (name not in ("CF4", "RKMK4")))
+        for name, case in EXTENDED.items()
+        if name != "Dopri8"
+    ],
 )
 def test_the_error_between_the_steps_falls_with_the_order_of_the_solution(solver, order):
     """Within one step like h^(order + 1), so it keeps the order of the solution."""

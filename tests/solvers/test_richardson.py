@@ -62,6 +62,7 @@ def close(a, b, atol=1e-14):
 # The estimate
 
 
+@pytest.mark.representatives(3)
 @cases
 @variants
 def test_estimate_and_result_of_a_step(name, as_in_paper):
@@ -88,6 +89,7 @@ def test_estimate_and_result_of_a_step(name, as_in_paper):
     assert wrapped.error_order(term) == order + as_in_paper
 
 
+@pytest.mark.representatives(1)
 @pytest.mark.parametrize("name", ["CF3", "CF4", "RKMK4", "Euler"])
 def test_the_estimate_in_the_paper_is_the_error_of_the_two_halves(name):
     """To leading order, and of order p + 1 in h, which error_order tells the controller.
@@ -121,6 +123,7 @@ def test_the_estimate_in_the_paper_is_the_error_of_the_two_halves(name):
         assert abs(slope - expected) < 0.3
 
 
+@pytest.mark.slow
 @variants
 @pytest.mark.parametrize("name", ["CF4"])
 def test_order(name, as_in_paper, body_problem):
@@ -198,6 +201,7 @@ def rigid_body_answer():
     return problems.reference(ode, 0.0, 10.0, rigid_body.y0)
 
 
+@pytest.mark.representatives(1)
 @pytest.mark.parametrize("name", CONTROLLED)
 def test_the_error_is_proportional_to_the_tolerance(name, rigid_body_answer):
     """An estimate of order p + 1 would let their ratio grow by tol^(-1/(p+1)): 11 to 32 times."""
@@ -245,6 +249,7 @@ def test_pytree_of_manifolds(flight_problem):
 # Memory: solvers whose last stage is the first of the next step.
 
 
+@pytest.mark.representatives(1)
 @pytest.mark.parametrize(
     "name, as_in_paper, direction",
     [("CF4", True, 1), ("CF4", False, -1), ("Tsit5", False, 1), ("Tsit5", True, -1)],
@@ -256,6 +261,7 @@ def test_fixed_steps_are_those_of_the_solver(name, as_in_paper, direction):
     close(ys(found), ys(plain), 1e-13)
 
 
+@pytest.mark.representatives(2)
 @variants
 @pytest.mark.parametrize("name", ["CF4", "Tsit5"])
 def test_accepted_steps_are_those_of_the_solver(name, as_in_paper):
@@ -277,6 +283,7 @@ def test_accepted_steps_are_those_of_the_solver(name, as_in_paper):
         close(wanted, y, 1e-13)
 
 
+@pytest.mark.representatives(1)
 @variants
 def test_memory_is_renewed_after_a_jump(as_in_paper):
     term = diffrax.ODETerm(lambda t, y, args: jnp.where(t < 0.9, -1.0, 3.0) * y)
@@ -294,6 +301,7 @@ def test_memory_is_renewed_after_a_jump(as_in_paper):
 # Output between steps
 
 
+@pytest.mark.representatives(1)
 @variants
 def test_dense_output_is_that_of_the_solver(as_in_paper):
     solver, _, problem = CASES["Tsit5"]
@@ -364,6 +372,7 @@ def test_a_value_that_compiles_once():
 # Failure
 
 
+@pytest.mark.representatives(1)
 @variants
 def test_a_failure_of_the_solver_is_a_failure(as_in_paper):
     root_finder = diffrax.VeryChord(1e-12, 1e-12, optimistix.max_norm)
