@@ -47,5 +47,5 @@ def pytest_collection_modifyitems(items):
 
 
 def values(item):
-    """Which value of which parameter a test has."""
-    return set(item.callspec.indices.items())
+    """Which value each parameter has: the same objects make all sets of a product."""
+    return {(name, id(value)) for name, value in item.callspec.params.items()}

@@ -66,7 +66,7 @@ def exact(m, alpha, b, point):
     return np.stack(columns, axis=1).reshape(np.shape(point))
 
 
-@pytest.mark.representatives(8)
+@pytest.mark.representatives(6)
 @cases
 @pytest.mark.parametrize("columns", [(), (3,), (2, 2)])
 def test_flow_against_a_dense_exponential(case, columns):
@@ -404,7 +404,7 @@ def parts(field, point):
     return split, flow
 
 
-@pytest.mark.representatives(6)
+@pytest.mark.representatives(4)
 @cases
 @pytest.mark.parametrize("alpha", [0.7, 0.0])
 def test_derivatives(case, alpha):
@@ -447,6 +447,7 @@ def check_derivatives(field, point):
 # Dtypes, batches, and solutions.
 
 
+@pytest.mark.slow
 def test_float32():
     for case in CASES:
         field, point, m = data(case)

@@ -41,7 +41,7 @@ def flow(field, point):
     return field.flow(point)
 
 
-@pytest.mark.representatives(8)
+@pytest.mark.representatives(5)
 @BOTH
 @pytest.mark.parametrize(
     "shape, dtype", [*((shape, np.float64) for shape in SHAPES), (SHAPES[0], np.float32)]
@@ -177,7 +177,7 @@ def one_step(solver, field, y0, t0=0.2, h=0.3):
     return jax.jit(step)(y0, ARGS)
 
 
-@pytest.mark.representatives(4)
+@pytest.mark.representatives(2)
 @pytest.mark.parametrize("name", METHODS)
 @pytest.mark.parametrize("pair", [(low_rank, low_rank_dense), (border, border_dense)])
 def test_a_step_is_the_step_with_full_matrices(pair, name):
@@ -214,6 +214,7 @@ def test_a_product_of_manifolds():
         problems.assert_close(found, expected, atol=2e-14)
 
 
+@pytest.mark.slow
 def test_solvers_loops_and_terms_of_diffrax():
     """integrate, diffeqsolve, and the sum of a term in time and one in a control: one answer."""
     solver, steps = cfjax.CF2(), 8

@@ -199,7 +199,7 @@ def check_gradient(value, x, atol):
 WEIGHTS = np.cos(np.arange(11.0))
 
 
-@pytest.mark.representatives(1)
+@pytest.mark.slow
 @pytest.mark.parametrize("solver", [cfjax.CF4(), cfjax.RKMK4()], ids=["CF4", "RKMK4"])
 def test_gradient_of_a_solution(solver):
     """With respect to the initial value and all of the diffusivity, through the spectrum too."""

@@ -75,7 +75,7 @@ def test_frozen_fields_are_the_equations(n, p):
     np.testing.assert_allclose(found, s @ y, rtol=0, atol=1e-13)
 
 
-@pytest.mark.representatives(1)
+@pytest.mark.slow
 @both
 def test_reference_and_method_give_the_tabulated_numbers(problem):
     rows, total = stiefel.tabulated[problem]
@@ -87,7 +87,7 @@ def test_reference_and_method_give_the_tabulated_numbers(problem):
         np.testing.assert_allclose(y.sum(), total, rtol=0, atol=2e-12)
 
 
-@pytest.mark.representatives(3)
+@pytest.mark.representatives(2)
 @both
 @pytest.mark.parametrize("name", METHODS)
 def test_order(problem, name):

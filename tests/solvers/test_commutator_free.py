@@ -103,7 +103,7 @@ def test_reversed_composition_loses_its_order(matrix_problems, name):
     assert wrong < METHODS[name].order(None) - TOLERANCE - 0.8
 
 
-@pytest.mark.representatives(1)
+@pytest.mark.slow
 @pytest.mark.parametrize("name", ["CG3", "CG4"])
 def test_a_commuting_problem_does_not_see_reversed_composition(name):
     """Why the problem above must not commute: here both compositions are right."""
@@ -172,7 +172,7 @@ def euler(f, t, y, h):
     return y + h * f(t, y)
 
 
-@pytest.mark.representatives(12)
+@pytest.mark.representatives(6)
 @pytest.mark.parametrize("term", [cfjax.LieTerm, diffrax.ODETerm])
 @pytest.mark.parametrize("shape", [(), (3,), (9,), (2, 3)])
 @pytest.mark.parametrize(
@@ -244,6 +244,7 @@ def test_the_transposed_problem_has_the_transposed_solution(name):
     np.testing.assert_allclose(right, left.T, rtol=0, atol=2e-14)
 
 
+@pytest.mark.slow
 def test_a_product_of_manifolds_moves_its_parts_as_one():
     """One step of CF4 on the product, against NumPy and SciPy's exponential."""
 
@@ -328,7 +329,7 @@ class Counting(cfjax.AbstractFrozenField):
         return self.v
 
 
-@pytest.mark.representatives(30)
+@pytest.mark.representatives(20)
 @methods
 @pytest.mark.parametrize("shape", [(3,), (4, 4)])
 @pytest.mark.parametrize("estimate", [False, True])
@@ -356,6 +357,7 @@ def test_a_step_costs_what_its_tableau_says(solver, shape, estimate):
 # Precision
 
 
+@pytest.mark.representatives(8)
 @methods
 @pytest.mark.parametrize("dtype", [np.float32, np.float64])
 def test_a_step_keeps_the_precision(solver, dtype):
