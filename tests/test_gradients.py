@@ -76,7 +76,7 @@ def check(fun, x, atol, seed=0, forwards=True):
 
 # The body divides by its inertia, 5! comes in, and directions are up to 2 long: derivatives of
 # 3e4. The matrices are sums of products, with derivatives of 1e4.
-@pytest.mark.representatives(3)
+@pytest.mark.representatives(2)
 @pytest.mark.parametrize(
     "loop, solver, problem",
     [
@@ -102,6 +102,7 @@ def test_gradients_in_start_and_args(loop, solver, problem):
     assert all(np.abs(leaf).max() > 1e-3 for leaf in jtu.tree_leaves(gradient))
 
 
+@pytest.mark.slow
 def test_the_two_loops_have_the_same_gradient():
     found, expected = (
         jax.jit(jax.grad(lambda x, loop=loop: functional(end(loop, LIE["CF4"], BODY[0], *x))))(
@@ -225,7 +226,7 @@ PAIRS = [
 PLACES = jnp.asarray([(1.0, 0.2, 0.9), (0.0, 0.2, 0.9), (1.0, 0.2, 0.2), (0.0, 0.2, 0.2)])
 
 
-@pytest.mark.representatives(6)
+@pytest.mark.representatives(5)
 @pytest.mark.parametrize("kind, method", PAIRS)
 def test_finite_and_right_for_every_field_and_method(kind, method):
     """In the field's scale, both times, the start and args (a spectrum in them) at once.
@@ -262,7 +263,7 @@ def test_finite_and_right_for_every_field_and_method(kind, method):
 # Hard places
 
 
-@pytest.mark.representatives(1)
+@pytest.mark.slow
 @pytest.mark.parametrize("solver, problem", [("RKMK4", BODY), ("CF4", MATRIX)])
 def test_at_a_zero_field(solver, problem):
     """At scale 0 the end is the start, and its derivative in the scale is the field's integral."""
@@ -346,7 +347,7 @@ def test_at_large_angles(solver):
     assert angles[0] < np.pi and angles[1] > 2 * np.pi and angles[2] > 6 * np.pi
 
 
-@pytest.mark.representatives(1)
+@pytest.mark.slow
 @solvers
 def test_at_large_angles_of_a_constant_field(solver):
     """Six turns in one step, with the derivative in closed form: a turn about the third axis."""
@@ -488,7 +489,7 @@ def test_a_batch_of_hessian_vector_products():
 # Closed forms
 
 
-@pytest.mark.representatives(1)
+@pytest.mark.slow
 @pytest.mark.parametrize("solver", [cfjax.CF4(), cfjax.RKMK4()], ids=["CF4", "RKMK4"])
 def test_a_linear_flow_in_its_spectrum(solver):
     """`u' = M u + b` is solved exactly, so its derivatives in spectrum, b, start and time are."""
@@ -626,7 +627,7 @@ def tangential(y, g):
     return g - y @ (y.T @ g + g.T @ y) / 2
 
 
-@pytest.mark.representatives(1)
+@pytest.mark.slow
 @pytest.mark.parametrize("problem", ["sphere", "rotations", "orthogonal"])
 def test_the_gradient_in_the_algebra_is_the_tangential_one(problem):
     """`w -> loss(exp(w) y)` at w = 0 sees the tangential part of the Euclidean gradient alone."""
@@ -691,7 +692,7 @@ def test_the_energy_of_the_body_has_its_initial_gradient_forever(solver):
     assert solver.order(None) - 0.3 < problems.slope(steps, found) < solver.order(None) + 1.3
 
 
-@pytest.mark.representatives(1)
+@pytest.mark.slow
 @solvers
 def test_the_length_of_the_momentum_has_its_initial_gradient_exactly(solver):
     """The flow keeps |y| whatever the field, so this gradient has no error of the method."""

@@ -125,7 +125,7 @@ def test_save_every_kind_at_once(solver, direction):
     close(ys["energy"]["E"], np.sum(np.asarray(exact)[2::2] ** 2 / problems.INERTIA, axis=1) / 2)
 
 
-@pytest.mark.representatives(1)
+@pytest.mark.slow
 @directions
 @solvers
 def test_save_at_times_that_the_steps_end_at(solver, direction):
@@ -146,7 +146,7 @@ def test_save_at_times_that_the_steps_end_at(solver, direction):
     close(sol.ys, by_steps(solver, ts))
 
 
-@pytest.mark.representatives(1)
+@pytest.mark.slow
 @solvers
 def test_save_at_nodes_of_a_regular_grid(solver):
     """Times that the steps meet up to rounding only."""
@@ -156,7 +156,7 @@ def test_save_at_nodes_of_a_regular_grid(solver):
     close(sol.ys, by_steps(solver, nodes())[np.round(ts * STEPS).astype(int)])
 
 
-@pytest.mark.representatives(1)
+@pytest.mark.slow
 @directions
 def test_dense_output_is_that_of_the_steps_at_nodes(direction):
     solver, saveat = cfjax.RKMK4(), diffrax.SaveAt(dense=True)
@@ -173,7 +173,7 @@ def test_dense_output_is_that_of_the_steps_at_nodes(direction):
 # Fields and states
 
 
-@pytest.mark.representatives(1)
+@pytest.mark.slow
 @solvers
 def test_a_product_of_manifolds(flight_problem, solver):
     field, y0, args, answer = flight_problem
@@ -185,7 +185,7 @@ def test_a_product_of_manifolds(flight_problem, solver):
     assert np.linalg.norm(problems.flat(end) - answer) < ERROR
 
 
-@pytest.mark.representatives(1)
+@pytest.mark.slow
 @pytest.mark.filterwarnings("ignore:Complex dtype support in Diffrax:UserWarning")
 @solvers
 def test_a_complex_state(solver):
@@ -222,7 +222,7 @@ def test_single_precision_stays_single(solver):
     close(sol.ys[-1], by_steps(solver, nodes())[-1].astype(jnp.float32), atol=5e-6)
 
 
-@pytest.mark.representatives(1)
+@pytest.mark.slow
 @solvers
 def test_a_jump_in_the_field_costs_no_order_when_steps_end_there(solver):
     """A field that changes at t = 0.37 for another one. Order measured across the jump."""
@@ -268,7 +268,7 @@ def test_a_jump_in_the_field_costs_no_order_when_steps_end_there(solver):
 # Events
 
 
-@pytest.mark.representatives(1)
+@pytest.mark.slow
 @solvers
 def test_a_boolean_event_ends_on_the_step_where_it_holds(solver):
     exact = np.asarray(by_steps(solver, nodes(n=40)))
@@ -316,6 +316,7 @@ def test_a_text_progress_meter(capfd):
     close(sol.ys[-1], by_steps(cfjax.CF4(), nodes())[-1])
 
 
+@pytest.mark.slow
 def test_a_bar_as_progress_meter(capfd):
     pytest.importorskip("tqdm")
     sol = solve(cfjax.CF4(), progress_meter=diffrax.TqdmProgressMeter())
@@ -408,6 +409,7 @@ def test_batches_of_gradients_and_gradients_of_batches():
     close(jax.jit(jax.grad(total))(batch), each, atol=1e-12)
 
 
+@pytest.mark.slow
 def test_the_backsolve_adjoint():
     """`vf_prod` is the tangent in the ambient space, where every solver integrates backwards.
 
@@ -441,7 +443,7 @@ def in_the_times(adjoint, t0, t1):
     return jnp.sum(jnp.sin(sol.ys[-1]))
 
 
-@pytest.mark.representatives(1)
+@pytest.mark.slow
 @pytest.mark.parametrize("adjoint", ADJOINTS)
 def test_derivatives_in_the_times(adjoint):
     fun = lambda times: in_the_times(ADJOINTS[adjoint], *times)  # noqa: E731
@@ -458,7 +460,7 @@ def test_derivatives_in_the_times(adjoint):
     np.testing.assert_allclose(found, expected, rtol=0, atol=DIFFERENCE_ERROR)
 
 
-@pytest.mark.representatives(1)
+@pytest.mark.slow
 @pytest.mark.parametrize("adjoint", ["checkpointed", "direct"])
 def test_hessian_vector_products(adjoint):
     """The same steps as `cfjax.integrate`, whose products are tested against differences."""
@@ -489,7 +491,7 @@ def test_hessian_vector_products(adjoint):
         close(reverse_over_forward(by_diffrax), expected, atol=1e-13)
 
 
-@pytest.mark.representatives(1)
+@pytest.mark.slow
 @pytest.mark.parametrize(
     "adjoint, derivative, message",
     [
@@ -569,6 +571,7 @@ def test_a_blow_up_with_constant_steps_is_a_result(solver):
     assert explosion(solver, y0 / 4, throw=False).result == diffrax.RESULTS.successful
 
 
+@pytest.mark.slow
 def test_in_a_batch_a_blow_up_leaves_the_others_alone():
     y0 = jnp.asarray([[1.0, 0.2], [0.1, 0.2]])
     ys = jax.vmap(lambda y0: explosion(cfjax.CF4(), y0).ys[-1])(y0)
@@ -578,6 +581,7 @@ def test_in_a_batch_a_blow_up_leaves_the_others_alone():
     np.testing.assert_allclose(ys.at[0, 0].set(jnp.nan), exact, rtol=1e-5)
 
 
+@pytest.mark.slow
 def test_a_gradient_beside_the_check_of_finiteness():
     slopes = jax.grad(lambda y0: jnp.sum(explosion(cfjax.CF4(), y0).ys[-1]))(jnp.asarray([0.1]))
     # (1 - 3 y0)^-2, to the error of the method.
@@ -592,7 +596,7 @@ def test_error_control_without_an_estimate_is_refused(solver):
         solve(solver, stepsize_controller=controller)
 
 
-@pytest.mark.representatives(1)
+@pytest.mark.slow
 @solvers
 def test_step_doubling_gives_an_estimate(answers, solver):
     """The tolerance governs the error, and the manifold is kept. `atol` alone: see the README."""
@@ -665,7 +669,7 @@ def test_a_time_that_is_nan_is_an_error(bad, term, solver, y0):
         diffrax.diffeqsolve(term, solver, t0, t1, 0.5, y0, ARGS)
 
 
-@pytest.mark.representatives(1)
+@pytest.mark.slow
 @pytest.mark.parametrize("solver", [diffrax.Tsit5(), diffrax.Heun()])
 def test_solvers_of_linear_spaces_take_translations(solver):
     def field(t, y, args):

@@ -220,6 +220,7 @@ def test_the_error_between_the_steps_falls_with_the_order_of_the_solution(solver
     assert abs(slope - (order + 1)) < 0.15
 
 
+@pytest.mark.representatives(1)
 @pytest.mark.parametrize(
     "name", ["CF4", "CK54", "RKMK4", pytest.param("CF54", marks=pytest.mark.slow)]
 )
@@ -282,6 +283,7 @@ def test_derivatives_in_time(name, direction):
             np.testing.assert_allclose(found, slope, rtol=0, atol=1e-9)
 
 
+@pytest.mark.slow
 def test_a_product_of_manifolds():
     y0, args = problems.arrays(problems.FLIGHT_START), problems.arrays(problems.FLIGHT_ARGS)
     sol = dense(cfjax.CF4(), 32, problems.body_in_flight, y0, args)
@@ -312,6 +314,7 @@ def frame_ode(t, y):
     return ((g @ y.T - y @ g.T) @ y).ravel()
 
 
+@pytest.mark.representatives(1)
 @pytest.mark.parametrize(
     "name", ["RKMK4", "CayleyRK4", pytest.param("CK54", marks=pytest.mark.slow)]
 )
@@ -339,6 +342,7 @@ def test_the_error_between_the_steps_of_a_frame(name):
     assert abs(problems.slope(steps, errors) - 4) < 0.15
 
 
+@pytest.mark.slow
 def test_frames_in_coordinates_of_their_own():
     """Low-rank fields share the columns of a step, also after diffrax has stored them."""
     y0, field = jnp.asarray(FRAME), frame_field
@@ -424,6 +428,7 @@ def test_a_pendulum_passes_a_plane_on_the_sphere_at_the_right_time(name):
     assert abs(np.linalg.norm(sol.ys["q"][-1]) - 1) < 1e-14
 
 
+@pytest.mark.slow
 def test_gradients_through_output_between_steps():
     field, y0, args = BODY
 

@@ -178,7 +178,7 @@ def test_one_step_is_the_published_formula(name):
     np.testing.assert_allclose(found, expected, rtol=0, atol=2e-14)
 
 
-@pytest.mark.representatives(2)
+@pytest.mark.representatives(1)
 @names
 def test_one_step_from_the_right_is_the_transposed_one(name):
     def transposed(t, x, args):
@@ -191,7 +191,7 @@ def test_one_step_from_the_right_is_the_transposed_one(name):
     np.testing.assert_allclose(right, left.T, rtol=0, atol=2e-14)
 
 
-@pytest.mark.representatives(2)
+@pytest.mark.representatives(1)
 @names
 def test_rotations_agree_with_their_matrices(name):
     def as_matrices(t, y, args):
@@ -214,7 +214,7 @@ def classical(tableau, f, t, y, h):
     return y + sum(b * k for b, k in zip(tableau.b_sol, stages, strict=True))
 
 
-@pytest.mark.representatives(8)
+@pytest.mark.representatives(5)
 @pytest.mark.parametrize("term", [cfjax.LieTerm, diffrax.ODETerm])
 @pytest.mark.parametrize("shape", [(3,), (9,), (2, 3)])
 @pytest.mark.parametrize("name", ["Heun", "Bosh3", "Dopri5", "Tsit5"])

@@ -127,7 +127,7 @@ def landau_zener_answer():
     return problems.reference(ode, 0.0, 2.0, np.array([0.6, 0.0, 0.8]))
 
 
-@pytest.mark.representatives(2)
+@pytest.mark.representatives(1)
 @pairs
 def test_the_default_sees_a_commuting_error(name):
     exact = 1 / (1 + 9 * np.exp(-2.0))
@@ -137,7 +137,7 @@ def test_the_default_sees_a_commuting_error(name):
         assert 1e-4 * atol < abs(float(sol.ys[-1, 0]) - exact) < 10 * atol
 
 
-@pytest.mark.representatives(2)
+@pytest.mark.representatives(1)
 @pairs
 def test_the_default_sees_an_error_of_commutators_alone(name, landau_zener_answer):
     y0, args = jnp.asarray([0.6, 0.0, 0.8]), jnp.asarray(LANDAU_ZENER)
@@ -147,7 +147,7 @@ def test_the_default_sees_an_error_of_commutators_alone(name, landau_zener_answe
         assert 1e-4 * atol < error < 30 * atol
 
 
-@pytest.mark.representatives(2)
+@pytest.mark.representatives(1)
 @pairs
 def test_the_estimate_in_the_algebra_is_blind_to_commutators_alone(name, landau_zener_answer):
     y0, args = jnp.asarray([0.6, 0.0, 0.8]), jnp.asarray(LANDAU_ZENER)
@@ -230,6 +230,7 @@ def counted(field, counter):
     return counted_field
 
 
+@pytest.mark.representatives(2)
 @pytest.mark.parametrize("name, evaluations, first", [("CF4", 4, 1), ("CF54", 7, 1), ("CF3", 3, 0)])
 def test_evaluations_with_accepted_and_rejected_steps(name, evaluations, first):
     """A method that is first same as last evaluates once at the start, and never twice there."""
@@ -243,7 +244,7 @@ def test_evaluations_with_accepted_and_rejected_steps(name, evaluations, first):
     assert counter.count == first + evaluations * int(sol.stats["num_steps"])
 
 
-@pytest.mark.representatives(2)
+@pytest.mark.representatives(1)
 @pytest.mark.parametrize("name", ["CF3", "CF4", "CF43", "CF54"])
 def test_steps_over_a_jump(name):
     """The field changes at t = 0.7: what was evaluated before says nothing of after."""
@@ -284,6 +285,7 @@ def test_a_kept_evaluation_is_discarded_after_a_jump():
 # Error control
 
 
+@pytest.mark.representatives(1)
 @pytest.mark.parametrize("name", ["CF3", "CF4", "CF43", "CF54"])
 def test_error_per_tolerance_is_steady(name):
     y0, inertia = jnp.asarray(problems.MOMENTUM), jnp.asarray(problems.INERTIA)

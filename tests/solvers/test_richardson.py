@@ -89,7 +89,7 @@ def test_estimate_and_result_of_a_step(name, as_in_paper):
     assert wrapped.error_order(term) == order + as_in_paper
 
 
-@pytest.mark.representatives(1)
+@pytest.mark.slow
 @pytest.mark.parametrize("name", ["CF3", "CF4", "RKMK4", "Euler"])
 def test_the_estimate_in_the_paper_is_the_error_of_the_two_halves(name):
     """To leading order, and of order p + 1 in h, which error_order tells the controller.
@@ -201,7 +201,7 @@ def rigid_body_answer():
     return problems.reference(ode, 0.0, 10.0, rigid_body.y0)
 
 
-@pytest.mark.representatives(1)
+@pytest.mark.slow
 @pytest.mark.parametrize("name", CONTROLLED)
 def test_the_error_is_proportional_to_the_tolerance(name, rigid_body_answer):
     """An estimate of order p + 1 would let their ratio grow by tol^(-1/(p+1)): 11 to 32 times."""
@@ -232,6 +232,7 @@ def test_the_error_is_proportional_to_the_tolerance(name, rigid_body_answer):
     assert 0.1 < ratios.min() and ratios.max() < 20
 
 
+@pytest.mark.slow
 def test_pytree_of_manifolds(flight_problem):
     field, y0, args, answer = flight_problem
     problem = (cfjax.LieTerm(field), problems.arrays(y0), problems.arrays(args))
@@ -261,7 +262,7 @@ def test_fixed_steps_are_those_of_the_solver(name, as_in_paper, direction):
     close(ys(found), ys(plain), 1e-13)
 
 
-@pytest.mark.representatives(2)
+@pytest.mark.representatives(1)
 @variants
 @pytest.mark.parametrize("name", ["CF4", "Tsit5"])
 def test_accepted_steps_are_those_of_the_solver(name, as_in_paper):
