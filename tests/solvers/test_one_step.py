@@ -55,6 +55,16 @@ def line(t, y, args):
     return Line(*line_coefficients(jnp, t, y, args))
 
 
+def driven_coefficients(xp, t, args):
+    return args * xp.cos(t), args - 1 + xp.sin(3 * t)
+
+
+def driven_line(t, y, args):
+    """The state has no part in it, so nor has it in what CF4's companion sees."""
+    del y
+    return Line(*driven_coefficients(jnp, t, args))
+
+
 def hat(w):
     return np.array([[0, -w[2], w[1]], [w[2], 0, -w[0]], [-w[1], w[0], 0]])
 
@@ -74,6 +84,12 @@ class OnLines:
     def flow(f, y):
         flows = (scipy.linalg.expm(np.array([[a, b], [0, 0]])) for a, b in f.T)
         return np.array([m[0, 0] * x + m[0, 1] for m, x in zip(flows, y, strict=True)])
+
+
+class OnDrivenLines(OnLines):
+    @staticmethod
+    def field(t, y):
+        return np.array(driven_coefficients(np, t, SLOPES))
 
 
 class FromLeft:
@@ -110,6 +126,7 @@ class OnSphere(FromLeft):
 _RNG = np.random.default_rng(3)
 SLOPES = _RNG.uniform(0.5, 1.5, 9)
 LINES = line, _RNG.uniform(-1, 1, 9), SLOPES, OnLines
+DRIVEN = driven_line, LINES[1], SLOPES, OnDrivenLines
 BODY = problems.driven_body, problems.MOMENTUM, problems.INERTIA, OnSphere
 LEFT = problems.left_matrix, problems.ORTHOGONAL, problems.GENERATORS, FromLeft
 RIGHT = problems.right_matrix, problems.ORTHOGONAL, problems.GENERATORS, FromRight
@@ -188,6 +205,7 @@ ESTIMATES = [
 ]
 QUICK = [
     *((*case, LINES) for case in ESTIMATES),
+    *((*case, DRIVEN) for case in [("CF4", "group"), ("CF4", "algebra"), ("CF2", "group")]),
     *((*case, BODY) for case in [("CF4", "group"), ("CF3", "algebra"), ("CK34", "group")]),
     *((*case, LEFT) for case in [("CF4", "group"), ("Luscher3", "group")]),
     ("CF3", "group", RIGHT),
