@@ -61,7 +61,7 @@ def test_flow(cls, dtype, shape, norm):
     np.testing.assert_allclose(np.asarray(got).T @ got, np.eye(shape[1]), rtol=0, atol=atol)
 
 
-@pytest.mark.representatives(2)
+@pytest.mark.representatives(1)
 @BOTH
 @pytest.mark.parametrize("shape", SHAPES)
 def test_tangent_is_the_velocity_of_the_flow(cls, shape):
@@ -269,7 +269,7 @@ def test_a_batch_with_a_field_that_needs_more_than_the_series():
 # Derivatives
 
 
-@pytest.mark.representatives(2)
+@pytest.mark.representatives(1)
 @BOTH
 @pytest.mark.parametrize("norm", [0.0, 0.5, 6.0])
 def test_gradients_of_a_flow(cls, norm):
@@ -295,7 +295,7 @@ def test_gradients_of_a_flow(cls, norm):
         problems.assert_close(reverse, second, atol=1e-11)
 
 
-@pytest.mark.representatives(1)
+@pytest.mark.slow
 @pytest.mark.parametrize("field", [low_rank, border])
 def test_gradients_at_a_zero_step(field):
     """t1 = t0: the derivative in t1 is the velocity, that in y0 along the manifold the identity."""
@@ -404,7 +404,7 @@ def start(cls, y, way, solver):
     return np.asarray(ys["q"][-1])
 
 
-@pytest.mark.representatives(1)
+@pytest.mark.slow
 @BOTH
 @pytest.mark.parametrize(
     ("way", "solver"),

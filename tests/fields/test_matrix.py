@@ -37,7 +37,7 @@ def act(cls, matrix, point):
     return matrix @ point if cls is LeftMatrix else point @ matrix
 
 
-@pytest.mark.representatives(8)
+@pytest.mark.representatives(6)
 @BOTH
 @pytest.mark.parametrize("vector", [True, False])
 @pytest.mark.parametrize(
@@ -107,7 +107,7 @@ def test_skew_hermitian_is_unitary():
     np.testing.assert_allclose(q.conj().T @ q, np.eye(3), rtol=0, atol=1e-14)
 
 
-@pytest.mark.representatives(2)
+@pytest.mark.representatives(1)
 @BOTH
 @pytest.mark.parametrize("norm", [0.0, 30.0])
 def test_gradient(cls, norm):

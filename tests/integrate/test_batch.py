@@ -466,7 +466,7 @@ def key(solve):
     return _batch._Program(solve, np.ones((4, 3)), 4, None).fingerprint()
 
 
-@pytest.mark.representatives(5)
+@pytest.mark.representatives(3)
 @pytest.mark.parametrize("name", SOLVES)
 def test_a_key_knows_every_constant_to_the_last_bit(name):
     parameter = np.asarray([0.1, 0.2, 0.3])

@@ -280,7 +280,7 @@ def test_inside_jit_and_vmap():
 STEP, DIFFERENCE_ERROR = 1e-3, 1e-9
 
 
-@pytest.mark.representatives(2)
+@pytest.mark.slow
 @pytest.mark.parametrize("k", range(4), ids=["t0", "t1", "y0", "args"])
 def test_gradients_in_every_argument(k):
     weights = jnp.asarray([1.0, -2.0, 3.0])
@@ -385,6 +385,7 @@ def test_the_memory_forwards_grows_by_what_is_saved():
     assert 0.9 * saved < many - few < 2.1 * saved
 
 
+@pytest.mark.slow
 def test_the_memory_backwards_is_one_state_for_each_step():
     few, many = temporary_bytes(100, reverse=True), temporary_bytes(1100, reverse=True)
     a_step = (many - few) / 1000
@@ -397,6 +398,7 @@ def test_the_memory_backwards_of_a_small_system_is_its_state_and_a_count_for_eac
     assert (many - few) / 10_000 <= 3 * 8 + 4
 
 
+@pytest.mark.slow
 def test_the_memory_backwards_grows_with_the_root_of_the_steps_on_request():
     """A block keeps the state and what the last sum lost; within one block a step keeps a state."""
 
@@ -406,8 +408,11 @@ def test_the_memory_backwards_grows_with_the_root_of_the_steps_on_request():
     assert 3 * 90 <= states(100) - states(10) <= 3.1 * 90
 
 
-@pytest.mark.representatives(2)
-@pytest.mark.parametrize("checkpoint_every, save_every", [(1, None), (5, None), (4, 6), (30, 6)])
+@pytest.mark.parametrize(
+    "checkpoint_every, save_every",
+    # One that leaves steps behind the last checkpoint.
+    [(5, None), *(pytest.param(*x, marks=pytest.mark.slow) for x in [(1, None), (4, 6), (30, 6)])],
+)
 def test_fewer_checkpoints_give_the_same_numbers(checkpoint_every, save_every):
     def run(y0, **options):
         sol = cfjax.integrate(

@@ -364,7 +364,7 @@ ADJOINTS = {
 DIFFERENCE_STEP, DIFFERENCE_ERROR = 1e-3, 2e-9
 
 
-@pytest.mark.representatives(1)
+@pytest.mark.slow
 @pytest.mark.parametrize(
     "name, adjoint",
     [
@@ -510,7 +510,7 @@ def test_what_an_adjoint_cannot_do_is_an_error(adjoint, derivative, message):
 # Transformations
 
 
-@pytest.mark.representatives(1)
+@pytest.mark.slow
 @solvers
 def test_a_batch_of_starts_and_args(solver):
     @jax.jit
@@ -648,7 +648,7 @@ def still(t, y, args):
     return cfjax.LowRankSkew(jnp.zeros_like(y))
 
 
-@pytest.mark.representatives(3)
+@pytest.mark.representatives(1)
 @pytest.mark.parametrize("bad", ["t0", "t1"])
 @pytest.mark.parametrize(
     ("term", "solver", "y0"),

@@ -104,7 +104,7 @@ def test_mistaken_scales():
 # The first step
 
 
-@pytest.mark.representatives(2)
+@pytest.mark.representatives(1)
 @pytest.mark.parametrize("speed", [1e-4, 1.0, 1e4])
 @pytest.mark.parametrize("direction", [1.0, -1.0])
 def test_a_first_step_is_accepted_and_not_far_too_short(speed, direction):
@@ -176,7 +176,7 @@ def stiefel_problem():
     return stiefel.first, 1.0, stiefel.y0(n, p), stiefel.diagonals(n, p), answer
 
 
-@pytest.mark.representatives(1)
+@pytest.mark.slow
 @pytest.mark.parametrize(
     "problem, estimate",
     [

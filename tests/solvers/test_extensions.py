@@ -220,7 +220,7 @@ def test_the_error_between_the_steps_falls_with_the_order_of_the_solution(solver
     assert abs(slope - (order + 1)) < 0.15
 
 
-@pytest.mark.representatives(1)
+@pytest.mark.slow
 @pytest.mark.parametrize(
     "name", ["CF4", "CK54", "RKMK4", pytest.param("CF54", marks=pytest.mark.slow)]
 )
@@ -262,6 +262,7 @@ def test_random_times_are_on_the_manifold_and_nodes_are_the_steps(name):
     np.testing.assert_allclose(saved.ys, ys[np.argsort(times)], rtol=0, atol=1e-14)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     "name, direction", [pytest.param("CF3", 1, marks=pytest.mark.slow), ("CF4", -1)]
 )

@@ -64,6 +64,7 @@ def test_the_observed_order(body_problem, name):
     assert abs(problems.slope(steps, found) - METHODS[name][0]) < 0.15
 
 
+@pytest.mark.slow
 def test_a_frame_in_coordinates_of_its_own_takes_every_stage(no_shape_hook):
     """Such a step changes its structure from stage to stage, so it cannot be a loop."""
     y0 = jnp.asarray(np.linalg.qr(np.random.default_rng(1).standard_normal((8, 2)))[0])

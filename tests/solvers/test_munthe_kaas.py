@@ -178,7 +178,7 @@ def test_one_step_is_the_published_formula(name):
     np.testing.assert_allclose(found, expected, rtol=0, atol=2e-14)
 
 
-@pytest.mark.representatives(1)
+@pytest.mark.slow
 @names
 def test_one_step_from_the_right_is_the_transposed_one(name):
     def transposed(t, x, args):
@@ -262,6 +262,7 @@ def inexact_end() -> tuple[float, float]:
             return float(t0), float(t1)
 
 
+@pytest.mark.representatives(2)
 @pytest.mark.parametrize(
     "name, stages",
     [
@@ -364,6 +365,7 @@ class Shear(cfjax.AbstractFrozenField):
         return self.v
 
 
+@pytest.mark.representatives(4)
 @names
 @pytest.mark.parametrize("nested", [False, True])
 def test_a_field_without_bracket_is_refused_by_name(name, nested):
