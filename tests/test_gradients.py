@@ -76,7 +76,7 @@ def check(fun, x, atol, seed=0, forwards=True):
 
 # The body divides by its inertia, 5! comes in, and directions are up to 2 long: derivatives of
 # 3e4. The matrices are sums of products, with derivatives of 1e4.
-@pytest.mark.representatives(2)
+@pytest.mark.representatives(1)
 @pytest.mark.parametrize(
     "loop, solver, problem",
     [

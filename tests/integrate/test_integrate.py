@@ -42,7 +42,7 @@ LINEAR: Any = [
 ]
 
 
-@pytest.mark.representatives(4)
+@pytest.mark.representatives(2)
 @pytest.mark.parametrize(
     "term, solver",
     [(TERM, s) for s in LIE] + [(diffrax.ODETerm(ode), s) for s in LINEAR],
@@ -75,7 +75,7 @@ def test_it_takes_the_steps_of_diffeqsolve(term, solver, t1):
 # Output
 
 
-@pytest.mark.representatives(5)
+@pytest.mark.representatives(3)
 @pytest.mark.parametrize("t0, t1", [(0.0, 1.0), (0.1, 0.7), (0.3, -2.6), (1e9, 1e9 + 1)])
 @pytest.mark.parametrize("save_every", [None, 1, 3, 12])
 def test_the_shape_and_the_times_of_the_output(t0, t1, save_every):
@@ -378,6 +378,7 @@ def test_the_memory_forwards_does_not_grow_with_the_steps():
     assert temporary_bytes(100) == temporary_bytes(100_000)
 
 
+@pytest.mark.slow
 def test_the_memory_forwards_grows_by_what_is_saved():
     few, many = temporary_bytes(1000, save_every=100), temporary_bytes(1000, save_every=1)
     saved = 990 * (BIG**2 + 1) * 8
@@ -479,6 +480,7 @@ def test_a_state_of_no_numbers(y0, no_shape_hook):
         cfjax.integrate(term, cfjax.CF4(), 0.0, 1.0, y0, num_steps=2)
 
 
+@pytest.mark.representatives(1)
 @pytest.mark.parametrize("dtype", [bool, np.int32, np.float16, jnp.bfloat16])
 def test_integers_and_half_precision_become_the_default_dtype(dtype):
     """In both loops."""
@@ -495,7 +497,7 @@ def test_integers_and_half_precision_become_the_default_dtype(dtype):
     problems.assert_close(ours, theirs, atol=1e-14)
 
 
-@pytest.mark.representatives(8)
+@pytest.mark.representatives(3)
 @pytest.mark.parametrize("y0", [None, {}, {"a": None, "b": jnp.ones(2)}, {"b": jnp.zeros((0, 3))}])
 @pytest.mark.parametrize(
     "solver",
@@ -628,6 +630,7 @@ def test_the_result_tells_of_a_blow_up_where_nothing_is_thrown():
     close(calm.ys["a"][-1], [0.1 / 0.8, 0.4 / 0.2], atol=1e-6)
 
 
+@pytest.mark.slow
 def test_in_a_batch_the_result_tells_which_blew_up():
     starts = jnp.asarray([0.4, 1.0, 0.2])
     sol = jax.vmap(lambda y: explosion(y, throw=False))(starts)
@@ -641,7 +644,7 @@ def test_a_start_that_is_not_finite_is_in_the_result():
     assert explosion(np.nan, throw=False).result == diffrax.RESULTS.nonfinite
 
 
-@pytest.mark.representatives(3)
+@pytest.mark.representatives(1)
 @pytest.mark.parametrize(
     "field, y0",
     [
@@ -780,6 +783,7 @@ def test_an_attitude_stays_a_rotation_over_a_million_steps():
     assert orthogonality(sol.ys).max() < 1e-14
 
 
+@pytest.mark.slow
 def test_a_large_matrix_stays_orthogonal():
     generators = np.random.default_rng(1).standard_normal((3, 8, 8))
 
@@ -803,6 +807,7 @@ def test_a_large_matrix_stays_orthogonal():
     assert orthogonality(sol.ys).max() < 3e-14
 
 
+@pytest.mark.slow
 def test_compensation_serves_every_part_whose_field_offers_a_displacement():
     y0 = {
         "vector": jnp.arange(1.0, 4.0),

@@ -87,7 +87,7 @@ def test_reference_and_method_give_the_tabulated_numbers(problem):
         np.testing.assert_allclose(y.sum(), total, rtol=0, atol=2e-12)
 
 
-@pytest.mark.representatives(2)
+@pytest.mark.representatives(1)
 @both
 @pytest.mark.parametrize("name", METHODS)
 def test_order(problem, name):

@@ -387,6 +387,7 @@ def pendulum_ode(gravity):
     return ode
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("name", ["CF4"])
 def test_a_pendulum_passes_a_plane_on_the_sphere_at_the_right_time(name):
     gravity = 2.0

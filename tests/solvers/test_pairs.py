@@ -192,6 +192,7 @@ def test_a_weak_dependence_on_the_state_hides_no_error(estimate):
         assert sol.stats["num_accepted_steps"] > 30
 
 
+@pytest.mark.slow
 def test_part_of_a_state_can_be_blind_to_the_last_evaluation():
     """CF4's companion differs by f(y1) only: no help where the field does not see the state."""
 

@@ -250,7 +250,7 @@ def test_pytree_of_manifolds(flight_problem):
 # Memory: solvers whose last stage is the first of the next step.
 
 
-@pytest.mark.representatives(1)
+@pytest.mark.slow
 @pytest.mark.parametrize(
     "name, as_in_paper, direction",
     [("CF4", True, 1), ("CF4", False, -1), ("Tsit5", False, 1), ("Tsit5", True, -1)],
@@ -262,7 +262,7 @@ def test_fixed_steps_are_those_of_the_solver(name, as_in_paper, direction):
     close(ys(found), ys(plain), 1e-13)
 
 
-@pytest.mark.representatives(1)
+@pytest.mark.slow
 @variants
 @pytest.mark.parametrize("name", ["CF4", "Tsit5"])
 def test_accepted_steps_are_those_of_the_solver(name, as_in_paper):
@@ -302,7 +302,7 @@ def test_memory_is_renewed_after_a_jump(as_in_paper):
 # Output between steps
 
 
-@pytest.mark.representatives(1)
+@pytest.mark.slow
 @variants
 def test_dense_output_is_that_of_the_solver(as_in_paper):
     solver, _, problem = CASES["Tsit5"]
@@ -321,6 +321,7 @@ def test_dense_output_is_that_of_the_solver(as_in_paper):
     close(jax.vmap(backwards.evaluate)(-times), jax.vmap(plain.evaluate)(-times), 1e-13)
 
 
+@pytest.mark.slow
 def test_output_between_steps_on_a_manifold_is_that_of_the_halves():
     problem = CASES["CF4"][2]
     saveat = diffrax.SaveAt(dense=True)
@@ -333,6 +334,7 @@ def test_output_between_steps_on_a_manifold_is_that_of_the_halves():
 # Modes of use
 
 
+@pytest.mark.slow
 def test_single_precision_and_batch():
     problem = (
         cfjax.LieTerm(problems.rigid_body),
@@ -397,6 +399,7 @@ def test_a_step_that_is_not_finite_is_rejected():
     close(ys(solution)[-1], [1 - np.exp(-3)], 1e-5)
 
 
+@pytest.mark.slow
 def test_an_implicit_solver_takes_the_tolerances_of_the_controller():
     controller = diffrax.PIDController(rtol=0.0, atol=1e-7)
     problem = CASES["Tsit5"][2]
@@ -425,6 +428,7 @@ def test_unknown_order():
         solve(Richardson(NoOrder()), CASES["Euler"][2])
 
 
+@pytest.mark.slow
 def test_a_complex_state_in_single_precision():
     """A spin that precesses: the exact end, to a few times the tolerance."""
     term = cfjax.LieTerm(lambda t, y, args: cfjax.LeftMatrix(args))
