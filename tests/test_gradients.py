@@ -124,6 +124,7 @@ class Network(eqx.Module):
         return cfjax.Rotation(self.mlp(jnp.append(y, t)))
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("loop", ["integrate", pytest.param("diffeqsolve", marks=pytest.mark.slow)])
 def test_gradients_in_a_network_held_by_the_term(loop):
     """By `eqx.filter_grad` over the term, for a batch of starts."""
@@ -213,7 +214,7 @@ METHODS = {
 }
 # The low-storage methods ask nothing more of a field: they get one of each kind of points.
 PAIRS = [
-    *((kind, "CF4") for kind in GRID),
+    *(pytest.param(kind, "CF4", marks=[pytest.mark.slow] * (kind == "attitude")) for kind in GRID),
     *(
         pytest.param(kind, "RKMK3", marks=[pytest.mark.slow] * (kind not in ("vector", "affine")))
         for kind in GRID
@@ -287,7 +288,7 @@ def test_at_a_zero_field(solver, problem):
     np.testing.assert_allclose(d_scale, expected, rtol=0, atol=2e-6)
 
 
-@pytest.mark.representatives(1)
+@pytest.mark.slow
 @solvers
 def test_at_a_field_that_vanishes_with_the_state(solver):
     """y = 0 is a fixed point of the body, and the flow there is the identity to first order."""
@@ -315,7 +316,7 @@ def test_at_a_zero_step(problem):
     np.testing.assert_allclose(d_t1, problems.inner(slope, velocity), rtol=0, atol=1e-14)
 
 
-@pytest.mark.representatives(1)
+@pytest.mark.slow
 @solvers
 def test_at_large_angles(solver):
     """From half a turn to more than six turns in one step.
@@ -371,7 +372,7 @@ def test_at_large_angles_of_a_constant_field(solver):
 # Higher order
 
 
-@pytest.mark.representatives(1)
+@pytest.mark.slow
 @pytest.mark.parametrize(
     "solver, problem, num_steps",
     [("RKMK4", BODY, 4), pytest.param("CF4", MATRIX, 2, marks=pytest.mark.slow)],

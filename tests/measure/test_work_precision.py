@@ -247,6 +247,7 @@ def test_turns_are_taken_in_order_and_within_the_budget():
     assert _work_precision.take_turns(programs, repeats=4, budget=1e-9).shape == (3, 1)
 
 
+@pytest.mark.slow
 def test_backwards_in_time_and_in_single_precision(answer):
     y0, args = np.float32(answer), np.float32(ARGS)
     bosh = (SPACE, diffrax.Bosh3())
