@@ -424,6 +424,7 @@ def test_hessians_in_every_order(solver):
         np.testing.assert_allclose(found, expected, rtol=0, atol=2e-8)
 
 
+@pytest.mark.slow
 def test_programs_of_second_derivatives_are_short():
     """Some four times those of the gradient, in every order, and compiled no longer than they are.
 

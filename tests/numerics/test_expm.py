@@ -338,7 +338,7 @@ def second_derivatives(a, v):
     return forward_over_reverse, jax.grad(slope)(a), reverse_over_reverse
 
 
-@pytest.mark.representatives(2)
+@pytest.mark.representatives(1)
 @pytest.mark.parametrize("member", range(4))
 def test_second_derivatives(member):
     a, v = BATCH[member], jnp.asarray(random("general", 3, 1.0, seed=3))
@@ -350,6 +350,7 @@ def test_second_derivatives(member):
         np.testing.assert_allclose(second, difference, rtol=0, atol=1e-7)
 
 
+@pytest.mark.slow
 def test_third_derivative():
     # d³/dx³ exp(x·J) = -J·exp(x·J) for a rotation J.
     rotation = jnp.asarray([[0.0, -1.0], [1.0, 0.0]])
@@ -363,6 +364,7 @@ def test_third_derivative():
         np.testing.assert_allclose(third(x), -np.cos(x), rtol=0, atol=4 * 4 * 2 * 2.3e-16 * (1 + x))
 
 
+@pytest.mark.slow
 def test_maps_and_derivatives_commute():
     gradients = jnp.stack([gradient(a, SHARED) for a in BATCH])
     # Gradients of norm 1, rounded in another order: 4·3·80 units as in test_accuracy, and the
@@ -377,6 +379,7 @@ def test_maps_and_derivatives_commute():
     np.testing.assert_allclose(got, jnp.stack([gradients] * 2), rtol=0, atol=tolerance)
 
 
+@pytest.mark.slow
 def test_hessian_under_vmap():
     got = jax.jit(jax.vmap(jax.hessian(curved), in_axes=(0, None)))(BATCH, SHARED)
     v = jnp.asarray(random("general", 3, 1.0, seed=3))
@@ -424,7 +427,7 @@ def test_refuses_other_dtypes(dtype):
         inspect.unwrap(expm)(jnp.zeros((2, 2), dtype))
 
 
-@pytest.mark.representatives(1)
+@pytest.mark.slow
 @pytest.mark.parametrize("norm", [0.0, 0.3, 1.0])
 def test_second_derivative_of_a_size_with_two_schemes(norm):
     # d²/dx² exp(x·a) = a²·exp(x·a).

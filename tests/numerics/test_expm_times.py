@@ -80,7 +80,7 @@ def test_which_points_are_thin():
     assert not _is_thin(jnp.zeros((7, 7)), jnp.zeros(7))
 
 
-@pytest.mark.representatives(4)
+@pytest.mark.representatives(2)
 @BOTH
 @pytest.mark.parametrize(
     ("kind", "dtype", "point_dtype"),
