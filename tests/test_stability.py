@@ -98,6 +98,7 @@ def test_without_an_explicit_part_a_step_is_exact(solver):
     np.testing.assert_allclose(found, np.exp(z), rtol=43 * 50 * 2.0**-52)
 
 
+@pytest.mark.slow
 def test_negative_rows_overflow_where_dissipation_is_strong():
     """They go backwards in time: a Crouch-Grossman method meets exp(+|z|) on its way."""
     z = -1e6
@@ -124,6 +125,7 @@ def test_methods_with_flows_backwards_in_time_say_so():
         assert backwards == (not np.isfinite(cfjax.stability_function(tableau, -1e6, 1.0))), solver
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("dtype, limit", [("float64", 3000), ("float32", 370)])
 def test_how_long_a_step_of_cf54_may_be(dtype, limit):
     """Up to what its docstring says. Behind, error control rejects; CF43 has no such limit."""

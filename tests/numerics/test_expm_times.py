@@ -135,7 +135,7 @@ def forward(cls, a, direction, point):
     return jax.jvp(lambda a: cls(a).flow(point), (a,), (direction,))[1]
 
 
-@pytest.mark.representatives(3)
+@pytest.mark.representatives(1)
 @BOTH
 @pytest.mark.parametrize("norm", [0.0, 0.5, 2.0, 30.0])
 def test_derivatives(cls, norm):
@@ -166,6 +166,7 @@ def test_a_derivative_does_not_depend_on_the_point():
     np.testing.assert_allclose(got, want, rtol=0, atol=1e-13)
 
 
+@pytest.mark.slow
 def test_the_second_derivative_at_zero():
     # The term of second order of exp is d d / 2, so its second derivative along d is d d.
     d, point = random((N, N), 2), jnp.asarray(random((N,), 3))

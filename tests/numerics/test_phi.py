@@ -95,6 +95,7 @@ def test_modes_agree():
     np.testing.assert_allclose(twice, mixed, rtol=1e-15)
 
 
+@pytest.mark.slow
 def test_second_reverse_pass_through_a_checkpointed_loop():
     """A loop may lose the rule of the derivative, and then differentiates what is inside."""
 
