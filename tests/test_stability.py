@@ -263,6 +263,7 @@ def test_the_error_of_large_steps_is_large_and_seen(solver):
         assert seen > error / 4
 
 
+@pytest.mark.slow
 def test_a_huge_first_step_is_rejected():
     tolerance = 1e-6
 
@@ -377,6 +378,7 @@ def test_a_far_stage_makes_the_error_constant_grow(side, body_answer):
 # float32
 
 
+@pytest.mark.slow
 def test_single_precision_does_not_get_worse_with_more_steps():
     """The distance to the same steps in float64, for sixteen starts close to each other."""
     starts = rigid_body.y0 + 0.01 * np.random.default_rng(7).normal(size=(16, 3))

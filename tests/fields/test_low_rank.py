@@ -187,6 +187,7 @@ def test_a_step_is_the_step_with_full_matrices(pair, name):
     assert np.abs(found - Y0).max() > 0.05
 
 
+@pytest.mark.slow
 def test_backwards_is_the_step_with_full_matrices():
     for pair in [(low_rank, low_rank_dense), (border, border_dense)]:
         found, expected = (one_step(cfjax.CF2(), f, Y0, h=-0.3) for f in pair)

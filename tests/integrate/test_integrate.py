@@ -262,6 +262,7 @@ def end(t0, t1, y0, args):
 POINT = (jnp.asarray(0.2), jnp.asarray(0.9), Y0, ARGS)
 
 
+@pytest.mark.slow
 def test_inside_jit_and_vmap():
     expected = end(*POINT)
     close(jax.jit(end)(*POINT), expected, atol=1e-15)
@@ -394,6 +395,7 @@ def test_the_memory_backwards_is_one_state_for_each_step():
     assert BIG**2 * 8 <= a_step <= (BIG**2 + 4) * 8
 
 
+@pytest.mark.slow
 def test_the_memory_backwards_of_a_small_system_is_its_state_and_a_count_for_each_step():
     few, many = (temporary_bytes(n, reverse=True, y0=Y0) for n in (100, 10_100))
     assert (many - few) / 10_000 <= 3 * 8 + 4
@@ -480,7 +482,7 @@ def test_a_state_of_no_numbers(y0, no_shape_hook):
         cfjax.integrate(term, cfjax.CF4(), 0.0, 1.0, y0, num_steps=2)
 
 
-@pytest.mark.representatives(1)
+@pytest.mark.slow
 @pytest.mark.parametrize("dtype", [bool, np.int32, np.float16, jnp.bfloat16])
 def test_integers_and_half_precision_become_the_default_dtype(dtype):
     """In both loops."""

@@ -390,6 +390,7 @@ def test_hessian_under_vmap():
         np.testing.assert_allclose(product, second_derivatives(a, v)[0], rtol=0, atol=tolerance)
 
 
+@pytest.mark.slow
 def test_through_a_scan_with_checkpoints():
     a = jnp.asarray(random("general", 3, 4.0))
 

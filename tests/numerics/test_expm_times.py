@@ -174,6 +174,7 @@ def test_the_second_derivative_at_zero():
     np.testing.assert_allclose(got, d @ d @ point, rtol=0, atol=1e-12)
 
 
+@pytest.mark.slow
 def test_a_batch_of_different_norms():
     point = random((N,), 1)
     for norms in (NORMS[:6], NORMS):

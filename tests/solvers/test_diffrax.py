@@ -688,6 +688,7 @@ def test_no_warning_comes_from_a_plain_solve():
     assert caught == []
 
 
+@pytest.mark.slow
 def test_the_solver_carries_no_state_from_step_to_step():
     """Two solves of half the length are one solve."""
     saveat = diffrax.SaveAt(t1=True, solver_state=True, controller_state=True, made_jump=True)

@@ -104,7 +104,7 @@ def test_mistaken_scales():
 # The first step
 
 
-@pytest.mark.representatives(1)
+@pytest.mark.slow
 @pytest.mark.parametrize("speed", [1e-4, 1.0, 1e4])
 @pytest.mark.parametrize("direction", [1.0, -1.0])
 def test_a_first_step_is_accepted_and_not_far_too_short(speed, direction):
