@@ -137,6 +137,7 @@ def test_command_as_a_user(tmp_path):
     check_text(done.stdout)
 
 
+@pytest.mark.slow
 def test_a_second_run(tmp_path, capsys):
     output = tmp_path / "figures"
     output.mkdir()
