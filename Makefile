@@ -5,7 +5,7 @@ PYTEST := -m pytest --numprocesses auto --dist worksteal
 # Each solver and each field once, what the code relies on in jax, equinox and diffrax, and imports.
 QUICK := tests/test_quick.py tests/test_canary.py tests/test_public.py tests/test_architecture.py
 
-.PHONY: paper lint test test-all test-quick test-lowest test-newest benchmarks readme clean
+.PHONY: paper lint test test-all test-quick test-lowest test-newest coverage defects benchmarks readme clean
 
 # Tables and figures of the paper, in figures/.
 paper: .venv/paper
@@ -49,6 +49,14 @@ benchmarks: .venv/dev
 # README's tables, numbers and pictures, from what has been measured.
 readme: .venv/dev
 	$(BIN)/python benchmarks/readme.py
+
+# The tests of `make test`, with lines and branches of cfjax that they do not reach.
+coverage: .venv/dev
+	$(BIN)/python -m pytest --numprocesses auto --dist worksteal --cov --cov-report=term-missing
+
+# Whether the tests see mistakes, planted one at a time.
+defects: .venv/dev
+	$(BIN)/python tests/planted_defects.py
 
 .venv/paper .venv/dev: pyproject.toml
 	test -x $(BIN)/python || $(PYTHON) -m venv .venv

@@ -1,3 +1,5 @@
+from collections import defaultdict
+
 import jax
 import jaxtyping
 import pytest
@@ -20,3 +22,30 @@ def no_shape_hook():
     jaxtyping.config.update("jaxtyping_disable", True)
     yield
     jaxtyping.config.update("jaxtyping_disable", False)
+
+
+@pytest.hookimpl(tryfirst=True)
+def pytest_collection_modifyitems(items):
+    """Of a test marked `representatives(n)` all but n sets of parameters are slow.
+
+    Those that stay quick have as many values of single parameters as n sets can have: in a product
+    the first, then one that differs in all parameters.
+    """
+    cases = defaultdict(list)
+    for item in items:
+        if item.get_closest_marker("representatives") and not item.get_closest_marker("slow"):
+            cases[item.path, item.originalname].append(item)
+    for rest in cases.values():
+        (number,) = rest[0].get_closest_marker("representatives").args
+        seen = set()
+        for _ in range(min(number, len(rest))):
+            chosen = max(rest, key=lambda item: len(values(item) - seen))
+            seen |= values(chosen)
+            rest.remove(chosen)
+        for item in rest:
+            item.add_marker(pytest.mark.slow)
+
+
+def values(item):
+    """Which value each parameter has: the same objects make all sets of a product."""
+    return {(name, id(value)) for name, value in item.callspec.params.items()}

@@ -173,11 +173,14 @@ EXAMPLES: dict[str, tuple[Any, tuple[Any, ...], tuple[str, ...]]] = {
     "fft": (jnp.fft.fft, (X,), ("fft_lengths",)),
     "gather": (lambda x: x[jnp.asarray([0, 1])], (jnp.asarray(X),), ()),
     "integer_pow": (lambda x: lax.integer_pow(x, 3), (X,), ("y",)),
+    "iota": (lambda: lax.iota(jnp.float32, 3), (), ("dtype", "shape", "dimension")),
     "lu": (lax.linalg.lu, (M,), ()),
     "optimization_barrier": (lax.optimization_barrier, (X,), ()),
     "pad": (lambda x: lax.pad(x, 0.0, [(1, 1, 0)]), (X,), ()),
     "pure_callback": (lambda x: jax.pure_callback(np.sin, x, x), (X,), ("callback",)),
     "qr": (jnp.linalg.qr, (M,), ("full_matrices",)),
+    "reduce_and": (jnp.all, (X > 0,), ("axes",)),
+    "reduce_or": (jnp.any, (X > 0,), ("axes",)),
     "reduce_max": (jnp.max, (X,), ()),
     "reduce_min": (jnp.min, (X,), ()),
     "reduce_prod": (jnp.prod, (X,), ()),
@@ -189,7 +192,11 @@ EXAMPLES: dict[str, tuple[Any, tuple[Any, ...], tuple[str, ...]]] = {
         (X,),
         ("length", "jaxpr", "reverse"),
     ),
-    "scatter": (lambda x: x.at[jnp.asarray([0])].set(1.0), (jnp.asarray(X),), ()),
+    "scatter": (
+        lambda x: x.at[jnp.asarray([0])].set(1.0),
+        (jnp.asarray(X),),
+        ("dimension_numbers", "indices_are_sorted", "unique_indices", "mode"),
+    ),
     "select_n": (lambda x: lax.select(x > 0, x, x), (X,), ()),
     "slice": (
         lambda x: lax.slice(x, (0,), (2,)),
@@ -209,6 +216,16 @@ EXAMPLES: dict[str, tuple[Any, tuple[Any, ...], tuple[str, ...]]] = {
 # One of these names, whichever this version has, with the parameter.
 EITHER = {
     ("jit", "pjit"): (jax.jit(jnp.sin), (X,), ("jaxpr",)),
+    ("scatter-add", "scatter_add"): (
+        lambda x: x.at[jnp.asarray([0])].add(1.0),
+        (jnp.asarray(X),),
+        ("dimension_numbers",),
+    ),
+    ("scatter-mul", "scatter_mul"): (
+        lambda x: x.at[jnp.asarray([0])].mul(2.0),
+        (jnp.asarray(X),),
+        ("dimension_numbers",),
+    ),
     ("checkpoint", "remat2"): (jax.checkpoint(jnp.sin), (X,), ("jaxpr",)),
 }
 # Written down beside the others, for versions and programs in which they occur.
@@ -267,6 +284,7 @@ def tables():
     for module in modules:
         for name, value in vars(module).items():
             is_table = isinstance(value, dict | frozenset | set) and value
+            is_table = is_table and set(value) != {"loop", "step"}
             if is_table and not name.startswith("__") and all(isinstance(x, str) for x in value):
                 yield f"{module.__name__}.{name}", value
 

@@ -76,6 +76,7 @@ def check(fun, x, atol, seed=0, forwards=True):
 
 # The body divides by its inertia, 5! comes in, and directions are up to 2 long: derivatives of
 # 3e4. The matrices are sums of products, with derivatives of 1e4.
+@pytest.mark.representatives(1)
 @pytest.mark.parametrize(
     "loop, solver, problem",
     [
@@ -101,6 +102,7 @@ def test_gradients_in_start_and_args(loop, solver, problem):
     assert all(np.abs(leaf).max() > 1e-3 for leaf in jtu.tree_leaves(gradient))
 
 
+@pytest.mark.slow
 def test_the_two_loops_have_the_same_gradient():
     found, expected = (
         jax.jit(jax.grad(lambda x, loop=loop: functional(end(loop, LIE["CF4"], BODY[0], *x))))(
@@ -122,6 +124,7 @@ class Network(eqx.Module):
         return cfjax.Rotation(self.mlp(jnp.append(y, t)))
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("loop", ["integrate", pytest.param("diffeqsolve", marks=pytest.mark.slow)])
 def test_gradients_in_a_network_held_by_the_term(loop):
     """By `eqx.filter_grad` over the term, for a batch of starts."""
@@ -211,7 +214,7 @@ METHODS = {
 }
 # The low-storage methods ask nothing more of a field: they get one of each kind of points.
 PAIRS = [
-    *((kind, "CF4") for kind in GRID),
+    *(pytest.param(kind, "CF4", marks=[pytest.mark.slow] * (kind == "attitude")) for kind in GRID),
     *(
         pytest.param(kind, "RKMK3", marks=[pytest.mark.slow] * (kind not in ("vector", "affine")))
         for kind in GRID
@@ -224,6 +227,7 @@ PAIRS = [
 PLACES = jnp.asarray([(1.0, 0.2, 0.9), (0.0, 0.2, 0.9), (1.0, 0.2, 0.2), (0.0, 0.2, 0.2)])
 
 
+@pytest.mark.representatives(5)
 @pytest.mark.parametrize("kind, method", PAIRS)
 def test_finite_and_right_for_every_field_and_method(kind, method):
     """In the field's scale, both times, the start and args (a spectrum in them) at once.
@@ -260,6 +264,7 @@ def test_finite_and_right_for_every_field_and_method(kind, method):
 # Hard places
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("solver, problem", [("RKMK4", BODY), ("CF4", MATRIX)])
 def test_at_a_zero_field(solver, problem):
     """At scale 0 the end is the start, and its derivative in the scale is the field's integral."""
@@ -283,6 +288,7 @@ def test_at_a_zero_field(solver, problem):
     np.testing.assert_allclose(d_scale, expected, rtol=0, atol=2e-6)
 
 
+@pytest.mark.slow
 @solvers
 def test_at_a_field_that_vanishes_with_the_state(solver):
     """y = 0 is a fixed point of the body, and the flow there is the identity to first order."""
@@ -292,6 +298,7 @@ def test_at_a_field_that_vanishes_with_the_state(solver):
     np.testing.assert_allclose(jacobian, np.eye(3), rtol=0, atol=1e-15)
 
 
+@pytest.mark.representatives(1)
 @pytest.mark.parametrize("problem", [BODY, MATRIX], ids=["body", "matrix"])
 def test_at_a_zero_step(problem):
     """t1 = t0: the end is the start, and its derivative in t1 is the velocity."""
@@ -309,6 +316,7 @@ def test_at_a_zero_step(problem):
     np.testing.assert_allclose(d_t1, problems.inner(slope, velocity), rtol=0, atol=1e-14)
 
 
+@pytest.mark.slow
 @solvers
 def test_at_large_angles(solver):
     """From half a turn to more than six turns in one step.
@@ -340,6 +348,7 @@ def test_at_large_angles(solver):
     assert angles[0] < np.pi and angles[1] > 2 * np.pi and angles[2] > 6 * np.pi
 
 
+@pytest.mark.slow
 @solvers
 def test_at_large_angles_of_a_constant_field(solver):
     """Six turns in one step, with the derivative in closed form: a turn about the third axis."""
@@ -363,6 +372,7 @@ def test_at_large_angles_of_a_constant_field(solver):
 # Higher order
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     "solver, problem, num_steps",
     [("RKMK4", BODY, 4), pytest.param("CF4", MATRIX, 2, marks=pytest.mark.slow)],
@@ -396,6 +406,7 @@ def orders(fun):
     return [outer(inner(fun)) for inner in modes for outer in modes]
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("solver", [cfjax.CF3(), pytest.param(cfjax.CF4(), marks=pytest.mark.slow)])
 def test_hessians_in_every_order(solver):
     """In start and inertia, against differences of gradients."""
@@ -413,6 +424,7 @@ def test_hessians_in_every_order(solver):
         np.testing.assert_allclose(found, expected, rtol=0, atol=2e-8)
 
 
+@pytest.mark.slow
 def test_programs_of_second_derivatives_are_short():
     """Some four times those of the gradient, in every order, and compiled no longer than they are.
 
@@ -451,6 +463,7 @@ def test_a_gradient_of_a_gradient():
     np.testing.assert_allclose(found, expected, rtol=0, atol=2e-8)
 
 
+@pytest.mark.slow
 def test_a_batch_of_hessian_vector_products():
     """Reverse over forward and forward over reverse, each under vmap, against one at a time."""
     field, y0, args = BODY
@@ -478,6 +491,7 @@ def test_a_batch_of_hessian_vector_products():
 # Closed forms
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("solver", [cfjax.CF4(), cfjax.RKMK4()], ids=["CF4", "RKMK4"])
 def test_a_linear_flow_in_its_spectrum(solver):
     """`u' = M u + b` is solved exactly, so its derivatives in spectrum, b, start and time are."""
@@ -507,6 +521,7 @@ def test_a_linear_flow_in_its_spectrum(solver):
         np.testing.assert_allclose(a, e, rtol=1e-12, atol=1e-9)
 
 
+@pytest.mark.slow
 def test_heat_with_a_constant_diffusivity():
     """All steps are exact then: the sensitivity in the constant is `t M u(t)`.
 
@@ -551,6 +566,7 @@ def skew_of(gamma):
     return wide - wide.T
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("kind", ["left", "bordered"])
 def test_a_constant_field_on_the_stiefel_manifold(kind):
     """The end is `exp(t a) Q`: derivatives in a, by the Frechet derivative, and in t."""
@@ -578,6 +594,7 @@ def test_a_constant_field_on_the_stiefel_manifold(kind):
     )
 
 
+@pytest.mark.slow
 def test_turning_the_frame_turns_its_solution():
     """For equal weights of the columns `Y(t; Q R) = Y(t; Q) R`: along `Q w` it moves by `Y w`.
 
@@ -612,6 +629,7 @@ def tangential(y, g):
     return g - y @ (y.T @ g + g.T @ y) / 2
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("problem", ["sphere", "rotations", "orthogonal"])
 def test_the_gradient_in_the_algebra_is_the_tangential_one(problem):
     """`w -> loss(exp(w) y)` at w = 0 sees the tangential part of the Euclidean gradient alone."""
@@ -647,6 +665,7 @@ def test_the_gradient_in_the_algebra_is_the_tangential_one(problem):
 # Structure
 
 
+@pytest.mark.slow
 @solvers
 def test_the_energy_of_the_body_has_its_initial_gradient_forever(solver):
     """Energy is constant, so d E(y(T)) / d y(0) = dE(y(0)), up to the method's error.
@@ -675,6 +694,7 @@ def test_the_energy_of_the_body_has_its_initial_gradient_forever(solver):
     assert solver.order(None) - 0.3 < problems.slope(steps, found) < solver.order(None) + 1.3
 
 
+@pytest.mark.slow
 @solvers
 def test_the_length_of_the_momentum_has_its_initial_gradient_exactly(solver):
     """The flow keeps |y| whatever the field, so this gradient has no error of the method."""

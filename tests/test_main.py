@@ -174,6 +174,7 @@ def read_until(stream, text):
     raise AssertionError(f"{text!r} was not printed.")
 
 
+@pytest.mark.representatives(1)
 @pytest.mark.parametrize(
     "number, status, message",
     [(signal.SIGINT, 130, "cfjax: interrupted"), (signal.SIGTERM, 143, "cfjax: terminated")],

@@ -10,6 +10,7 @@ README = (ROOT / "README.md").read_text()
 EXAMPLES = re.findall(r"```python\n(.*?)```", README, flags=re.DOTALL)
 
 
+@pytest.mark.representatives(2)
 @pytest.mark.parametrize("example", EXAMPLES, ids=lambda e: e.strip().splitlines()[-1])
 def test_examples_run_when_pasted(example):
     # A new process: what a reader has, without the settings of these tests.

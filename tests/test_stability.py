@@ -76,6 +76,7 @@ SOLVERS = [
 ]
 
 
+@pytest.mark.representatives(2)
 @pytest.mark.parametrize("solver", SOLVERS, ids=lambda s: type(s).__name__)
 def test_the_tableau_says_what_a_real_step_does(solver):
     z, w = RNG.normal(size=(2, 200)) + 1j * RNG.normal(size=(2, 200))
@@ -88,6 +89,7 @@ def test_the_tableau_says_what_a_real_step_does(solver):
     np.testing.assert_allclose(found, expected, rtol=0, atol=1e-13 * scale)
 
 
+@pytest.mark.representatives(2)
 @pytest.mark.parametrize("solver", SOLVERS, ids=lambda s: type(s).__name__)
 def test_without_an_explicit_part_a_step_is_exact(solver):
     z = np.array([0, -1e-9, -1, -50, 3j, -2 + 5j])
@@ -96,6 +98,7 @@ def test_without_an_explicit_part_a_step_is_exact(solver):
     np.testing.assert_allclose(found, np.exp(z), rtol=43 * 50 * 2.0**-52)
 
 
+@pytest.mark.slow
 def test_negative_rows_overflow_where_dissipation_is_strong():
     """They go backwards in time: a Crouch-Grossman method meets exp(+|z|) on its way."""
     z = -1e6
@@ -122,6 +125,7 @@ def test_methods_with_flows_backwards_in_time_say_so():
         assert backwards == (not np.isfinite(cfjax.stability_function(tableau, -1e6, 1.0))), solver
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("dtype, limit", [("float64", 3000), ("float32", 370)])
 def test_how_long_a_step_of_cf54_may_be(dtype, limit):
     """Up to what its docstring says. Behind, error control rejects; CF43 has no such limit."""
@@ -138,6 +142,7 @@ def test_how_long_a_step_of_cf54_may_be(dtype, limit):
     assert np.isfinite(step(cfjax.CF43(), 100 * limit)).all()
 
 
+@pytest.mark.representatives(2)
 @pytest.mark.parametrize("solver, order", [(cfjax.CF3(), 3), (cfjax.CF4(), 4), (cfjax.CF2(), 2)])
 def test_without_an_exact_part_it_is_the_classical_polynomial(solver, order):
     """A method of as many stages as its order has the truncated series of the exponential."""
@@ -147,6 +152,7 @@ def test_without_an_exact_part_it_is_the_classical_polynomial(solver, order):
     np.testing.assert_allclose(found, series, rtol=1e-13)
 
 
+@pytest.mark.representatives(2)
 @pytest.mark.parametrize(
     "solver, direction, limit",
     [
@@ -208,6 +214,7 @@ START, INERTIA = jnp.asarray(rigid_body.y0), jnp.asarray(rigid_body.inertia)
 LENGTH = np.linalg.norm(rigid_body.y0)
 
 
+@pytest.mark.representatives(2)
 @pytest.mark.parametrize("solver", [cfjax.CF3(), cfjax.CF4(), cfjax.RKMK4()])
 @pytest.mark.parametrize("dtype", [np.float32, np.float64])
 def test_large_steps_stay_on_the_sphere(solver, dtype):
@@ -233,6 +240,7 @@ def test_large_steps_stay_on_the_sphere(solver, dtype):
         assert np.abs(length - LENGTH).max() < 5 * np.sqrt(128) * eps / 2
 
 
+@pytest.mark.representatives(1)
 @pytest.mark.parametrize("solver", [cfjax.CF3(), cfjax.CF4(), cfjax.RKMK4()])
 def test_the_error_of_large_steps_is_large_and_seen(solver):
     """Beyond a rotation by one radian a step says nothing, and two step sizes disagree.
@@ -255,6 +263,7 @@ def test_the_error_of_large_steps_is_large_and_seen(solver):
         assert seen > error / 4
 
 
+@pytest.mark.slow
 def test_a_huge_first_step_is_rejected():
     tolerance = 1e-6
 
@@ -311,6 +320,7 @@ TOGETHER = [
 ]
 
 
+@pytest.mark.representatives(1)
 @pytest.mark.parametrize("family, singular, residue", TOGETHER)
 def test_weights_grow_and_the_error_constant_does_not(family, singular, residue):
     constants = []
@@ -325,6 +335,7 @@ def test_weights_grow_and_the_error_constant_does_not(family, singular, residue)
     np.testing.assert_allclose(constants, constants[-1], rtol=2e-3)
 
 
+@pytest.mark.representatives(1)
 @pytest.mark.parametrize("family, singular, residue", TOGETHER)
 def test_close_stages_magnify_rounding(family, singular, residue, body_answer):
     """The floor is eps over the distance; above it the order is 3 and the error no larger."""
@@ -343,6 +354,7 @@ def test_close_stages_magnify_rounding(family, singular, residue, body_answer):
     assert np.all((floor / expected > 1 / 5) & (floor / expected < 5))
 
 
+@pytest.mark.representatives(1)
 @pytest.mark.parametrize("side", [-1, 1])
 def test_a_far_stage_makes_the_error_constant_grow(side, body_answer):
     """At alpha = 1 of family B the second stage goes to infinity, and order 3 is late to come."""
@@ -366,6 +378,7 @@ def test_a_far_stage_makes_the_error_constant_grow(side, body_answer):
 # float32
 
 
+@pytest.mark.slow
 def test_single_precision_does_not_get_worse_with_more_steps():
     """The distance to the same steps in float64, for sixteen starts close to each other."""
     starts = rigid_body.y0 + 0.01 * np.random.default_rng(7).normal(size=(16, 3))

@@ -309,6 +309,7 @@ def test_a_complex_field_on_a_real_state_says_what_to_do(value, no_shape_hook):
         LieTerm(lambda t, y, args: value).vf(0.0, V3, None)
 
 
+@pytest.mark.slow
 def test_backsolve_adjoint():
     def loss(y0, args, adjoint):
         y = solve(LieTerm(rigid_body), CF4(), 0.02, y0, args, adjoint=adjoint)
@@ -326,6 +327,7 @@ def test_backsolve_adjoint():
         assert np.linalg.norm(b) > 0.1
 
 
+@pytest.mark.slow
 def test_gradient_with_respect_to_arrays_of_the_field():
     """A field that is a module: its arrays are parameters, here the matrix of y' = a y."""
 

@@ -11,7 +11,7 @@ from typing import Any, ClassVar
 import diffrax
 import equinox as eqx
 import jax.tree_util as jtu
-from jaxtyping import PyTree
+from jaxtyping import Array, PyTree, Real
 
 from .._field import (
     AbstractAlgebraElement,
@@ -40,7 +40,7 @@ class AbstractMuntheKaas(AbstractLieSolver):
     continuous_extension: eqx.AbstractVar[ContinuousExtension]
 
     @abc.abstractmethod
-    def elements(self, field: Callable[[float, PyTree], PyTree]) -> list[PyTree]:
+    def elements(self, field: Callable[[Any, PyTree], PyTree]) -> list[PyTree]:
         """What v is the combination of that has the weights `b`.
 
         `field(c, u)` is `h f(t + c h, exp(u) y0)`, and `u = None` means zero.
@@ -51,7 +51,7 @@ class AbstractMuntheKaas(AbstractLieSolver):
         path = Path.of(self.continuous_extension, value_of(start), elements)
         return Move(leave(v, flow(v, start)), path)
 
-    def logarithm(self, field: Callable[[float, PyTree], PyTree], y0: PyTree) -> Any:
+    def logarithm(self, field: Callable[[Any, PyTree], PyTree], y0: PyTree) -> Any:
         """The element v with the end of the step `exp(v) y0`, what it is a combination of, and y0.
 
         They are in the step's coordinates.
@@ -59,7 +59,7 @@ class AbstractMuntheKaas(AbstractLieSolver):
         fields: list[PyTree] = []
         start = y0
 
-        def field_at(c: float, u: PyTree) -> PyTree:
+        def field_at(c: float | Real[Array, ""], u: PyTree) -> PyTree:
             nonlocal start
             here = start if u is None else flow(u, start)
             value = field(c, leave(fields[0], here) if fields else here)

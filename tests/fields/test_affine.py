@@ -66,6 +66,7 @@ def exact(m, alpha, b, point):
     return np.stack(columns, axis=1).reshape(np.shape(point))
 
 
+@pytest.mark.representatives(6)
 @cases
 @pytest.mark.parametrize("columns", [(), (3,), (2, 2)])
 def test_flow_against_a_dense_exponential(case, columns):
@@ -78,6 +79,7 @@ def test_flow_against_a_dense_exponential(case, columns):
     np.testing.assert_allclose(found, wanted, rtol=0, atol=atol)
 
 
+@pytest.mark.representatives(3)
 @cases
 def test_tangent_is_the_velocity_of_the_flow(case):
     field, point, m = data(case)
@@ -112,6 +114,7 @@ def test_infinitely_stiff():
     np.testing.assert_allclose(found, b / (-2 * spectrum), rtol=4 * EPS)
 
 
+@pytest.mark.representatives(3)
 @cases
 def test_bracket_is_the_commutator_of_the_fields(case):
     a, x, m = data(case, seed=1)
@@ -226,6 +229,7 @@ KINDS = ("sine", "cosine", "Fourier", "real Fourier")
 PAIRS = [(a, b) for a in KINDS for b in KINDS if (a, b) != ("real Fourier",) * 2]
 
 
+@pytest.mark.representatives(5)
 @pytest.mark.parametrize("pair", PAIRS)
 def test_flow_on_a_grid(pair):
     transform, spectrum, m, dtype = on_grid(pair, (4, 5))
@@ -240,6 +244,7 @@ def test_flow_on_a_grid(pair):
     np.testing.assert_allclose(field.tangent(jnp.asarray(u)), velocity, rtol=0, atol=atol)
 
 
+@pytest.mark.representatives(1)
 @pytest.mark.parametrize("pair", [("sine", "cosine"), ("Fourier", "real Fourier")])
 def test_flow_on_a_grid_beyond_the_dense_limit(pair):
     """By the dense eigenvectors: an exponential of this size by SciPy is slow."""
@@ -294,6 +299,7 @@ def test_columns_first_where_an_axis_has_no_transform():
         np.testing.assert_allclose(end, exact_on_grid(d * m, 0.7, f, p), rtol=0, atol=100 * EPS)
 
 
+@pytest.mark.representatives(1)
 @pytest.mark.parametrize("pair", [("sine", "cosine"), ("Fourier", "real Fourier")])
 def test_float32_on_a_grid(pair):
     transform, spectrum, m, dtype = on_grid(pair, (4, 5))
@@ -307,6 +313,7 @@ def test_float32_on_a_grid(pair):
     np.testing.assert_allclose(found, wanted, rtol=0, atol=50 * 2.0**-23)
 
 
+@pytest.mark.representatives(1)
 @pytest.mark.parametrize("pair", [("sine", "cosine"), ("real Fourier", "Fourier")])
 def test_order_of_a_semilinear_problem_on_a_grid(pair):
     """Allen-Cahn with a forcing that does not commute with the Laplacian, against SciPy."""
@@ -397,6 +404,7 @@ def parts(field, point):
     return split, flow
 
 
+@pytest.mark.representatives(4)
 @cases
 @pytest.mark.parametrize("alpha", [0.7, 0.0])
 def test_derivatives(case, alpha):
@@ -404,6 +412,7 @@ def test_derivatives(case, alpha):
     check_derivatives(Affine(alpha, field.b, field.spectrum, field.transform), point)
 
 
+@pytest.mark.slow
 def test_derivatives_on_a_grid():
     transform, spectrum, _, dtype = on_grid(("real Fourier", "sine"), (4, 3))
     b, u = random_points(dtype, (4, 3))
@@ -438,6 +447,7 @@ def check_derivatives(field, point):
 # Dtypes, batches, and solutions.
 
 
+@pytest.mark.slow
 def test_float32():
     for case in CASES:
         field, point, m = data(case)
@@ -476,6 +486,7 @@ def reaction(transform):
     return field
 
 
+@pytest.mark.representatives(3)
 @pytest.mark.parametrize("solver, order", [(cfjax.CF3(), 3), (cfjax.CF4(), 4), (cfjax.RKMK4(), 4)])
 @pytest.mark.parametrize("case", ["sine", "cosine", "real Fourier", "coefficients"])
 def test_order_of_a_nonlinear_problem(solver, order, case):

@@ -41,6 +41,7 @@ def flow(field, point):
     return field.flow(point)
 
 
+@pytest.mark.representatives(5)
 @BOTH
 @pytest.mark.parametrize(
     "shape, dtype", [*((shape, np.float64) for shape in SHAPES), (SHAPES[0], np.float32)]
@@ -60,6 +61,7 @@ def test_flow(cls, dtype, shape, norm):
     np.testing.assert_allclose(np.asarray(got).T @ got, np.eye(shape[1]), rtol=0, atol=atol)
 
 
+@pytest.mark.representatives(1)
 @BOTH
 @pytest.mark.parametrize("shape", SHAPES)
 def test_tangent_is_the_velocity_of_the_flow(cls, shape):
@@ -175,6 +177,7 @@ def one_step(solver, field, y0, t0=0.2, h=0.3):
     return jax.jit(step)(y0, ARGS)
 
 
+@pytest.mark.representatives(2)
 @pytest.mark.parametrize("name", METHODS)
 @pytest.mark.parametrize("pair", [(low_rank, low_rank_dense), (border, border_dense)])
 def test_a_step_is_the_step_with_full_matrices(pair, name):
@@ -184,12 +187,14 @@ def test_a_step_is_the_step_with_full_matrices(pair, name):
     assert np.abs(found - Y0).max() > 0.05
 
 
+@pytest.mark.slow
 def test_backwards_is_the_step_with_full_matrices():
     for pair in [(low_rank, low_rank_dense), (border, border_dense)]:
         found, expected = (one_step(cfjax.CF2(), f, Y0, h=-0.3) for f in pair)
         np.testing.assert_allclose(found, expected, rtol=0, atol=2e-14)
 
 
+@pytest.mark.slow
 def test_a_product_of_manifolds():
     """A frame, a position in a linear space and a rotation, each driven by the others."""
 
@@ -210,6 +215,7 @@ def test_a_product_of_manifolds():
         problems.assert_close(found, expected, atol=2e-14)
 
 
+@pytest.mark.slow
 def test_solvers_loops_and_terms_of_diffrax():
     """integrate, diffeqsolve, and the sum of a term in time and one in a control: one answer."""
     solver, steps = cfjax.CF2(), 8
@@ -230,6 +236,7 @@ def test_solvers_loops_and_terms_of_diffrax():
         np.testing.assert_allclose(end, expected.ys, rtol=0, atol=1e-13)
 
 
+@pytest.mark.slow
 def test_the_adjoint_of_diffrax():
     term, solver = cfjax.LieTerm(low_rank), cfjax.CF2()
 
@@ -263,6 +270,7 @@ def test_a_batch_with_a_field_that_needs_more_than_the_series():
 # Derivatives
 
 
+@pytest.mark.representatives(1)
 @BOTH
 @pytest.mark.parametrize("norm", [0.0, 0.5, 6.0])
 def test_gradients_of_a_flow(cls, norm):
@@ -288,6 +296,7 @@ def test_gradients_of_a_flow(cls, norm):
         problems.assert_close(reverse, second, atol=1e-11)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("field", [low_rank, border])
 def test_gradients_at_a_zero_step(field):
     """t1 = t0: the derivative in t1 is the velocity, that in y0 along the manifold the identity."""
@@ -308,6 +317,7 @@ def test_gradients_at_a_zero_step(field):
 # Long runs and large n
 
 
+@pytest.mark.representatives(1)
 @pytest.mark.parametrize(
     "n, dtype, limit",
     [
@@ -340,6 +350,7 @@ def test_orthonormality_after_2000_steps(problem, n, dtype, limit):
     assert np.abs(wide[-1] - wide[0]).max() > 1e-2
 
 
+@pytest.mark.slow
 def test_n_of_a_hundred_thousand():
     """A matrix of n x n would take 80 GB."""
     scene, n = cfjax.scenes.stiefel, 100_000
@@ -394,6 +405,7 @@ def start(cls, y, way, solver):
     return np.asarray(ys["q"][-1])
 
 
+@pytest.mark.slow
 @BOTH
 @pytest.mark.parametrize(
     ("way", "solver"),
@@ -419,6 +431,7 @@ def test_a_start_off_the_manifold_is_refused(cls, way, solver):
     np.testing.assert_allclose(end.T @ end, np.eye(2), rtol=0, atol=limit)
 
 
+@pytest.mark.representatives(1)
 @BOTH
 def test_in_a_batch_one_start_off_the_manifold_is_an_error(cls):
     ys = jnp.stack([frame(6, 2), 1.1 * frame(6, 2)])
@@ -427,6 +440,7 @@ def test_in_a_batch_one_start_off_the_manifold_is_an_error(cls):
         jax.vmap(lambda y: diffrax.diffeqsolve(term, cfjax.CF4(), 0.0, 0.1, 0.1, y).ys)(ys)
 
 
+@pytest.mark.slow
 @BOTH
 def test_a_point_off_the_manifold_gives_nan(cls):
     """Without a solver's check of the start."""

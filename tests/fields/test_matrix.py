@@ -37,6 +37,7 @@ def act(cls, matrix, point):
     return matrix @ point if cls is LeftMatrix else point @ matrix
 
 
+@pytest.mark.representatives(6)
 @BOTH
 @pytest.mark.parametrize("vector", [True, False])
 @pytest.mark.parametrize(
@@ -106,6 +107,7 @@ def test_skew_hermitian_is_unitary():
     np.testing.assert_allclose(q.conj().T @ q, np.eye(3), rtol=0, atol=1e-14)
 
 
+@pytest.mark.representatives(1)
 @BOTH
 @pytest.mark.parametrize("norm", [0.0, 30.0])
 def test_gradient(cls, norm):
@@ -128,6 +130,7 @@ def test_gradient(cls, norm):
         np.testing.assert_allclose(gradient, by_hand, rtol=0, atol=1e-14)
 
 
+@pytest.mark.representatives(1)
 @BOTH
 def test_second_derivative_at_zero(cls):
     # The term of second order of exp is d d / 2, so its second derivative along d is d d.
@@ -146,6 +149,7 @@ def elements(cls, seed):
     return a, b, random((3, 3), seed=seed + 1)
 
 
+@pytest.mark.representatives(2)
 @pytest.mark.parametrize("cls", [Rotation, LeftMatrix, RightMatrix])
 def test_bracket_by_composition_of_flows(cls):
     """Flow along a, then along b, is the flow along a + b - [a, b]/2 + ..
@@ -194,6 +198,7 @@ def test_bracket_identities(cls):
     assert isinstance(a.bracket(b), cls)
 
 
+@pytest.mark.representatives(1)
 @BOTH
 def test_vmap(cls):
     a, x = random((5, 3, 3)), random((5, 3), seed=1)
@@ -225,6 +230,7 @@ def test_wrong_point(cls, shape):
         cls(np.eye(3)).tangent(jnp.ones(shape))
 
 
+@pytest.mark.representatives(2)
 @BOTH
 @pytest.mark.parametrize("dtype", [np.complex64, np.float32])
 def test_precisions_do_not_mix(cls, dtype):

@@ -151,6 +151,7 @@ def test_gradient_against_finite_differences():
     np.testing.assert_allclose(got, want, rtol=0, atol=5e-10)
 
 
+@pytest.mark.representatives(1)
 @pytest.mark.parametrize("mode", ["forward over reverse", "reverse over reverse"])
 def test_second_derivatives(mode):
     outer = jax.jacfwd if mode == "forward over reverse" else jax.jacrev

@@ -466,6 +466,7 @@ def key(solve):
     return _batch._Program(solve, np.ones((4, 3)), 4, None).fingerprint()
 
 
+@pytest.mark.representatives(3)
 @pytest.mark.parametrize("name", SOLVES)
 def test_a_key_knows_every_constant_to_the_last_bit(name):
     parameter = np.asarray([0.1, 0.2, 0.3])
@@ -500,6 +501,7 @@ for name in reversed(test_batch.SOLVES):
 """
 
 
+@pytest.mark.slow
 def test_a_key_is_the_same_in_every_process_and_after_other_programs():
     parameter = np.asarray([0.1, 0.2, 0.3])
     keys = {name: key(make(parameter)).hex() for name, make in SOLVES.items()}
@@ -672,6 +674,7 @@ def check_against_one_device(path):
     np.testing.assert_allclose(np.load(path), expected, rtol=0, atol=1e-14)
 
 
+@pytest.mark.representatives(1)
 @pytest.mark.parametrize("shape", ["8", "4x2"])
 def test_eight_devices(tmp_path, shape):
     process = start(8, tmp_path / "values.npy", shape, tmp_path / "chunks")
@@ -681,6 +684,7 @@ def test_eight_devices(tmp_path, shape):
     check_against_one_device(tmp_path / "values.npy")
 
 
+@pytest.mark.slow
 def test_two_processes(tmp_path):
     with socket.socket() as free:
         free.bind(("localhost", 0))

@@ -42,6 +42,7 @@ LINEAR: Any = [
 ]
 
 
+@pytest.mark.representatives(2)
 @pytest.mark.parametrize(
     "term, solver",
     [(TERM, s) for s in LIE] + [(diffrax.ODETerm(ode), s) for s in LINEAR],
@@ -74,6 +75,7 @@ def test_it_takes_the_steps_of_diffeqsolve(term, solver, t1):
 # Output
 
 
+@pytest.mark.representatives(3)
 @pytest.mark.parametrize("t0, t1", [(0.0, 1.0), (0.1, 0.7), (0.3, -2.6), (1e9, 1e9 + 1)])
 @pytest.mark.parametrize("save_every", [None, 1, 3, 12])
 def test_the_shape_and_the_times_of_the_output(t0, t1, save_every):
@@ -143,6 +145,7 @@ def test_there_and_back():
 # Precision
 
 
+@pytest.mark.representatives(3)
 @pytest.mark.parametrize("dtype", [np.float32, np.float64])
 @pytest.mark.parametrize("time", [float, np.float64, jnp.float32, int])
 def test_the_state_decides_the_precision(dtype, time):
@@ -259,6 +262,7 @@ def end(t0, t1, y0, args):
 POINT = (jnp.asarray(0.2), jnp.asarray(0.9), Y0, ARGS)
 
 
+@pytest.mark.slow
 def test_inside_jit_and_vmap():
     expected = end(*POINT)
     close(jax.jit(end)(*POINT), expected, atol=1e-15)
@@ -277,6 +281,7 @@ def test_inside_jit_and_vmap():
 STEP, DIFFERENCE_ERROR = 1e-3, 1e-9
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("k", range(4), ids=["t0", "t1", "y0", "args"])
 def test_gradients_in_every_argument(k):
     weights = jnp.asarray([1.0, -2.0, 3.0])
@@ -374,6 +379,7 @@ def test_the_memory_forwards_does_not_grow_with_the_steps():
     assert temporary_bytes(100) == temporary_bytes(100_000)
 
 
+@pytest.mark.slow
 def test_the_memory_forwards_grows_by_what_is_saved():
     few, many = temporary_bytes(1000, save_every=100), temporary_bytes(1000, save_every=1)
     saved = 990 * (BIG**2 + 1) * 8
@@ -381,6 +387,7 @@ def test_the_memory_forwards_grows_by_what_is_saved():
     assert 0.9 * saved < many - few < 2.1 * saved
 
 
+@pytest.mark.slow
 def test_the_memory_backwards_is_one_state_for_each_step():
     few, many = temporary_bytes(100, reverse=True), temporary_bytes(1100, reverse=True)
     a_step = (many - few) / 1000
@@ -388,11 +395,13 @@ def test_the_memory_backwards_is_one_state_for_each_step():
     assert BIG**2 * 8 <= a_step <= (BIG**2 + 4) * 8
 
 
+@pytest.mark.slow
 def test_the_memory_backwards_of_a_small_system_is_its_state_and_a_count_for_each_step():
     few, many = (temporary_bytes(n, reverse=True, y0=Y0) for n in (100, 10_100))
     assert (many - few) / 10_000 <= 3 * 8 + 4
 
 
+@pytest.mark.slow
 def test_the_memory_backwards_grows_with_the_root_of_the_steps_on_request():
     """A block keeps the state and what the last sum lost; within one block a step keeps a state."""
 
@@ -402,7 +411,11 @@ def test_the_memory_backwards_grows_with_the_root_of_the_steps_on_request():
     assert 3 * 90 <= states(100) - states(10) <= 3.1 * 90
 
 
-@pytest.mark.parametrize("checkpoint_every, save_every", [(1, None), (5, None), (4, 6), (30, 6)])
+@pytest.mark.parametrize(
+    "checkpoint_every, save_every",
+    # One that leaves steps behind the last checkpoint.
+    [(5, None), *(pytest.param(*x, marks=pytest.mark.slow) for x in [(1, None), (4, 6), (30, 6)])],
+)
 def test_fewer_checkpoints_give_the_same_numbers(checkpoint_every, save_every):
     def run(y0, **options):
         sol = cfjax.integrate(
@@ -469,6 +482,7 @@ def test_a_state_of_no_numbers(y0, no_shape_hook):
         cfjax.integrate(term, cfjax.CF4(), 0.0, 1.0, y0, num_steps=2)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("dtype", [bool, np.int32, np.float16, jnp.bfloat16])
 def test_integers_and_half_precision_become_the_default_dtype(dtype):
     """In both loops."""
@@ -485,6 +499,7 @@ def test_integers_and_half_precision_become_the_default_dtype(dtype):
     problems.assert_close(ours, theirs, atol=1e-14)
 
 
+@pytest.mark.representatives(3)
 @pytest.mark.parametrize("y0", [None, {}, {"a": None, "b": jnp.ones(2)}, {"b": jnp.zeros((0, 3))}])
 @pytest.mark.parametrize(
     "solver",
@@ -617,6 +632,7 @@ def test_the_result_tells_of_a_blow_up_where_nothing_is_thrown():
     close(calm.ys["a"][-1], [0.1 / 0.8, 0.4 / 0.2], atol=1e-6)
 
 
+@pytest.mark.slow
 def test_in_a_batch_the_result_tells_which_blew_up():
     starts = jnp.asarray([0.4, 1.0, 0.2])
     sol = jax.vmap(lambda y: explosion(y, throw=False))(starts)
@@ -630,6 +646,7 @@ def test_a_start_that_is_not_finite_is_in_the_result():
     assert explosion(np.nan, throw=False).result == diffrax.RESULTS.nonfinite
 
 
+@pytest.mark.representatives(1)
 @pytest.mark.parametrize(
     "field, y0",
     [
@@ -723,6 +740,7 @@ STEADY = {
 }
 
 
+@pytest.mark.representatives(1)
 @pytest.mark.parametrize("shape", STEADY)
 def test_a_steady_rotation_over_a_million_steps(shape):
     field, y0, most = STEADY[shape]
@@ -767,6 +785,7 @@ def test_an_attitude_stays_a_rotation_over_a_million_steps():
     assert orthogonality(sol.ys).max() < 1e-14
 
 
+@pytest.mark.slow
 def test_a_large_matrix_stays_orthogonal():
     generators = np.random.default_rng(1).standard_normal((3, 8, 8))
 
@@ -790,6 +809,7 @@ def test_a_large_matrix_stays_orthogonal():
     assert orthogonality(sol.ys).max() < 3e-14
 
 
+@pytest.mark.slow
 def test_compensation_serves_every_part_whose_field_offers_a_displacement():
     y0 = {
         "vector": jnp.arange(1.0, 4.0),

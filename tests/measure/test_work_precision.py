@@ -95,6 +95,7 @@ def test_errors_are_those_of_a_loop_of_its_own(equal, answer):
     )
 
 
+@pytest.mark.slow
 def test_one_program_takes_the_steps_of_integrate(equal, answer):
     for name, term, solver in [("CF4", TERM, cfjax.CF4()), ("Tsit5", SPACE, diffrax.Tsit5())]:
         rows = equal.select(name)
@@ -118,6 +119,7 @@ def test_evaluations_and_flows_of_equal_steps(equal):
     np.testing.assert_array_equal(equal.select("Tsit5").num_flows, 0)
 
 
+@pytest.mark.slow
 def test_evaluations_are_those_that_happen():
     """Counted by a callback in the field of whole solves, adaptive with rejected steps."""
     happened = 0
@@ -160,6 +162,7 @@ def test_evaluations_are_those_that_happen():
         assert work.num_evaluations[0] == happened
 
 
+@pytest.mark.slow
 def test_a_product_of_manifolds_moves_in_one_flow():
     work = cfjax.work_precision(
         cfjax.LieTerm(problems.body_in_flight),
@@ -244,6 +247,7 @@ def test_turns_are_taken_in_order_and_within_the_budget():
     assert _work_precision.take_turns(programs, repeats=4, budget=1e-9).shape == (3, 1)
 
 
+@pytest.mark.slow
 def test_backwards_in_time_and_in_single_precision(answer):
     y0, args = np.float32(answer), np.float32(ARGS)
     bosh = (SPACE, diffrax.Bosh3())

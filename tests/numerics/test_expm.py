@@ -137,6 +137,7 @@ def test_theta_is_where_the_backward_error_reaches_the_unit_roundoff(scheme, deg
     assert backward(scheme.theta) <= unit < backward(scheme.theta * 1.001)
 
 
+@pytest.mark.representatives(20)
 @pytest.mark.parametrize("dtype", DTYPES)
 @pytest.mark.parametrize(
     ("kind", "norm"),
@@ -163,6 +164,7 @@ def test_accuracy(kind, norm, dtype):
     assert error(got, reference(a)) <= bound
 
 
+@pytest.mark.representatives(3)
 @pytest.mark.parametrize("scheme", [_DEGREE_15_DOUBLE, _DEGREE_21])
 @pytest.mark.parametrize("dtype", [np.float64, np.complex128])
 @pytest.mark.parametrize("relative", [0.999, 1.001])
@@ -177,6 +179,7 @@ def test_accuracy_on_both_sides_of_theta(relative, dtype, scheme):
     assert error(compiled(jnp.asarray(a)), reference(a)) <= bound
 
 
+@pytest.mark.representatives(6)
 @pytest.mark.parametrize("n", [0, 1, 2, 3, 4, 5, 7, 8, 9, 33])
 @pytest.mark.parametrize("dtype", [np.float32, np.complex128])
 def test_every_size(n, dtype):
@@ -191,6 +194,7 @@ def test_every_size(n, dtype):
     assert error(got, reference(a)) <= 2 * (n + 2) * np.finfo(dtype).eps
 
 
+@pytest.mark.representatives(5)
 @pytest.mark.parametrize("dtype", DTYPES)
 @pytest.mark.parametrize("n", [1, 3, 6, 8])
 def test_exact_at_zero(n, dtype):
@@ -234,6 +238,7 @@ def test_each_member_of_a_batch_has_its_own_scaling():
         assert error(x, reference(a)) <= 4 * 5 * 2.3e-16 * max(1.0, norm)
 
 
+@pytest.mark.representatives(3)
 @pytest.mark.parametrize("n", [1, 3, 6, 9])
 @pytest.mark.parametrize("dtype", [np.float32, np.complex128])
 def test_not_finite_gives_nan_and_stays_with_its_member(n, dtype):
@@ -296,6 +301,7 @@ def both_derivatives(a, direction):
     return pushed, jax.vjp(expm, a)[1](direction)[0]
 
 
+@pytest.mark.representatives(5)
 @pytest.mark.parametrize("norm", [0.0, 1e-8, 0.5, 5.0, 200.0])
 @pytest.mark.parametrize(("n", "dtype"), [(3, np.float64), (6, np.float64), (3, np.complex128)])
 def test_derivative_is_the_frechet_derivative(n, dtype, norm):
@@ -332,6 +338,7 @@ def second_derivatives(a, v):
     return forward_over_reverse, jax.grad(slope)(a), reverse_over_reverse
 
 
+@pytest.mark.representatives(1)
 @pytest.mark.parametrize("member", range(4))
 def test_second_derivatives(member):
     a, v = BATCH[member], jnp.asarray(random("general", 3, 1.0, seed=3))
@@ -343,6 +350,7 @@ def test_second_derivatives(member):
         np.testing.assert_allclose(second, difference, rtol=0, atol=1e-7)
 
 
+@pytest.mark.slow
 def test_third_derivative():
     # d³/dx³ exp(x·J) = -J·exp(x·J) for a rotation J.
     rotation = jnp.asarray([[0.0, -1.0], [1.0, 0.0]])
@@ -356,6 +364,7 @@ def test_third_derivative():
         np.testing.assert_allclose(third(x), -np.cos(x), rtol=0, atol=4 * 4 * 2 * 2.3e-16 * (1 + x))
 
 
+@pytest.mark.slow
 def test_maps_and_derivatives_commute():
     gradients = jnp.stack([gradient(a, SHARED) for a in BATCH])
     # Gradients of norm 1, rounded in another order: 4·3·80 units as in test_accuracy, and the
@@ -370,6 +379,7 @@ def test_maps_and_derivatives_commute():
     np.testing.assert_allclose(got, jnp.stack([gradients] * 2), rtol=0, atol=tolerance)
 
 
+@pytest.mark.slow
 def test_hessian_under_vmap():
     got = jax.jit(jax.vmap(jax.hessian(curved), in_axes=(0, None)))(BATCH, SHARED)
     v = jnp.asarray(random("general", 3, 1.0, seed=3))
@@ -380,6 +390,7 @@ def test_hessian_under_vmap():
         np.testing.assert_allclose(product, second_derivatives(a, v)[0], rtol=0, atol=tolerance)
 
 
+@pytest.mark.slow
 def test_through_a_scan_with_checkpoints():
     a = jnp.asarray(random("general", 3, 4.0))
 
@@ -417,6 +428,7 @@ def test_refuses_other_dtypes(dtype):
         inspect.unwrap(expm)(jnp.zeros((2, 2), dtype))
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("norm", [0.0, 0.3, 1.0])
 def test_second_derivative_of_a_size_with_two_schemes(norm):
     # d²/dx² exp(x·a) = a²·exp(x·a).

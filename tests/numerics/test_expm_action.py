@@ -53,6 +53,7 @@ def test_polynomials_use_few_terms(eps):
         assert fewer > eps / 2
 
 
+@pytest.mark.representatives(6)
 @dtypes
 @pytest.mark.parametrize("norm", [0.0, 1e-3, 0.1, 0.5, 1.0, 2.0, 2.3, 2.6, 7.0, 300.0])
 def test_every_norm(dtype, norm):
@@ -89,6 +90,7 @@ def test_infinite_and_nan_give_nan():
         assert np.all(np.isnan(action(a, b, bad)))
 
 
+@pytest.mark.representatives(2)
 @pytest.mark.parametrize("norm", [0.0, 0.3, 2.0, 12.0])
 def test_derivatives(norm):
     """Against the exponential of the block matrix `[[a, d], [0, a]]`, and between the modes."""

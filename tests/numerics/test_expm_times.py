@@ -80,6 +80,7 @@ def test_which_points_are_thin():
     assert not _is_thin(jnp.zeros((7, 7)), jnp.zeros(7))
 
 
+@pytest.mark.representatives(2)
 @BOTH
 @pytest.mark.parametrize(
     ("kind", "dtype", "point_dtype"),
@@ -134,6 +135,7 @@ def forward(cls, a, direction, point):
     return jax.jvp(lambda a: cls(a).flow(point), (a,), (direction,))[1]
 
 
+@pytest.mark.representatives(1)
 @BOTH
 @pytest.mark.parametrize("norm", [0.0, 0.5, 2.0, 30.0])
 def test_derivatives(cls, norm):
@@ -164,6 +166,7 @@ def test_a_derivative_does_not_depend_on_the_point():
     np.testing.assert_allclose(got, want, rtol=0, atol=1e-13)
 
 
+@pytest.mark.slow
 def test_the_second_derivative_at_zero():
     # The term of second order of exp is d d / 2, so its second derivative along d is d d.
     d, point = random((N, N), 2), jnp.asarray(random((N,), 3))
@@ -171,6 +174,7 @@ def test_the_second_derivative_at_zero():
     np.testing.assert_allclose(got, d @ d @ point, rtol=0, atol=1e-12)
 
 
+@pytest.mark.slow
 def test_a_batch_of_different_norms():
     point = random((N,), 1)
     for norms in (NORMS[:6], NORMS):

@@ -49,6 +49,7 @@ def derivatives(z):
     return jnp.stack([value, first, second, third])
 
 
+@pytest.mark.representatives(2)
 @pytest.mark.parametrize("dtype", [np.float32, np.float64, np.complex64, np.complex128])
 def test_value_and_three_derivatives(dtype):
     directions = DIRECTIONS if np.issubdtype(dtype, np.complexfloating) else REAL
@@ -94,6 +95,7 @@ def test_modes_agree():
     np.testing.assert_allclose(twice, mixed, rtol=1e-15)
 
 
+@pytest.mark.slow
 def test_second_reverse_pass_through_a_checkpointed_loop():
     """A loop may lose the rule of the derivative, and then differentiates what is inside."""
 

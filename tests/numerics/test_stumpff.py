@@ -104,6 +104,7 @@ def derivatives(n):
     return jax.jit(jax.vmap(one))
 
 
+@pytest.mark.representatives(6)
 @DTYPES
 @pytest.mark.parametrize("n", range(6))
 def test_values_and_three_derivatives(n, dtype, exact):

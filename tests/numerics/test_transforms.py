@@ -45,6 +45,7 @@ def close(found, wanted, n):
     np.testing.assert_allclose(found, wanted, rtol=0, atol=4 * eps * np.sqrt(n) * np.log2(n + 2))
 
 
+@pytest.mark.representatives(14)
 @kinds
 @pytest.mark.parametrize("n", SIZES)
 def test_against_scipy_and_back(kind, n):
@@ -54,6 +55,7 @@ def test_against_scipy_and_back(kind, n):
     close(t.inverse(c), x, n)
 
 
+@pytest.mark.representatives(4)
 @kinds
 @pytest.mark.parametrize("n", [5, 255])
 def test_columns_and_batches(kind, n):
@@ -65,6 +67,7 @@ def test_columns_and_batches(kind, n):
     close(batch.transpose(2, 0, 1), found, n)
 
 
+@pytest.mark.representatives(4)
 @kinds
 @pytest.mark.parametrize("n", [6, 200])
 def test_float32(kind, n):
@@ -101,6 +104,7 @@ def operator(kind, n):
     return a, eigenvalues if kind == "Fourier" else eigenvalues[: n // 2 + 1]
 
 
+@pytest.mark.representatives(6)
 @kinds
 @pytest.mark.parametrize("n", [3, 16, 201])
 def test_the_operator_is_diagonal(kind, n):
@@ -110,6 +114,7 @@ def test_the_operator_is_diagonal(kind, n):
     close(found, a @ x, n)
 
 
+@pytest.mark.representatives(6)
 @kinds
 @pytest.mark.parametrize("n", [4, 5, 170])
 def test_transpose_and_derivative(kind, n):
@@ -142,6 +147,7 @@ def second_difference(kind, n):
     return np.roll(eye, 1, axis=0) + np.roll(eye, -1, axis=0) - 2 * eye
 
 
+@pytest.mark.representatives(10)
 @kinds
 @pytest.mark.parametrize("n", [1, 2, 5, 6, 161])
 def test_eigenvalues_of_the_second_difference(kind, n):
@@ -186,6 +192,7 @@ def scipy_on_grid(grid_kinds, x: Any):
     return x
 
 
+@pytest.mark.representatives(12)
 @pytest.mark.parametrize("pair, shape", GRIDS)
 def test_grids_against_scipy_and_back(pair, shape):
     t, x = on_grid(pair, shape)
@@ -217,6 +224,7 @@ def test_three_axes_and_columns(three):
     close(batch, c, 5)
 
 
+@pytest.mark.representatives(1)
 @pytest.mark.parametrize("pair", [("sine", "real Fourier"), ("Fourier", "cosine")])
 def test_transpose_and_derivative_on_grids(pair):
     """The transpose of a map L by its definition, and its derivative, which is L itself."""

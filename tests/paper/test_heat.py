@@ -150,6 +150,7 @@ def test_what_the_paper_finds(runs):
     assert all(b > 1.9 * a for a, b in pairwise(steps))
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("tol", [1e-4, 1e-6])
 def test_what_diffrax_makes_of_it(tol):
     """The setting that the docstring of Richardson gives, and how it differs."""

@@ -126,6 +126,7 @@ def command_line(*arguments, code="from cfjax.__main__ import main; raise System
 
 
 @pytest.mark.slow
+@pytest.mark.slow
 def test_command_as_a_user(tmp_path):
     command = [sys.executable, "-m", "cfjax", "paper"]
     done = subprocess.run(command, cwd=tmp_path, capture_output=True, text=True)
@@ -136,6 +137,7 @@ def test_command_as_a_user(tmp_path):
     check_text(done.stdout)
 
 
+@pytest.mark.slow
 def test_a_second_run(tmp_path, capsys):
     output = tmp_path / "figures"
     output.mkdir()
@@ -157,6 +159,7 @@ def check_text(printed):
         assert text in printed
 
 
+@pytest.mark.representatives(1)
 @pytest.mark.parametrize("extra", ["matplotlib", "rich"])
 def test_missing_extra(extra):
     code = f"""

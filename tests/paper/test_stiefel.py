@@ -9,6 +9,7 @@ from cfjax import WorkPrecision
 from cfjax._paper import stiefel
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("problem, part", [("first", 0.25), ("second", 0.5)])
 @pytest.mark.parametrize("n", [100, 1000])
 def test_flops_of_cf4_are_a_part_of_the_papers(problem, n, part):
@@ -17,6 +18,7 @@ def test_flops_of_cf4_are_a_part_of_the_papers(problem, n, part):
         assert stiefel.flops_of_step("CF4", problem, n, num_steps) <= part * printed
 
 
+@pytest.mark.slow
 def test_rankings_of_the_findings():
     flops = {
         (problem, name): stiefel.flops_of_step(name, problem, 1000, 16)
@@ -38,6 +40,7 @@ def test_sums_keep_the_rank_and_brackets_do_not():
     assert stiefel.rank_of_step("RKMK4, full series", "first") == 20
 
 
+@pytest.mark.slow
 def test_errors_fall_with_order_4():
     with Progress(disable=True) as progress:
         work = stiefel.efficiencies("second", (8, 16), 2, progress)

@@ -107,6 +107,7 @@ def test_reference_solves_the_large_system():
 # Methods
 
 
+@pytest.mark.representatives(2)
 @pytest.mark.parametrize(
     "solver, term, order",
     [
@@ -141,6 +142,7 @@ def test_translations_make_the_classical_runge_kutta_method():
     np.testing.assert_allclose(end(found), wanted, rtol=0, atol=1e-14)
 
 
+@pytest.mark.representatives(1)
 @pytest.mark.parametrize("solver", [cfjax.CF4(), cfjax.RKMK4()], ids=["CF4", "RKMK4"])
 def test_grid_values_with_a_transform_give_the_same_steps(solver):
     def field(t, u, args):
@@ -197,6 +199,7 @@ def check_gradient(value, x, atol):
 WEIGHTS = np.cos(np.arange(11.0))
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("solver", [cfjax.CF4(), cfjax.RKMK4()], ids=["CF4", "RKMK4"])
 def test_gradient_of_a_solution(solver):
     """With respect to the initial value and all of the diffusivity, through the spectrum too."""
@@ -212,6 +215,7 @@ def test_gradient_of_a_solution(solver):
     assert float(problems.inner(found, direction)) == pytest.approx(float(forward), rel=1e-11)
 
 
+@pytest.mark.slow
 def test_second_derivative_of_a_solution():
     def value(constant):
         args = arguments(9)._replace(constant=constant)
@@ -227,6 +231,7 @@ def test_second_derivative_of_a_solution():
     assert float(jax.jacfwd(jax.grad(value))(constant)) == pytest.approx(float(wanted), abs=1e-8)
 
 
+@pytest.mark.slow
 def test_gradient_with_adaptive_steps():
     """diffrax holds the step sizes fixed in a derivative, so the differences must do so too."""
     solver = cfjax.Richardson(cfjax.CF4())

@@ -72,6 +72,7 @@ def test_rk4_at_its_limit():
 
 
 @pytest.mark.slow
+@pytest.mark.slow
 def test_steps_needed_against_the_number_of_intervals():
     for name in ("RKMK4", "RK4"):
         few, many = (adaptive(METHODS[name], 1e-3, n).num_steps for n in (50, 200))
@@ -85,6 +86,7 @@ def test_steps_needed_against_the_number_of_intervals():
 # CF4's own limit: the part of the diffusivity that is not in the flow
 
 
+@pytest.mark.representatives(6)
 @pytest.mark.parametrize("ratio", [0.0, 0.5, 1.0, 1.5, 2.0, 2.5])
 @pytest.mark.parametrize("solver", [cfjax.LieEuler(), cfjax.CF2(), cfjax.CF3(), cfjax.CF4()])
 def test_linear_theory_is_a_real_step(solver, ratio):
@@ -138,6 +140,7 @@ def variable(power, fraction):
     )
 
 
+@pytest.mark.representatives(2)
 @pytest.mark.parametrize(
     "power, fraction", [(1, 1.0), (1, 0.72), (2, 1.0), (1, 0.68), (1, 0.5), (3, 1.0), (8, 1.0)]
 )
@@ -169,6 +172,7 @@ def test_blow_up_with_fixed_steps_is_a_result():
         diffrax.diffeqsolve(GRID, CF4, 0.0, 0.5, 5e-3, u0, args)
 
 
+@pytest.mark.representatives(1)
 @pytest.mark.parametrize("name", ["RK4", "RKMK4"])
 def test_too_few_adaptive_steps_are_a_result(name):
     method = METHODS[name]
@@ -188,6 +192,7 @@ def test_too_few_adaptive_steps_are_a_result(name):
     assert solution.result == diffrax.RESULTS.max_steps_reached
 
 
+@pytest.mark.slow
 def test_adaptive_steps_see_what_fixed_ones_do_not():
     """With half of mu_c the steps of CF4 grow 13 times each, unless they are small."""
     _, args = variable(1, 0.5)

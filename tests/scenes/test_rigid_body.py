@@ -78,6 +78,7 @@ def test_precision_follows_the_state(dtype):
     assert rigid_body.energy(y, inertia).dtype == dtype
 
 
+@pytest.mark.representatives(1)
 @pytest.mark.parametrize("method", [cfjax.CF4(), cfjax.RKMK4()])
 def test_integration_keeps_the_norm(method):
     solution = cfjax.integrate(
@@ -88,6 +89,7 @@ def test_integration_keeps_the_norm(method):
     )
 
 
+@pytest.mark.representatives(3)
 @pytest.mark.parametrize("method, order", METHODS, ids=lambda x: type(x).__name__)
 def test_order(method, order):
     """The slope of the error at t = 1 over h = 1/16 to 1/128.
@@ -103,6 +105,7 @@ def test_order(method, order):
     assert method.order(TERM) == order
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("tableau", [diffrax.Dopri5.tableau, diffrax.Tsit5.tableau])
 def test_order_of_munthe_kaas_methods_of_order_five(tableau):
     """As above, at t = 10: at t = 1 they meet the reference's error before their order shows."""

@@ -50,6 +50,7 @@ def test_constants_are_numpy_arrays():
         assert rows.dtype == np.float64
 
 
+@pytest.mark.representatives(2)
 @pytest.mark.parametrize("n, p", [(5, 4), (9, 2), (7, 1)])
 def test_frozen_fields_are_the_equations(n, p):
     """The matrices as the paper has them, entry by entry."""
@@ -74,6 +75,7 @@ def test_frozen_fields_are_the_equations(n, p):
     np.testing.assert_allclose(found, s @ y, rtol=0, atol=1e-13)
 
 
+@pytest.mark.slow
 @both
 def test_reference_and_method_give_the_tabulated_numbers(problem):
     rows, total = stiefel.tabulated[problem]
@@ -85,6 +87,7 @@ def test_reference_and_method_give_the_tabulated_numbers(problem):
         np.testing.assert_allclose(y.sum(), total, rtol=0, atol=2e-12)
 
 
+@pytest.mark.representatives(1)
 @both
 @pytest.mark.parametrize("name", METHODS)
 def test_order(problem, name):
@@ -106,6 +109,7 @@ def test_order(problem, name):
     assert solver.order(None) == order
 
 
+@pytest.mark.slow
 @both
 def test_gradients_of_a_whole_solve(problem):
     """In Y0, D and C, against finite differences of order 4."""
@@ -132,6 +136,7 @@ def test_gradients_of_a_whole_solve(problem):
     assert all(np.abs(leaf).max() > 1e-3 for leaf in jax.tree.leaves(gradient))
 
 
+@pytest.mark.representatives(1)
 @pytest.mark.parametrize("dtype", [np.float32, np.float64])
 def test_precision_follows_the_state(dtype):
     y = jnp.asarray(stiefel.y0(6, 2), dtype)

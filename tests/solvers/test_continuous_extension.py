@@ -180,7 +180,11 @@ def dense(solver, n, field, y0, args, t1=1.0, **kwargs):
 # The errors of Dopri8 are at rounding after two of these steps.
 @pytest.mark.parametrize(
     "solver, order",
-    [pytest.param(*case, id=name) for name, case in EXTENDED.items() if name != "Dopri8"],
+    [
+        pytest.param(*case, id=name, marks=[pytest.mark.slow] * (name not in ("CF4", "RKMK4")))
+        for name, case in EXTENDED.items()
+        if name != "Dopri8"
+    ],
 )
 def test_the_error_between_the_steps_falls_with_the_order_of_the_solution(solver, order):
     """Within one step like h^(order + 1), so it keeps the order of the solution."""
@@ -215,6 +219,7 @@ def test_the_error_between_the_steps_falls_with_the_order_of_the_solution(solver
     assert abs(slope - (order + 1)) < 0.15
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     "name", ["CF4", "CK54", "RKMK4", pytest.param("CF54", marks=pytest.mark.slow)]
 )
@@ -256,6 +261,7 @@ def test_random_times_are_on_the_manifold_and_nodes_are_the_steps(name):
     np.testing.assert_allclose(saved.ys, ys[np.argsort(times)], rtol=0, atol=1e-14)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     "name, direction", [pytest.param("CF3", 1, marks=pytest.mark.slow), ("CF4", -1)]
 )
@@ -277,6 +283,7 @@ def test_derivatives_in_time(name, direction):
             np.testing.assert_allclose(found, slope, rtol=0, atol=1e-9)
 
 
+@pytest.mark.slow
 def test_a_product_of_manifolds():
     y0, args = problems.arrays(problems.FLIGHT_START), problems.arrays(problems.FLIGHT_ARGS)
     sol = dense(cfjax.CF4(), 32, problems.body_in_flight, y0, args)
@@ -307,6 +314,7 @@ def frame_ode(t, y):
     return ((g @ y.T - y @ g.T) @ y).ravel()
 
 
+@pytest.mark.representatives(1)
 @pytest.mark.parametrize(
     "name", ["RKMK4", "CayleyRK4", pytest.param("CK54", marks=pytest.mark.slow)]
 )
@@ -334,6 +342,7 @@ def test_the_error_between_the_steps_of_a_frame(name):
     assert abs(problems.slope(steps, errors) - 4) < 0.15
 
 
+@pytest.mark.slow
 def test_frames_in_coordinates_of_their_own():
     """Low-rank fields share the columns of a step, also after diffrax has stored them."""
     y0, field = jnp.asarray(FRAME), frame_field
@@ -377,6 +386,7 @@ def pendulum_ode(gravity):
     return ode
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("name", ["CF4"])
 def test_a_pendulum_passes_a_plane_on_the_sphere_at_the_right_time(name):
     gravity = 2.0
@@ -419,6 +429,7 @@ def test_a_pendulum_passes_a_plane_on_the_sphere_at_the_right_time(name):
     assert abs(np.linalg.norm(sol.ys["q"][-1]) - 1) < 1e-14
 
 
+@pytest.mark.slow
 def test_gradients_through_output_between_steps():
     field, y0, args = BODY
 

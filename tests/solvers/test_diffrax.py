@@ -82,6 +82,7 @@ def answers():
 # Output
 
 
+@pytest.mark.representatives(1)
 @directions
 @solvers
 def test_the_end_is_the_solution(answers, solver, direction):
@@ -93,6 +94,7 @@ def test_the_end_is_the_solution(answers, solver, direction):
     close(sol.ys[-1], by_steps(solver, nodes(direction))[-1])
 
 
+@pytest.mark.representatives(1)
 @directions
 @solvers
 def test_save_every_kind_at_once(solver, direction):
@@ -126,6 +128,7 @@ def test_save_every_kind_at_once(solver, direction):
     close(ys["energy"]["E"], np.sum(np.asarray(exact)[2::2] ** 2 / problems.INERTIA, axis=1) / 2)
 
 
+@pytest.mark.slow
 @directions
 @solvers
 def test_save_at_times_that_the_steps_end_at(solver, direction):
@@ -146,6 +149,7 @@ def test_save_at_times_that_the_steps_end_at(solver, direction):
     close(sol.ys, by_steps(solver, ts))
 
 
+@pytest.mark.slow
 @solvers
 def test_save_at_nodes_of_a_regular_grid(solver):
     """Times that the steps meet up to rounding only."""
@@ -155,6 +159,7 @@ def test_save_at_nodes_of_a_regular_grid(solver):
     close(sol.ys, by_steps(solver, nodes())[np.round(ts * STEPS).astype(int)])
 
 
+@pytest.mark.slow
 @directions
 def test_dense_output_is_that_of_the_steps_at_nodes(direction):
     solver, saveat = cfjax.RKMK4(), diffrax.SaveAt(dense=True)
@@ -171,6 +176,7 @@ def test_dense_output_is_that_of_the_steps_at_nodes(direction):
 # Fields and states
 
 
+@pytest.mark.slow
 @solvers
 def test_a_product_of_manifolds(flight_problem, solver):
     field, y0, args, answer = flight_problem
@@ -182,6 +188,7 @@ def test_a_product_of_manifolds(flight_problem, solver):
     assert np.linalg.norm(problems.flat(end) - answer) < ERROR
 
 
+@pytest.mark.slow
 @pytest.mark.filterwarnings("ignore:Complex dtype support in Diffrax:UserWarning")
 @solvers
 def test_a_complex_state(solver):
@@ -206,6 +213,7 @@ def test_a_complex_state(solver):
     assert np.linalg.norm(y1.conj().T @ y1 - np.eye(3)) < 1e-13
 
 
+@pytest.mark.representatives(1)
 @solvers
 def test_single_precision_stays_single(solver):
     y0, args = Y0.astype(jnp.float32), ARGS.astype(jnp.float32)
@@ -217,6 +225,7 @@ def test_single_precision_stays_single(solver):
     close(sol.ys[-1], by_steps(solver, nodes())[-1].astype(jnp.float32), atol=5e-6)
 
 
+@pytest.mark.slow
 @solvers
 def test_a_jump_in_the_field_costs_no_order_when_steps_end_there(solver):
     """A field that changes at t = 0.37 for another one. Order measured across the jump."""
@@ -262,6 +271,7 @@ def test_a_jump_in_the_field_costs_no_order_when_steps_end_there(solver):
 # Events
 
 
+@pytest.mark.slow
 @solvers
 def test_a_boolean_event_ends_on_the_step_where_it_holds(solver):
     exact = np.asarray(by_steps(solver, nodes(n=40)))
@@ -279,6 +289,7 @@ def test_a_boolean_event_ends_on_the_step_where_it_holds(solver):
     close((sol.ts[-1], sol.ys[-1]), (nodes(n=40)[first], exact[first]))
 
 
+@pytest.mark.representatives(1)
 @solvers
 def test_a_continuous_event_ends_on_the_step_where_its_sign_changes(solver):
     exact = np.asarray(by_steps(solver, nodes(n=40)))
@@ -308,6 +319,7 @@ def test_a_text_progress_meter(capfd):
     close(sol.ys[-1], by_steps(cfjax.CF4(), nodes())[-1])
 
 
+@pytest.mark.slow
 def test_a_bar_as_progress_meter(capfd):
     pytest.importorskip("tqdm")
     sol = solve(cfjax.CF4(), progress_meter=diffrax.TqdmProgressMeter())
@@ -355,6 +367,7 @@ ADJOINTS = {
 DIFFERENCE_STEP, DIFFERENCE_ERROR = 1e-3, 2e-9
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     "name, adjoint",
     [
@@ -384,6 +397,7 @@ def test_derivatives_in_start_args_and_field(name, adjoint):
             np.testing.assert_allclose(found, expected, rtol=0, atol=DIFFERENCE_ERROR)
 
 
+@pytest.mark.slow
 def test_batches_of_gradients_and_gradients_of_batches():
     fun = lambda x: functional(cfjax.CF4(), ADJOINTS["checkpointed"], x)  # noqa: E731
     batch = jtu.tree_map(lambda x: jnp.stack([x, 0.5 * x, x + 0.1]), X)
@@ -398,6 +412,7 @@ def test_batches_of_gradients_and_gradients_of_batches():
     close(jax.jit(jax.grad(total))(batch), each, atol=1e-12)
 
 
+@pytest.mark.slow
 def test_the_backsolve_adjoint():
     """`vf_prod` is the tangent in the ambient space, where every solver integrates backwards.
 
@@ -431,6 +446,7 @@ def in_the_times(adjoint, t0, t1):
     return jnp.sum(jnp.sin(sol.ys[-1]))
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("adjoint", ADJOINTS)
 def test_derivatives_in_the_times(adjoint):
     fun = lambda times: in_the_times(ADJOINTS[adjoint], *times)  # noqa: E731
@@ -447,6 +463,7 @@ def test_derivatives_in_the_times(adjoint):
     np.testing.assert_allclose(found, expected, rtol=0, atol=DIFFERENCE_ERROR)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("adjoint", ["checkpointed", "direct"])
 def test_hessian_vector_products(adjoint):
     """The same steps as `cfjax.integrate`, whose products are tested against differences."""
@@ -477,6 +494,7 @@ def test_hessian_vector_products(adjoint):
         close(reverse_over_forward(by_diffrax), expected, atol=1e-13)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     "adjoint, derivative, message",
     [
@@ -495,6 +513,7 @@ def test_what_an_adjoint_cannot_do_is_an_error(adjoint, derivative, message):
 # Transformations
 
 
+@pytest.mark.slow
 @solvers
 def test_a_batch_of_starts_and_args(solver):
     @jax.jit
@@ -510,6 +529,7 @@ def test_a_batch_of_starts_and_args(solver):
     close(jax.vmap(end, (None, 0))(Y0, args), jnp.stack([end(Y0, a) for a in args]))
 
 
+@pytest.mark.representatives(1)
 @solvers
 def test_one_program_serves_all_values(solver):
     @eqx.debug.assert_max_traces(max_traces=1)
@@ -526,6 +546,7 @@ def test_one_program_serves_all_values(solver):
 # What does not fit
 
 
+@pytest.mark.representatives(1)
 @solvers
 def test_too_few_steps(solver):
     with pytest.raises(eqx.EquinoxRuntimeError, match="maximum number of solver steps"):
@@ -540,6 +561,7 @@ def explosion(solver, y0, rate=1.0, **kwargs):
     return diffrax.diffeqsolve(term, solver, 0.0, 3.0, 0.1, y0, **kwargs)
 
 
+@pytest.mark.representatives(1)
 @solvers
 def test_a_blow_up_with_constant_steps_is_a_result(solver):
     y0 = jnp.asarray([1.0, 0.2])
@@ -552,6 +574,7 @@ def test_a_blow_up_with_constant_steps_is_a_result(solver):
     assert explosion(solver, y0 / 4, throw=False).result == diffrax.RESULTS.successful
 
 
+@pytest.mark.slow
 def test_in_a_batch_a_blow_up_leaves_the_others_alone():
     y0 = jnp.asarray([[1.0, 0.2], [0.1, 0.2]])
     ys = jax.vmap(lambda y0: explosion(cfjax.CF4(), y0).ys[-1])(y0)
@@ -561,12 +584,14 @@ def test_in_a_batch_a_blow_up_leaves_the_others_alone():
     np.testing.assert_allclose(ys.at[0, 0].set(jnp.nan), exact, rtol=1e-5)
 
 
+@pytest.mark.slow
 def test_a_gradient_beside_the_check_of_finiteness():
     slopes = jax.grad(lambda y0: jnp.sum(explosion(cfjax.CF4(), y0).ys[-1]))(jnp.asarray([0.1]))
     # (1 - 3 y0)^-2, to the error of the method.
     np.testing.assert_allclose(slopes, 1 / 0.49, rtol=1e-5)
 
 
+@pytest.mark.representatives(1)
 @plain_solvers
 def test_error_control_without_an_estimate_is_refused(solver):
     controller = diffrax.PIDController(rtol=0, atol=1e-6)
@@ -574,6 +599,7 @@ def test_error_control_without_an_estimate_is_refused(solver):
         solve(solver, stepsize_controller=controller)
 
 
+@pytest.mark.slow
 @solvers
 def test_step_doubling_gives_an_estimate(answers, solver):
     """The tolerance governs the error, and the manifold is kept. `atol` alone: see the README."""
@@ -594,6 +620,7 @@ def test_step_doubling_gives_an_estimate(answers, solver):
     assert tight < loose / 100 and few < many
 
 
+@pytest.mark.representatives(2)
 @pytest.mark.parametrize(
     "solver",
     [diffrax.Bosh3(), diffrax.Tsit5(), diffrax.ReversibleHeun(), diffrax.Kvaerno3()],
@@ -624,6 +651,7 @@ def still(t, y, args):
     return cfjax.LowRankSkew(jnp.zeros_like(y))
 
 
+@pytest.mark.representatives(1)
 @pytest.mark.parametrize("bad", ["t0", "t1"])
 @pytest.mark.parametrize(
     ("term", "solver", "y0"),
@@ -644,6 +672,7 @@ def test_a_time_that_is_nan_is_an_error(bad, term, solver, y0):
         diffrax.diffeqsolve(term, solver, t0, t1, 0.5, y0, ARGS)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("solver", [diffrax.Tsit5(), diffrax.Heun()])
 def test_solvers_of_linear_spaces_take_translations(solver):
     def field(t, y, args):
@@ -662,6 +691,7 @@ def test_no_warning_comes_from_a_plain_solve():
     assert caught == []
 
 
+@pytest.mark.slow
 def test_the_solver_carries_no_state_from_step_to_step():
     """Two solves of half the length are one solve."""
     saveat = diffrax.SaveAt(t1=True, solver_state=True, controller_state=True, made_jump=True)

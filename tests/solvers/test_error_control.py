@@ -21,6 +21,7 @@ def turned_body(t, y, args):
     return cfjax.Rotation(TURN @ field.omega)
 
 
+@pytest.mark.representatives(1)
 @pytest.mark.parametrize("solver", [cfjax.CF3(), cfjax.CF4()], ids=["CF3", "CF4"])
 def test_a_turned_copy_takes_the_same_steps(solver):
     @jax.jit
@@ -103,6 +104,7 @@ def test_mistaken_scales():
 # The first step
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("speed", [1e-4, 1.0, 1e4])
 @pytest.mark.parametrize("direction", [1.0, -1.0])
 def test_a_first_step_is_accepted_and_not_far_too_short(speed, direction):
@@ -174,6 +176,7 @@ def stiefel_problem():
     return stiefel.first, 1.0, stiefel.y0(n, p), stiefel.diagonals(n, p), answer
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     "problem, estimate",
     [

@@ -39,6 +39,7 @@ def test_the_orders_by_their_conditions(name):
         assert tableau.num_embedded_flows == {"Luscher3": 1, "CFEES25": 1}.get(name, 0)
 
 
+@pytest.mark.slow
 @names
 def test_a_step_is_that_of_the_tableau(name):
     solver = getattr(cfjax, name)()
@@ -53,6 +54,7 @@ def test_a_step_is_that_of_the_tableau(name):
     problems.assert_close(found, expected, 1e-13 if name == "YRK135" else 1e-15 * 5)
 
 
+@pytest.mark.representatives(1)
 @pytest.mark.parametrize("name", ["BWRRK33", "CK54", "YRK135"])
 def test_the_observed_order(body_problem, name):
     field, y0, args, answer = body_problem
@@ -62,6 +64,7 @@ def test_the_observed_order(body_problem, name):
     assert abs(problems.slope(steps, found) - METHODS[name][0]) < 0.15
 
 
+@pytest.mark.slow
 def test_a_frame_in_coordinates_of_its_own_takes_every_stage(no_shape_hook):
     """Such a step changes its structure from stage to stage, so it cannot be a loop."""
     y0 = jnp.asarray(np.linalg.qr(np.random.default_rng(1).standard_normal((8, 2)))[0])
@@ -76,6 +79,7 @@ def test_a_frame_in_coordinates_of_its_own_takes_every_stage(no_shape_hook):
     np.testing.assert_allclose(ends[0], ends[1], rtol=0, atol=1e-14)
 
 
+@pytest.mark.representatives(2)
 @names
 def test_memory_of_two_states(name):
     """As the compiler plans it: the point and the sum, and what one evaluation needs."""
@@ -96,6 +100,7 @@ def test_memory_of_two_states(name):
     assert used < 4.5
 
 
+@pytest.mark.representatives(1)
 @pytest.mark.parametrize("name", [name for name, (_, below) in METHODS.items() if below])
 def test_error_control(name):
     y0, inertia = jnp.asarray(problems.MOMENTUM), jnp.asarray(problems.INERTIA)

@@ -14,6 +14,7 @@ import pytest
 import scipy.linalg
 
 import cfjax
+from cfjax._solvers.stages import written_out
 
 METHODS: dict[str, Any] = {
     "RKMK3": cfjax.RKMK3(),
@@ -43,8 +44,14 @@ def observed_order(problem, solver, **kwargs) -> float:
     return problems.slope(STEPS, found)
 
 
-@names
-@pytest.mark.parametrize("side", ["left", "right"])
+@pytest.mark.parametrize(
+    "side, name",
+    [
+        pytest.param(side, name, marks=[pytest.mark.slow] * ((side, name) != ("left", "RKMK4")))
+        for side in ("left", "right")
+        for name in METHODS
+    ],
+)
 def test_order_on_matrices(matrix_problems, side, name):
     solver = METHODS[name]
     assert solver.order(None) == ORDERS[name]
@@ -53,11 +60,13 @@ def test_order_on_matrices(matrix_problems, side, name):
 
 # Dopri5 and Tsit5 meet the error of the reference here before their order shows: their test is in
 # scenes/test_rigid_body.py.
+@pytest.mark.slow
 @pytest.mark.parametrize("name", ["RKMK3", "RKMK4", "Heun", "Bosh3"])
 def test_order_on_the_sphere(body_problem, name):
     assert abs(observed_order(body_problem, METHODS[name]) - ORDERS[name]) < TOLERANCE
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("name", ["RKMK3", "RKMK4", "Bosh3"])
 def test_order_on_a_product_of_manifolds(flight_problem, name):
     assert abs(observed_order(flight_problem, METHODS[name]) - ORDERS[name]) < TOLERANCE
@@ -70,6 +79,7 @@ class WrongSide(cfjax.LeftMatrix):
         return type(self)(-(cfjax.LeftMatrix.bracket(self, other).a))
 
 
+@pytest.mark.representatives(1)
 @pytest.mark.parametrize("name", ["RKMK3", "RKMK4", "Bosh3"])
 def test_a_mistaken_sign_of_the_bracket_loses_the_order(matrix_problems, name):
     """The problem sees it: with the other sign every method here is of order 2."""
@@ -82,6 +92,7 @@ def test_a_mistaken_sign_of_the_bracket_loses_the_order(matrix_problems, name):
     assert abs(order - 2) < TOLERANCE
 
 
+@pytest.mark.representatives(1)
 @pytest.mark.parametrize("name", ["RKMK4", "Tsit5"])
 def test_a_mistaken_stage_time_loses_the_order(matrix_problems, name):
     order = observed_order(matrix_problems["left"], METHODS[name], ignore_stage_times=True)
@@ -94,7 +105,7 @@ def test_a_mistaken_stage_time_loses_the_order(matrix_problems, name):
         (diffrax.Midpoint.tableau, 2),
         (diffrax.Ralston.tableau, 2),
         (diffrax.Heun.tableau, 2),
-        (diffrax.Dopri8.tableau, 8),
+        pytest.param(diffrax.Dopri8.tableau, 8, marks=pytest.mark.slow),
     ],
 )
 def test_the_order_is_the_tableaus(tableau, order):
@@ -168,6 +179,7 @@ def test_one_step_is_the_published_formula(name):
     np.testing.assert_allclose(found, expected, rtol=0, atol=2e-14)
 
 
+@pytest.mark.slow
 @names
 def test_one_step_from_the_right_is_the_transposed_one(name):
     def transposed(t, x, args):
@@ -180,6 +192,7 @@ def test_one_step_from_the_right_is_the_transposed_one(name):
     np.testing.assert_allclose(right, left.T, rtol=0, atol=2e-14)
 
 
+@pytest.mark.representatives(1)
 @names
 def test_rotations_agree_with_their_matrices(name):
     def as_matrices(t, y, args):
@@ -202,6 +215,7 @@ def classical(tableau, f, t, y, h):
     return y + sum(b * k for b, k in zip(tableau.b_sol, stages, strict=True))
 
 
+@pytest.mark.representatives(5)
 @pytest.mark.parametrize("term", [cfjax.LieTerm, diffrax.ODETerm])
 @pytest.mark.parametrize("shape", [(3,), (9,), (2, 3)])
 @pytest.mark.parametrize("name", ["Heun", "Bosh3", "Dopri5", "Tsit5"])
@@ -217,6 +231,7 @@ def test_in_a_linear_space_it_is_the_classical_method(name, shape, term):
     np.testing.assert_allclose(found, expected, rtol=0, atol=100 * np.finfo(float).eps)
 
 
+@pytest.mark.slow
 @names
 def test_a_constant_field_is_followed_exactly(name):
     """From no turn to several turns in one step, in both directions of time."""
@@ -248,6 +263,7 @@ def inexact_end() -> tuple[float, float]:
             return float(t0), float(t1)
 
 
+@pytest.mark.representatives(2)
 @pytest.mark.parametrize(
     "name, stages",
     [
@@ -313,10 +329,12 @@ def count_step(solver, y):
         counts.update(evaluations=0, flows=0, brackets=0)
         return solver.step(term, *time, y, None, state, made_jump=False)[0]
 
-    jax.eval_shape(step, y)
+    with written_out():
+        jax.eval_shape(step, y)
     return counts
 
 
+@pytest.mark.representatives(5)
 @pytest.mark.parametrize(
     "name, evaluations, flows, brackets",
     [("RKMK3", 3, 3, 1), ("RKMK4", 4, 4, 2), ("Heun", 2, 2, 0), ("Bosh3", 3, 3, 2)],
@@ -327,6 +345,7 @@ def test_a_step_costs_what_its_docstring_says(name, evaluations, flows, brackets
     assert counts == {"evaluations": evaluations, "flows": flows, "brackets": brackets}
 
 
+@pytest.mark.representatives(1)
 @pytest.mark.parametrize("name", ["Dopri5", "Tsit5"])
 def test_a_method_of_order_five_keeps_within_its_brackets(name):
     """`(s - 1)(q - 2)` at most, and no evaluation for a stage without weight."""
@@ -351,6 +370,7 @@ class Shear(cfjax.AbstractFrozenField):
         return self.v
 
 
+@pytest.mark.representatives(4)
 @names
 @pytest.mark.parametrize("nested", [False, True])
 def test_a_field_without_bracket_is_refused_by_name(name, nested):

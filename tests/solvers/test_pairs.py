@@ -59,6 +59,7 @@ def test_the_embedded_method_has_the_order_below(name):
     assert PAIRS[name].error_order(None) == cfjax.order(tableau)
 
 
+@pytest.mark.slow
 @pairs
 @estimates
 def test_the_estimate_falls_with_the_order_of_the_embedded_method(name, estimate):
@@ -75,6 +76,7 @@ def test_the_estimate_falls_with_the_order_of_the_embedded_method(name, estimate
     assert abs(slope - cfjax.order(PAIRS[name].tableau)) < 0.15
 
 
+@pytest.mark.slow
 @pairs
 def test_the_estimate_is_the_distance_from_the_embedded_method(name):
     """The embedded method as a method of its own takes the step from scratch."""
@@ -94,6 +96,7 @@ def test_an_estimate_of_no_kind_is_an_error(no_shape_hook):
         cfjax.CF4(estimate="x")  # pyright: ignore[reportArgumentType]
 
 
+@pytest.mark.representatives(2)
 @pairs
 def test_without_an_estimate_error_control_is_refused(name):
     with pytest.raises(RuntimeError, match="error estimate"):
@@ -124,6 +127,7 @@ def landau_zener_answer():
     return problems.reference(ode, 0.0, 2.0, np.array([0.6, 0.0, 0.8]))
 
 
+@pytest.mark.representatives(1)
 @pairs
 def test_the_default_sees_a_commuting_error(name):
     exact = 1 / (1 + 9 * np.exp(-2.0))
@@ -133,6 +137,7 @@ def test_the_default_sees_a_commuting_error(name):
         assert 1e-4 * atol < abs(float(sol.ys[-1, 0]) - exact) < 10 * atol
 
 
+@pytest.mark.representatives(1)
 @pairs
 def test_the_default_sees_an_error_of_commutators_alone(name, landau_zener_answer):
     y0, args = jnp.asarray([0.6, 0.0, 0.8]), jnp.asarray(LANDAU_ZENER)
@@ -142,6 +147,7 @@ def test_the_default_sees_an_error_of_commutators_alone(name, landau_zener_answe
         assert 1e-4 * atol < error < 30 * atol
 
 
+@pytest.mark.representatives(1)
 @pairs
 def test_the_estimate_in_the_algebra_is_blind_to_commutators_alone(name, landau_zener_answer):
     y0, args = jnp.asarray([0.6, 0.0, 0.8]), jnp.asarray(LANDAU_ZENER)
@@ -161,6 +167,7 @@ def test_the_estimate_in_the_algebra_is_blind_to_commutators_alone(name, landau_
         assert np.linalg.norm(sol.ys[-1] - landau_zener_answer) > 1e-5
 
 
+@pytest.mark.representatives(1)
 @pytest.mark.parametrize("estimate", ["group", "algebra"])
 def test_a_weak_dependence_on_the_state_hides_no_error(estimate):
     """CF4's embedded method sees how the field changes with the state: here next to nothing."""
@@ -185,6 +192,7 @@ def test_a_weak_dependence_on_the_state_hides_no_error(estimate):
         assert sol.stats["num_accepted_steps"] > 30
 
 
+@pytest.mark.slow
 def test_part_of_a_state_can_be_blind_to_the_last_evaluation():
     """CF4's embedded method differs by f(y1) only: no help where the field sees no state."""
 
@@ -223,6 +231,7 @@ def counted(field, counter):
     return counted_field
 
 
+@pytest.mark.representatives(2)
 @pytest.mark.parametrize("name, evaluations, first", [("CF4", 4, 1), ("CF54", 7, 1), ("CF3", 3, 0)])
 def test_evaluations_with_accepted_and_rejected_steps(name, evaluations, first):
     """A method that is first same as last evaluates once at the start, and never twice there."""
@@ -236,6 +245,7 @@ def test_evaluations_with_accepted_and_rejected_steps(name, evaluations, first):
     assert counter.count == first + evaluations * int(sol.stats["num_steps"])
 
 
+@pytest.mark.representatives(1)
 @pytest.mark.parametrize("name", ["CF3", "CF4", "CF43", "CF54"])
 def test_steps_over_a_jump(name):
     """The field changes at t = 0.7: what was evaluated before says nothing of after."""
@@ -276,6 +286,7 @@ def test_a_kept_evaluation_is_discarded_after_a_jump():
 # Error control
 
 
+@pytest.mark.representatives(1)
 @pytest.mark.parametrize("name", ["CF3", "CF4", "CF43", "CF54"])
 def test_error_per_tolerance_is_steady(name):
     y0, inertia = jnp.asarray(problems.MOMENTUM), jnp.asarray(problems.INERTIA)
@@ -296,6 +307,7 @@ def test_error_per_tolerance_is_steady(name):
     assert max(ratios) < 20
 
 
+@pytest.mark.slow
 def test_both_estimates_of_cf4_have_one_size_for_a_matrix_to_leading_order():
     """Where steps are compensated sums. The signs differ, which no controller sees."""
     args = jnp.asarray(problems.GENERATORS)

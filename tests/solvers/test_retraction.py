@@ -77,6 +77,7 @@ def test_in_a_linear_space_it_is_the_classical_method():
     np.testing.assert_allclose(found["place"], expected, rtol=0, atol=1e-15 * 10)
 
 
+@pytest.mark.slow
 def test_gradients():
     weight = np.arange(14.0).reshape(7, 2)
 

@@ -62,6 +62,7 @@ def close(a, b, atol=1e-14):
 # The estimate
 
 
+@pytest.mark.representatives(3)
 @cases
 @variants
 def test_estimate_and_result_of_a_step(name, as_in_paper):
@@ -88,6 +89,7 @@ def test_estimate_and_result_of_a_step(name, as_in_paper):
     assert wrapped.error_order(term) == order + as_in_paper
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("name", ["CF3", "CF4", "RKMK4", "Euler"])
 def test_the_estimate_in_the_paper_is_the_error_of_the_two_halves(name):
     """To leading order, and of order p + 1 in h, which error_order tells the controller.
@@ -121,6 +123,7 @@ def test_the_estimate_in_the_paper_is_the_error_of_the_two_halves(name):
         assert abs(slope - expected) < 0.3
 
 
+@pytest.mark.slow
 @variants
 @pytest.mark.parametrize("name", ["CF4"])
 def test_order(name, as_in_paper, body_problem):
@@ -198,6 +201,7 @@ def rigid_body_answer():
     return problems.reference(ode, 0.0, 10.0, rigid_body.y0)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("name", CONTROLLED)
 def test_the_error_is_proportional_to_the_tolerance(name, rigid_body_answer):
     """An estimate of order p + 1 would let their ratio grow by tol^(-1/(p+1)): 11 to 32 times."""
@@ -228,6 +232,7 @@ def test_the_error_is_proportional_to_the_tolerance(name, rigid_body_answer):
     assert 0.1 < ratios.min() and ratios.max() < 20
 
 
+@pytest.mark.slow
 def test_pytree_of_manifolds(flight_problem):
     field, y0, args, answer = flight_problem
     problem = (cfjax.LieTerm(field), problems.arrays(y0), problems.arrays(args))
@@ -245,6 +250,7 @@ def test_pytree_of_manifolds(flight_problem):
 # Memory: solvers whose last stage is the first of the next step.
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     "name, as_in_paper, direction",
     [("CF4", True, 1), ("CF4", False, -1), ("Tsit5", False, 1), ("Tsit5", True, -1)],
@@ -256,6 +262,7 @@ def test_fixed_steps_are_those_of_the_solver(name, as_in_paper, direction):
     close(ys(found), ys(plain), 1e-13)
 
 
+@pytest.mark.slow
 @variants
 @pytest.mark.parametrize("name", ["CF4", "Tsit5"])
 def test_accepted_steps_are_those_of_the_solver(name, as_in_paper):
@@ -277,6 +284,7 @@ def test_accepted_steps_are_those_of_the_solver(name, as_in_paper):
         close(wanted, y, 1e-13)
 
 
+@pytest.mark.representatives(1)
 @variants
 def test_memory_is_renewed_after_a_jump(as_in_paper):
     term = diffrax.ODETerm(lambda t, y, args: jnp.where(t < 0.9, -1.0, 3.0) * y)
@@ -294,6 +302,7 @@ def test_memory_is_renewed_after_a_jump(as_in_paper):
 # Output between steps
 
 
+@pytest.mark.slow
 @variants
 def test_dense_output_is_that_of_the_solver(as_in_paper):
     solver, _, problem = CASES["Tsit5"]
@@ -312,6 +321,7 @@ def test_dense_output_is_that_of_the_solver(as_in_paper):
     close(jax.vmap(backwards.evaluate)(-times), jax.vmap(plain.evaluate)(-times), 1e-13)
 
 
+@pytest.mark.slow
 def test_output_between_steps_on_a_manifold_is_that_of_the_halves():
     problem = CASES["CF4"][2]
     saveat = diffrax.SaveAt(dense=True)
@@ -324,6 +334,7 @@ def test_output_between_steps_on_a_manifold_is_that_of_the_halves():
 # Modes of use
 
 
+@pytest.mark.slow
 def test_single_precision_and_batch():
     problem = (
         cfjax.LieTerm(problems.rigid_body),
@@ -364,6 +375,7 @@ def test_a_value_that_compiles_once():
 # Failure
 
 
+@pytest.mark.representatives(1)
 @variants
 def test_a_failure_of_the_solver_is_a_failure(as_in_paper):
     root_finder = diffrax.VeryChord(1e-12, 1e-12, optimistix.max_norm)
@@ -387,6 +399,7 @@ def test_a_step_that_is_not_finite_is_rejected():
     close(ys(solution)[-1], [1 - np.exp(-3)], 1e-5)
 
 
+@pytest.mark.slow
 def test_an_implicit_solver_takes_the_tolerances_of_the_controller():
     controller = diffrax.PIDController(rtol=0.0, atol=1e-7)
     problem = CASES["Tsit5"][2]
@@ -415,6 +428,7 @@ def test_unknown_order():
         solve(Richardson(NoOrder()), CASES["Euler"][2])
 
 
+@pytest.mark.slow
 def test_a_complex_state_in_single_precision():
     """A spin that precesses: the exact end, to a few times the tolerance."""
     term = cfjax.LieTerm(lambda t, y, args: cfjax.LeftMatrix(args))

@@ -296,6 +296,7 @@ VALUE, DERIVATIVE = 60, 180
 LOW = {"float32": np.float32, "float16": np.float16, "conversions": np.float32}
 
 
+@pytest.mark.representatives(10)
 @ALL
 def test_values(name):
     fun, y = ZOO[name]
@@ -312,6 +313,7 @@ def test_values_outside_of_jit(name):
     assert_same(got, want, VALUE)
 
 
+@pytest.mark.representatives(8)
 @ALL
 def test_derivatives(name):
     """Value, gradient, forward over reverse and reverse over reverse, in one program."""
@@ -348,6 +350,7 @@ def test_derivatives(name):
     assert_same(got, want, DERIVATIVE, LOW.get(name, np.float64))
 
 
+@pytest.mark.representatives(8)
 @ALL
 def test_batches(name):
     """vmap, vmap of vmap, vmap of grad and grad of vmap."""

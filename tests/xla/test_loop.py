@@ -83,6 +83,7 @@ def close(found, want, case):
     assert jtu.tree_structure(found) == jtu.tree_structure(want)
 
 
+@pytest.mark.representatives(6)
 @pytest.mark.parametrize("case", CASES.values(), ids=CASES.keys())
 def test_values(case):
     want = jax.jit(plain)(*case)
@@ -117,6 +118,7 @@ DERIVATIVES = [
 ]
 
 
+@pytest.mark.representatives(6)
 @pytest.mark.parametrize("case, transform", DERIVATIVES)
 def test_derivatives(case, transform):
     case, transform = CASES[case], TRANSFORMS[transform]

@@ -11,6 +11,7 @@ from cfjax._xla.pack import pack, unpack
 RNG = np.random.default_rng(0)
 
 
+@pytest.mark.representatives(10)
 @pytest.mark.parametrize("axis", [0, 1])
 @pytest.mark.parametrize("dtype", [np.float32, np.float64, np.complex128, np.int32, np.bool_])
 @pytest.mark.parametrize("count", [1, 4])
@@ -35,6 +36,7 @@ def weighted(stack):
     return fun
 
 
+@pytest.mark.representatives(12)
 @pytest.mark.parametrize(
     "transform",
     [

@@ -1,0 +1,463 @@
+"""Whether the tests see mistakes: plants defects in cfjax one at a time, and runs the tests.
+
+    python tests/planted_defects.py [--first] [WORD ...]
+
+Every defect goes into a copy of the repository of its own. There the tests that should see it run
+first, up to the first failure, and if none fails all the tests of `make test`. A defect is caught
+if a test fails. With WORDs, only defects with one of them in the file's name or in what they are.
+With --first, the rest of the tests is left out, and what it would have caught counts as missed.
+
+The exit status is 1 if fewer than 95 % are caught.
+"""
+
+import argparse
+import os
+import re
+import shutil
+import subprocess
+import sys
+import tempfile
+import time
+from pathlib import Path
+from typing import NamedTuple
+
+ROOT = Path(__file__).parents[1]
+NEEDED = 0.95
+
+
+class Defect(NamedTuple):
+    """In `file`, below cfjax, `old` becomes `new`; the tests below `tests` run first."""
+
+    file: str
+    old: str
+    new: str
+    what: str
+    tests: str
+
+
+DEFECTS = [
+    # Methods: coefficients and what is made of them.
+    Defect(
+        "_methods/tableau.py",
+        "[[_half], [-_half, 0, 1]]]",
+        "[[_half], [-_third, 0, Fraction(5, 6)]]]",
+        "a wrong coefficient in a stage of CF4",
+        "methods/test_order_conditions.py",
+    ),
+    Defect(
+        "_methods/tableau.py",
+        "0.0659864263556022]",
+        "0.0659864263556122]",
+        "a wrong 14th digit in CG4",
+        "methods/test_order_conditions.py",
+    ),
+    Defect(
+        "_methods/tableau.py",
+        "1 / (2 * x * (3 * x - 1))]",
+        "1 / (2 * x * (3 * x + 1))]",
+        "a wrong sign in the first family of order 3",
+        "methods/test_tableau.py",
+    ),
+    Defect(
+        "_methods/order_conditions.py",
+        "return exact_weight(word[:-1]) * exact_weight(word[-1]) / _order_of(word)",
+        "return exact_weight(word[:-1]) * exact_weight(word[-1]) / len(word)",
+        "a wrong weight in the order conditions",
+        "methods/test_order_conditions.py",
+    ),
+    Defect(
+        "_methods/continuous_extension.py",
+        "found += ((total - found.sum(axis=1)) / num_powers)[:, None]",
+        "found += 0 * ((total - found.sum(axis=1)) / num_powers)[:, None]",
+        "output within a step that misses its end",
+        "solvers/test_continuous_extension.py -k conditions",
+    ),
+    Defect(
+        "_methods/stability.py",
+        "points[rows[: j + 1]] = np.exp(a * z) * points[rows[:j]] + _phi_1(a * z) * b",
+        "points[rows[: j + 1]] = np.exp(a * z) * points[rows[:j]] + _phi_1(z) * b",
+        "a missing factor in the stability function",
+        "test_stability.py",
+    ),
+    # Solvers.
+    Defect(
+        "_solvers/commutator_free.py",
+        "points[rows] = flow(self.element(rows, fields, kept), point(rows[:-1]))",
+        "points[rows] = flow(self.element(rows[:1], fields, kept), point(rows[1:]))",
+        "flows of a product in the wrong order",
+        "solvers/test_one_step.py",
+    ),
+    Defect(
+        "_solvers/commutator_free.py",
+        "            evaluate(1.0, stages[-1])",
+        "            evaluate(1.0, stages[-2])",
+        "the field at the last stage in place of that at the end",
+        "solvers/test_one_step.py",
+    ),
+    Defect(
+        "_solvers/commutator_free.py",
+        "return jnp.where(factor * factor * apart_square > error_square, other, error)",
+        "return error",
+        "a dropped floor of CF4's estimate",
+        "solvers/test_one_step.py -k driven_line",
+    ),
+    Defect(
+        "_solvers/commutator_free.py",
+        "rest = [[-entry for entry in row]",
+        "rest = [[entry for entry in row]",
+        "a sum for a difference in the estimate in the algebra",
+        "solvers/test_one_step.py -k algebra",
+    ),
+    Defect(
+        "_solvers/base.py",
+        "t = t1 if c == 1 else t0 + c * (t1 - t0)",
+        "t = t0 + c * (t1 - t0)",
+        "a last stage behind the end of the step by rounding",
+        "solvers/test_commutator_free.py::test_the_last_stage_is_at_the_end_exactly",
+    ),
+    Defect(
+        "_solvers/base.py",
+        "if first is not None and made_jump is not False:",
+        "if first is not None and made_jump is None:",
+        "a stale field after a jump",
+        "solvers/test_pairs.py -k jump",
+    ),
+    Defect(
+        "_solvers/base.py",
+        "State(new_lost, last, solver_state.zero)",
+        "State(new_lost, first, solver_state.zero)",
+        "a stale field after a step",
+        "solvers/test_one_step.py",
+    ),
+    Defect(
+        "_solvers/base.py",
+        "a, b = end.start, end.displacement + lax.stop_gradient(self.lost)",
+        "a, b = end.start, end.displacement",
+        "a dropped compensation of rounding",
+        "integrate/test_integrate.py -k compensation",
+    ),
+    Defect(
+        "_solvers/dense.py",
+        "total = (total + float(a)) * theta",
+        "total = total * theta + float(a)",
+        "a missing factor theta within a step",
+        "solvers/test_one_step.py",
+    ),
+    Defect(
+        "_solvers/low_storage.py",
+        "both = (float(self.a[i]), 1.0)",
+        "both = (1.0, float(self.a[i]))",
+        "swapped weights of a low-storage method",
+        "solvers/test_one_step.py -k Williamson3",
+    ),
+    Defect(
+        "_solvers/low_storage.py",
+        "total = combine((a, 1.0), (total, here))",
+        "total = combine((a, 1.0), (here, total))",
+        "a swapped sum in the loop of a low-storage method",
+        "solvers/test_one_step.py -k YRK135",
+    ),
+    Defect(
+        "_solvers/low_storage.py",
+        "-567301805773 / 1357537059087",
+        "-567301805773 / 1357537059078",
+        "two digits swapped in CK54",
+        "solvers/test_low_storage.py -k orders",
+    ),
+    Defect(
+        "_solvers/munthe_kaas.py",
+        "return [k1, k2, k3, bracket(k1, k2)]",
+        "return [k1, k2, k3, bracket(k2, k1)]",
+        "a bracket of the wrong sign in RKMK3",
+        "solvers/test_munthe_kaas.py::test_one_step_is_the_published_formula",
+    ),
+    Defect(
+        "_solvers/munthe_kaas.py",
+        "weights.append(float(_bernoulli(k) / factorial(k)))",
+        "weights.append(float(_bernoulli(k)))",
+        "a missing factorial in the series of RKMK",
+        "solvers/test_munthe_kaas.py::test_one_step_is_the_published_formula",
+    ),
+    Defect(
+        "_solvers/munthe_kaas.py",
+        "degree = self.order(None) - 2",
+        "degree = self.order(None) - 3",
+        "one commutator too few in RKMK",
+        "solvers/test_munthe_kaas.py::test_one_step_is_the_published_formula",
+    ),
+    Defect(
+        "_solvers/retraction.py",
+        "g = v - matmul(q, matmul(q.T, v)) / 2",
+        "g = v - matmul(q, matmul(q.T, v))",
+        "a missing half in the Cayley retraction",
+        "solvers/test_retraction.py",
+    ),
+    Defect(
+        "_solvers/retraction.py",
+        "w = matmul(along + matmul(x.T, self.middle), inverse)",
+        "w = matmul(along - matmul(x.T, self.middle), inverse)",
+        "a wrong sign in the differential of the retraction",
+        "solvers/test_retraction.py",
+    ),
+    Defect(
+        "_solvers/richardson.py",
+        "(a - b) / (2**order - 1)",
+        "(a - b) / 2**order",
+        "a wrong factor of Richardson's estimate",
+        "solvers/test_richardson.py -k estimate",
+    ),
+    Defect(
+        "_solvers/richardson.py",
+        "step(middle, t1, y_half, state_half, False)",
+        "step(middle, t1, y_half, solver_state, False)",
+        "a stale state in the second half of a step",
+        "solvers/test_richardson.py",
+    ),
+    Defect(
+        "_solvers/richardson.py",
+        "return self.order(terms) + (1 if self.as_in_paper else 0)",
+        "return self.order(terms) + 1",
+        "a wrong order of the estimate for the controller",
+        "solvers/test_richardson.py -k estimate",
+    ),
+    Defect(
+        "_solvers/error_control.py",
+        "squares.append(square / jnp.square(scale.astype(square.dtype)))",
+        "squares.append(square / scale.astype(square.dtype))",
+        "a scale that is not squared",
+        "solvers/test_error_control.py",
+    ),
+    # Fields.
+    Defect(
+        "_fields/matrix.py",
+        "self.act(self.a, other.a) - self.act(other.a, self.a)",
+        "self.act(other.a, self.a) - self.act(self.a, other.a)",
+        "the bracket of the other side",
+        "fields/test_matrix.py -k bracket",
+    ),
+    Defect(
+        "_fields/matrix.py",
+        "return _product(x, a)",
+        "return _product(a, x)",
+        "a matrix on the wrong side",
+        "fields/test_matrix.py -k flow",
+    ),
+    Defect(
+        "_fields/matrix.py",
+        "return (weight - 1) * point + moved",
+        "return weight * point + moved",
+        "a displacement that holds the point itself",
+        "fields/test_matrix.py solvers/test_one_step.py",
+    ),
+    Defect(
+        "_fields/rotation.py",
+        "return type(self)(cross(self.omega, other.omega))",
+        "return type(self)(cross(other.omega, self.omega))",
+        "a bracket of rotations of the wrong sign",
+        "fields/test_rotation.py fields/test_matrix.py -k bracket",
+    ),
+    Defect(
+        "_fields/affine.py",
+        "combine((self.alpha, -other.alpha), (other.b, self.b))",
+        "combine((other.alpha, -self.alpha), (other.b, self.b))",
+        "swapped coefficients in the bracket of affine fields",
+        "fields/test_affine.py -k bracket",
+    ),
+    Defect(
+        "_fields/affine.py",
+        "_times(phi_1(z), b)",
+        "_times(jnp.exp(z), b)",
+        "an exponential for phi_1",
+        "fields/test_affine.py -k flow",
+    ),
+    Defect(
+        "_fields/low_rank.py",
+        "point = SpanPoint(frozen_at + _correction(span.gram), span.blocks)",
+        "point = SpanPoint(frozen_at, span.blocks)",
+        "a dropped correction of the columns",
+        "fields/test_low_rank.py -k orthonormality",
+    ),
+    Defect(
+        "_fields/low_rank.py",
+        "span, frozen_at = earlier[-1].span, point.z",
+        "span, frozen_at = earlier[-1].span, jnp.eye(*point.z.shape, dtype=point.z.dtype)",
+        "a field frozen at the start of the step, the wrong frame",
+        "fields/test_low_rank.py -k full_matrices",
+    ),
+    Defect(
+        "_fields/low_rank.py",
+        "half = matmul(x.a, y.k)",
+        "half = matmul(y.a, x.k)",
+        "a bracket of the wrong sign on a span",
+        "fields/test_low_rank.py -k bracket",
+    ),
+    # Functions.
+    Defect(
+        "_numerics/expm.py",
+        "s = jnp.maximum((exponent + 1) // 2, 0)",
+        "s = jnp.maximum(exponent // 2, 0)",
+        "one squaring too few",
+        "numerics/test_expm.py",
+    ),
+    Defect(
+        "_numerics/expm_times.py",
+        "term = product(term) / k",
+        "term = product(term) / (k + 1)",
+        "a wrong factorial in the exponential times a few columns",
+        "numerics/test_expm_times.py",
+    ),
+    Defect(
+        "_numerics/phi.py",
+        "return _moment(m, z), _moment(m + 1, z) * z_dot",
+        "return _moment(m, z), _moment(m, z) * z_dot",
+        "a wrong derivative of phi_1",
+        "numerics/test_phi.py",
+    ),
+    Defect(
+        "_numerics/stumpff.py",
+        "(jnp.zeros_like(s), (c3 - c2) / 2 * s_dot, (c4 - c3 / 2) * s_dot)",
+        "(jnp.zeros_like(s), (c3 - c2) * s_dot, (c4 - c3 / 2) * s_dot)",
+        "a missing half in the derivative of a rotation",
+        "numerics/test_stumpff.py fields/test_rotation.py",
+    ),
+    Defect(
+        "_numerics/transforms.py",
+        "weights = n * _cosine_scale(n) * np.where(np.arange(n) == 0, 2, 1)",
+        "weights = n * _cosine_scale(n)",
+        "a missing factor in the fast cosine transform",
+        "numerics/test_transforms.py",
+    ),
+    # Integration, batches, measuring, scenes.
+    Defect(
+        "_term.py",
+        "        _check_precision(place, part, point)\n",
+        "",
+        "a dropped check of the precision",
+        "test_term.py",
+    ),
+    Defect(
+        "_integrate/integrate.py",
+        "return jnp.where(n == num_steps, t1, t0 + n.astype(t0.dtype) * ((t1 - t0) / intervals))",
+        "return t0 + n.astype(t0.dtype) * ((t1 - t0) / intervals)",
+        "a last step that misses the end by rounding",
+        "integrate/test_integrate.py",
+    ),
+    Defect(
+        "_integrate/integrate.py",
+        "        return repeat(step, carry, rest)",
+        "        return carry",
+        "dropped steps behind the last checkpoint",
+        "integrate/test_integrate.py -k checkpoint",
+    ),
+    Defect(
+        "_integrate/batch.py",
+        "index = np.minimum(np.arange(start, start + self.chunk_size), stop - 1)",
+        "index = np.minimum(np.arange(self.chunk_size), stop - 1)",
+        "the first chunk of a batch in place of every other",
+        "integrate/test_batch.py -k chunks",
+    ),
+    Defect(
+        "_integrate/batch.py",
+        "for x in (self.fingerprint, data)] + list(inputs))",
+        "for x in (self.fingerprint, data)])",
+        "kept results that do not know their members",
+        "integrate/test_batch.py -k other_members",
+    ),
+    Defect(
+        "_measure/flops.py",
+        "return 2 * _size(eqn.outvars[0]) *",
+        "return _size(eqn.outvars[0]) *",
+        "a missing factor 2 in the flops of a product",
+        "measure/test_flops.py",
+    ),
+    Defect(
+        "_measure/cost.py",
+        "return self.first + (num_steps - 1) * self.later",
+        "return self.first + num_steps * self.later",
+        "one step too many in the counts",
+        "measure/test_work_precision.py",
+    ),
+    Defect(
+        "scenes/heat.py",
+        "b = _operator(mu - constant, to_grid(y))",
+        "b = _operator(mu, to_grid(y))",
+        "a part of the diffusivity that acts twice",
+        "scenes/test_heat.py",
+    ),
+    # Programs for XLA.
+    Defect(
+        "_xla/loop.py",
+        "    return primals[0], tangents[1]",
+        "    return primals[0], tangents[0]",
+        "the derivative of the wrong traveller of a loop",
+        "xla/test_loop.py test_gradients.py",
+    ),
+]
+
+
+def planted(defect: Defect) -> str:
+    """The file's text with the defect; an error where the table is stale."""
+    text = (ROOT / "cfjax" / defect.file).read_text()
+    if text.count(defect.old) != 1:
+        raise ValueError(f"{defect.file} has {text.count(defect.old)} times {defect.old!r}.")
+    return text.replace(defect.old, defect.new)
+
+
+def caught_by(defect: Defect, only_first: bool) -> str:
+    """The first test that fails, or nothing."""
+    ignored = shutil.ignore_patterns(".*", "figures", "__pycache__", "*.egg-info")
+    with tempfile.TemporaryDirectory() as folder:
+        copy = shutil.copytree(ROOT, Path(folder) / "cfjax", ignore=ignored)
+        (copy / "cfjax" / defect.file).write_text(planted(defect))
+        words = defect.tests.split()
+        first = [f"tests/{word}" if ".py" in word else word for word in words]
+        everything = ["--numprocesses", "auto", "--dist", "worksteal"]
+        runs = [first] if only_first else [first, everything]
+        return next(filter(None, (failure(copy, arguments) for arguments in runs)), "")
+
+
+def failure(folder: Path, arguments: list[str]) -> str:
+    """The first test that fails with these arguments, or nothing."""
+    # The copy and not what is installed, also in processes that the tests start.
+    environment = os.environ | {"PYTHONPATH": str(folder), "PYTHONDONTWRITEBYTECODE": "1"}
+    command = [sys.executable, "-m", "pytest", "-x", "-q", "-p", "no:cacheprovider", *arguments]
+    done = subprocess.run(command, cwd=folder, env=environment, capture_output=True, text=True)
+    if done.returncode == 0:
+        return ""
+    # FAILED and a test, or ERROR and a file that cannot be imported. Else no test has run.
+    found = re.findall("^(?:FAILED|ERROR) (?:tests/)?(.*?)(?: - .*)?$", done.stdout, re.MULTILINE)
+    if not found:
+        raise RuntimeError(f"{' '.join(command)}:\n{done.stdout}{done.stderr}")
+    return found[0]
+
+
+def main() -> int:
+    parser = argparse.ArgumentParser(description="Whether the tests see planted defects.")
+    parser.add_argument("words", nargs="*", metavar="WORD")
+    parser.add_argument("--first", action="store_true")
+    options = parser.parse_args()
+    texts = [f"{defect.file}: {defect.what}" for defect in DEFECTS]
+    chosen = [
+        (defect, text)
+        for defect, text in zip(DEFECTS, texts, strict=True)
+        if not options.words or any(word in text for word in options.words)
+    ]
+    if not chosen:
+        parser.error("no defect has one of these words")
+    for defect, _ in chosen:
+        planted(defect)
+    caught = 0
+    for defect, text in chosen:
+        begin = time.perf_counter()
+        test = caught_by(defect, options.first)
+        caught += bool(test)
+        seconds = time.perf_counter() - begin
+        print(f"{'caught' if test else 'MISSED'}  {seconds:4.0f} s  {text}", flush=True)
+        if test:
+            print(f"                by {test}", flush=True)
+    print(f"{caught} of {len(chosen)} defects caught: {caught / len(chosen):.0%}")
+    return int(caught < NEEDED * len(chosen))
+
+
+if __name__ == "__main__":
+    sys.exit(main())
