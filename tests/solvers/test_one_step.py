@@ -12,9 +12,9 @@ import numpy as np
 import problems
 import pytest
 import scipy.linalg
-from cfjax._methods.continuous_extension import continuous_extension
 
 import cfjax
+from cfjax._methods.continuous_extension import continuous_extension
 
 SOLVERS: dict[str, Any] = {
     name: getattr(cfjax, name)()
