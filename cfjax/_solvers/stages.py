@@ -10,7 +10,7 @@ import jax.tree_util as jtu
 from jax import lax
 from jaxtyping import Array, PyTree, Real
 
-from .._field import AbstractFrozenField, Displaced, combine, flow, is_displaced, is_field
+from .._field import AbstractFrozenField, Displaced, flow, is_displaced, is_field
 from .._xla import is_rewritten
 
 _is_written_out: ContextVar[bool] = ContextVar("is_written_out", default=False)
@@ -133,10 +133,8 @@ def run(
 
 
 def _like(first: PyTree, value: PyTree) -> PyTree:
-    if jtu.tree_structure(value) != jtu.tree_structure(first):
-        combine((1.0, 1.0), (first, value))  # Which says what is wrong, if it is.
-        raise FieldVaries
-    if _types(value) != _types(first):
+    if jtu.tree_structure(value) != jtu.tree_structure(first) or _types(value) != _types(first):
+        # It may be an error, and is one in words where the stages are written out.
         raise FieldVaries
     # Only a weak type may be left over.
     return jtu.tree_map(lambda v, f: jnp.asarray(v, f.dtype), value, first)

@@ -44,6 +44,7 @@ BUILT_IN: dict[str, tuple[Any, Any]] = {
 }
 
 
+@pytest.mark.representatives(3)
 @pytest.mark.parametrize("name", BUILT_IN)
 def test_every_class_of_the_package_passes(name):
     make, point = BUILT_IN[name]

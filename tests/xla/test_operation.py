@@ -86,11 +86,13 @@ def test_derivatives(inner, outer, argument):
     check(quick(second(whole))(X, SCALE), second(plain)(X, SCALE))
 
 
+@pytest.mark.slow
 def test_third_derivatives():
     third = lambda f: jax.jacfwd(jax.jacrev(jax.grad(size(f))))  # noqa: E731
     check(quick(third(whole))(X, SCALE), third(plain)(X, SCALE))
 
 
+@pytest.mark.slow
 def test_directions_that_are_many():
     """More than are computed one by one."""
     directions = jnp.asarray(np.random.default_rng(1).normal(size=(20, 3)))

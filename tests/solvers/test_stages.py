@@ -1,0 +1,118 @@
+"""Stages in a loop: the numbers and derivatives of stages that are written out."""
+
+import diffrax
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+import problems
+import pytest
+
+import cfjax
+from cfjax._solvers.stages import written_out
+
+A, B = problems.GENERATORS[:2]
+FIELDS = {
+    "matrix": (problems.left_matrix, problems.ORTHOGONAL, problems.GENERATORS),
+    "product": (problems.body_in_flight, problems.FLIGHT_START, problems.FLIGHT_ARGS),
+    "complex": (
+        lambda t, y, args: cfjax.RightMatrix(
+            (args[0] + args[0].T) * (1j * t.astype(complex)) + args[1] * y[0, 0]
+        ),
+        jnp.eye(4, dtype=complex),
+        (A.astype(complex), B.astype(complex)),
+    ),
+}
+SOLVERS = {
+    "CF4": cfjax.CF4(),
+    "CF54": cfjax.CF54(),
+    "CG3": cfjax.CG3(),
+    "RKMK(Tsit5)": cfjax.RKMK(diffrax.Tsit5.tableau),
+}
+
+
+def moved(solver, field, y0, args):
+    """One step: its end, its estimate and a point within it."""
+    term, time = cfjax.LieTerm(field), (jnp.asarray(0.1), jnp.asarray(0.4))
+    state = solver.init(term, *time, y0, args)
+    y1, error, dense, _, _ = solver.step(term, *time, y0, args, state, made_jump=False)
+    return y1, error, solver.interpolation_cls(t0=time[0], t1=time[1], **dense).evaluate(0.2)
+
+
+def both(fun, *args):
+    looped = jax.jit(lambda *a: fun(*a)).lower(*args)
+    with written_out():
+        plain = jax.jit(lambda *a: fun(*a)).lower(*args)
+    assert "while" in looped.as_text()
+    # A flow each in one of them.
+    assert len(looped.as_text()) < len(plain.as_text())
+    return looped.compile()(*args), plain.compile()(*args)
+
+
+def assert_same(found, expected, units):
+    assert jax.tree.structure(found) == jax.tree.structure(expected)
+    for a, b in zip(jax.tree.leaves(found), jax.tree.leaves(expected), strict=True):
+        assert a.dtype == b.dtype
+        np.testing.assert_allclose(a, b, rtol=0, atol=units * 2.0**-52)
+
+
+@pytest.mark.representatives(4)
+@pytest.mark.parametrize("problem", FIELDS)
+@pytest.mark.parametrize("name", SOLVERS)
+def test_a_step(name, problem):
+    field, y0, args = FIELDS[problem]
+    y0, args = problems.arrays((y0, args))
+    fun = lambda y0, args: moved(SOLVERS[name], field, y0, args)  # noqa: E731
+    # Entries of size 1, some ten flows with a few roundings each.
+    assert_same(*both(fun, y0, args), 100)
+
+
+@pytest.mark.representatives(2)
+@pytest.mark.parametrize("name", ["CF4", "RKMK(Tsit5)"])
+def test_a_gradient_in_a_batch(name):
+    field, y0, args = FIELDS["matrix"]
+    y0, args = problems.arrays((y0, args))
+    loss = lambda y0, args: jnp.sum(jnp.sin(moved(SOLVERS[name], field, y0, args)[0]))  # noqa: E731
+    fun = jax.vmap(jax.grad(loss, (0, 1)), (0, None))
+    # Sums of sixteen products of such entries, and more than one stage back.
+    assert_same(*both(fun, jnp.stack([y0, 2 * y0]), args), 2000)
+
+
+class Weighted(cfjax.AbstractFrozenField):
+    """Grows with a number of its own, which is static."""
+
+    a: jax.Array
+    number: int = eqx.field(static=True, default=0)
+
+    def flow(self, point):
+        return point * jnp.exp(self.a)
+
+    def tangent(self, point):
+        return self.a * point
+
+
+def test_fields_of_different_kinds_are_an_error_in_words():
+    def field(t, y, args):
+        kinds.append(1)
+        return cfjax.LeftMatrix(A) if len(kinds) < 3 else cfjax.RightMatrix(A)
+
+    kinds = []
+    with pytest.raises(TypeError, match="Only fields of one kind can be added"):
+        moved(cfjax.CF4(), field, jnp.eye(4), None)
+
+
+def test_a_field_that_varies_is_written_out():
+    """Here in its static part, which no array can hold for all stages."""
+
+    def field(t, y, args):
+        numbers.append(1)
+        return Weighted(jnp.cos(t) * y / 2, len(numbers))
+
+    numbers = []
+    y0 = jnp.linspace(0.5, 1.0, 9)
+    time = jnp.asarray(0.1), jnp.asarray(0.4)
+    found = problems.first_step(cfjax.CF2(), cfjax.LieTerm(field), *time, y0, None)[0]
+    half = 0.25
+    middle = y0 * np.exp(0.15 * np.cos(0.1) * y0 / 2)
+    expected = y0 * np.exp(0.3 * np.cos(half) * middle / 2)
+    np.testing.assert_allclose(found, expected, rtol=1e-15)
