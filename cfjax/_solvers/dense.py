@@ -13,6 +13,7 @@ from jaxtyping import Array, PyTree
 from .._field import combine, flow, leave
 from .._methods.tableau import ContinuousExtension
 from .._xla import by_components
+from .stages import along, can_loop
 
 
 class Interpolation(diffrax.AbstractLocalInterpolation):
@@ -74,8 +75,10 @@ class Path(eqx.Module):
         def end(arrays: tuple[Array, ...]) -> PyTree:
             leaves = [arrays[i] for i in self.places]
             point, fields = jtu.tree_unflatten(self.structure, leaves)
-            for powers in self.continuous_extension:
-                weights = _polynomials(powers, theta)
+            rows = [_polynomials(powers, theta) for powers in self.continuous_extension]
+            if self.move is flow and len(rows) > 1 and can_loop(fields[0]):
+                return along(rows, fields, point)
+            for weights in rows:
                 used = [(w, f) for w, f in zip(weights, fields, strict=False) if w is not None]
                 point = self.move(combine(*zip(*used, strict=True)), point)
             return leave(fields[0], point)

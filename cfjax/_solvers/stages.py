@@ -89,6 +89,28 @@ def elements(
     return [_at(stages, k) for k in range(n)]
 
 
+def along(
+    rows: Sequence[Sequence[float | Real[Array, ""] | None]],
+    fields: Sequence[PyTree],
+    point: PyTree,
+) -> PyTree:
+    """Where flows of combinations of the fields lead, the first row first; None is no weight."""
+    n = len(fields)
+    dtype = jnp.result_type(next(w for row in rows for w in row if w is not None))
+    padded = ([*row, *[None] * n][:n] for row in rows)
+    weights = jnp.stack(
+        [jnp.stack([jnp.asarray(0.0 if w is None else w, dtype) for w in row]) for row in padded]
+    )
+    stages = jtu.tree_map(lambda *leaves: jnp.stack(leaves), *fields)
+
+    def body(point: PyTree, row: Array) -> Any:
+        return flow(jtu.tree_map(lambda f: _combination(row, f), stages), point), None
+
+    # A weak type would be lost on the way.
+    start = jtu.tree_map(lambda x: jnp.asarray(x, jnp.result_type(x)), point)
+    return lax.scan(body, start, weights)[0]
+
+
 def run(
     flows: Sequence[Flow],
     num_stages: int,
