@@ -37,8 +37,9 @@ from .scope import Place, is_numeric, is_on, is_short, unread, where, within
 # longer to compile than it saves.
 _MAX_ENTRIES = 16
 _MAX_OPERATIONS = 6000
-# Within a step matrices made from them too, such as the 4 x 4 matrix of a quaternion.
-_MAX_SIZE = 36
+# Within a step arrays made from them too, and constants: the 4 x 4 matrix of a quaternion, and the
+# 4 x 4 x 4 numbers that multiply two.
+_MAX_SIZE = 64
 _MAX_PRODUCT = 216
 
 _ELEMENTWISE = frozenset(
