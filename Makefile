@@ -26,7 +26,7 @@ test-all: .venv/dev
 
 # Whether a version works at all.
 test-quick: .venv/dev
-	$(BIN)/python $(PYTEST) $(QUICK) -m "slow or not slow"
+	$(BIN)/python $(PYTEST) $(QUICK)
 
 # The tests on exactly the lowest versions in pyproject.toml.
 test-lowest: .venv-lowest/dev

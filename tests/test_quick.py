@@ -85,7 +85,7 @@ def test_every_solver(name):
     check(SOLVERS[name](), unit, FRAME if name == "CayleyRK4" else ON_SPHERE, has_gradient=False)
 
 
-@pytest.mark.representatives(2)
+@pytest.mark.representatives(4)
 @pytest.mark.parametrize("name", FIELDS)
 def test_every_field(name):
     check(cfjax.CF3(), *FIELDS[name], has_gradient=True)
