@@ -19,7 +19,7 @@ exact solution: Owren, J. Phys. A 39 (2006), doi:10.1088/0305-4470/39/19/S07.
 import math
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from fractions import Fraction
-from functools import cache, lru_cache
+from functools import cache, cached_property, lru_cache
 from typing import Any, TypeAlias
 
 import numpy as np
@@ -38,7 +38,10 @@ class _Rounded:
     def __init__(self, value: Fraction, change: np.ndarray) -> None:
         self.value = value
         self.change = change
-        self._float = float(value)
+
+    @cached_property
+    def _float(self) -> float:
+        return float(self.value)
 
     def __add__(self, other: "_Rounded | Fraction") -> "_Rounded":
         if isinstance(other, Fraction):
@@ -232,10 +235,11 @@ def _tree_weights(tableau: Tableau) -> Iterator[Weights]:
         for tree in trees(n):
             for branches, value in zip(grown, values, strict=True):
                 value[tree] = math.prod((branches[child] for child in tree), start=Fraction(1))
+        yield {tree: _sum(a * values[k][tree] for k, a in end) for tree in trees(n)}
+        # Only for the next order, and the most work of all.
         for tree in trees(n):
             for row, branches in zip(rows, grown, strict=True):
                 branches[tree] = _sum(a * values[k][tree] for k, a in row)
-        yield {tree: _sum(a * values[k][tree] for k, a in end) for tree in trees(n)}
 
 
 def _nonzero(rows: Sequence[Row]) -> list[list[tuple[int, Number]]]:

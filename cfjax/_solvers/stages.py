@@ -11,7 +11,7 @@ from jax import lax
 from jaxtyping import Array, PyTree, Real
 
 from .._field import AbstractFrozenField, Displaced, flow, is_displaced, is_field
-from .._xla import is_rewritten
+from .._xla import is_rewritten, pack
 
 _is_written_out: ContextVar[bool] = ContextVar("is_written_out", default=False)
 
@@ -101,7 +101,8 @@ def along(
     weights = jnp.stack(
         [jnp.stack([jnp.asarray(0.0 if w is None else w, dtype) for w in row]) for row in padded]
     )
-    stages = jtu.tree_map(lambda *leaves: jnp.stack(leaves), *fields)
+    # XLA computes what leads to each of the arrays that `jnp.stack` gets for itself.
+    stages = jtu.tree_map(lambda *leaves: pack(leaves), *fields)
 
     def body(point: PyTree, row: Array) -> Any:
         return flow(jtu.tree_map(lambda f: _combination(row, f), stages), point), None

@@ -36,7 +36,7 @@ from .scope import Place, is_numeric, is_on, is_short, unread, where, within
 # a step is not longer than that: counted in operations on single numbers. Longer programs take XLA
 # longer to compile than it saves.
 _MAX_ENTRIES = 16
-_MAX_OPERATIONS = 6000
+_MAX_OPERATIONS = 3000
 # Within a step arrays made from them too, and constants: the 4 x 4 matrix of a quaternion, and the
 # 4 x 4 x 4 numbers that multiply two.
 _MAX_SIZE = 64

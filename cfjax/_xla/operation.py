@@ -38,10 +38,11 @@ from .scope import Place
 # What two of its functions need, XLA computes in both, and into one it puts some 2000 operations.
 # In long programs it then computes single ones exponentially often: in values never as measured, in
 # first derivatives from some 8000 operations on, counted as they are written, within diffrax's loop
-# from 4000, and in second ones earlier. Those are compiled as several, though to send what they
-# share through memory takes time.
+# from 4000, in batches from 5000, and in second ones earlier. Those are compiled as several, though
+# to send what they share through memory takes time.
 _WHOLE = {"loop": (math.inf, 6000, 3000), "step": (math.inf, 3500, 3000)}
-_GROUP = 1500
+_WHOLE_IN_BATCHES = (math.inf, 4500, 3000)
+_GROUP = 1000
 # A second derivative has up to five times the operations, and should fit.
 _PIECE = 250
 # Of so many directions each is computed on its own.
@@ -202,11 +203,14 @@ def variables(atoms: Iterable[Any]) -> list[Any]:
 
 
 class _Kind(NamedTuple):
-    """Where it runs, how many of the last operands it is linear in, and which derivative it is."""
+    """Where it runs, how many of the last operands it is linear in, which derivative it is, and
+    whether it is of a batch.
+    """
 
     place: Place
     linear: int = 0
     order: int = 0
+    is_batch: bool = False
 
 
 operation_p = Primitive("cfjax_operation")
@@ -215,7 +219,11 @@ operation_p.multiple_results = True
 
 @operation_p.def_impl
 def _run(*operands, program, kind):
-    groups = _groups(program, _WHOLE[kind.place][min(kind.order, 2)])
+    order = min(kind.order, 2)
+    most = _WHOLE[kind.place][order]
+    if kind.is_batch:
+        most = min(most, _WHOLE_IN_BATCHES[order])
+    groups = _groups(program, most)
     # Of a second derivative there are several in one loop.
     if len(groups) == 1 and kind.order < 2:
         return _flattened(program, *operands)
@@ -284,7 +292,7 @@ def _flattened(program: ClosedJaxpr, *operands: Array) -> list[Array]:
                 key = eqn.primitive, *keys, *dropped, parameters(eqn)
                 if key not in known:
                     values = [_read(v, env) for v in eqn.invars]
-                    known[key] = values, _evaluate(jaxpr, eqn, values)
+                    known[key] = values, evaluate(jaxpr, eqn, values)
                 _, outs = known[key]
             env.update(zip(eqn.outvars, outs, strict=True))
         return _results(jaxpr, env)
@@ -304,6 +312,9 @@ def parameters(eqn: JaxprEqn) -> Hashable:
 
 def evaluate(jaxpr: Jaxpr, eqn: JaxprEqn, values: Sequence[Any]) -> Sequence[Any]:
     """The results of one operation of a program; None for those that are dropped."""
+    # Most are of this kind, and the other way takes ten times as long.
+    if not eqn.primitive.multiple_results and not any(jaxprs_in_params(eqn.params)):
+        return [eqn.primitive.bind(*values, **eqn.params)]
     known = {v: x for v, x in zip(eqn.invars, values, strict=True) if not isinstance(v, Literal)}
     # JAX's own evaluator knows how every operation is called, in every version of JAX.
     alone = jaxpr.replace(
@@ -315,13 +326,6 @@ def evaluate(jaxpr: Jaxpr, eqn: JaxprEqn, values: Sequence[Any]) -> Sequence[Any
     )
     outs = iter(jaxpr_as_fun(ClosedJaxpr(alone, []))(*known.values()))
     return [None if isinstance(v, DropVar) else next(outs) for v in eqn.outvars]
-
-
-def _evaluate(jaxpr: Jaxpr, eqn: JaxprEqn, values: Sequence[Any]) -> Sequence[Any]:
-    # Most are of this kind, and the other way takes its time.
-    if not eqn.primitive.multiple_results and not any(jaxprs_in_params(eqn.params)):
-        return [eqn.primitive.bind(*values, **eqn.params)]
-    return evaluate(jaxpr, eqn, values)
 
 
 # Where newer versions of JAX put types of their own within, they take them out first.
@@ -468,7 +472,7 @@ def _batch(operands, dims, *, program, kind):
         out_dims = [0] * len(outs)
     else:
         batched, out_dims = _batched(program, tuple(dims), size)
-        outs = operation_p.bind(*operands, program=batched, kind=kind)
+        outs = operation_p.bind(*operands, program=batched, kind=kind._replace(is_batch=True))
     return outs, out_dims
 
 
