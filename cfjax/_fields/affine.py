@@ -51,8 +51,8 @@ class Affine(AbstractAlgebraElement):
     another kind of transform.
 
     Source: Celledoni, Marthinsen & Owren, Commutator-free Lie group methods, FGCS 19 (2003),
-    Section 3.3; Munthe-Kaas, High order Runge-Kutta methods on manifolds, Appl. Numer. Math. 29
-    (1999).
+    Section 3.3, doi:10.1016/S0167-739X(02)00161-9; Munthe-Kaas, High order Runge-Kutta methods on
+    manifolds, Appl. Numer. Math. 29 (1999), doi:10.1016/S0168-9274(98)00030-0.
     """
 
     alpha: Inexact[Array, ""]

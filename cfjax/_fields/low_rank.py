@@ -103,7 +103,7 @@ class BorderedSkew(AbstractSkewElement):
     of `y^T y`, is an error. Outside of a solve a point that is off by 0.1 gives NaN.
 
     Source: Celledoni, Marthinsen & Owren, Commutator-free Lie group methods, FGCS 19 (2003),
-    Section 3.2.
+    Section 3.2, doi:10.1016/S0167-739X(02)00161-9.
     """
 
     gamma: Float[Array, "n p"] = eqx.field(converter=jnp.asarray)

@@ -317,7 +317,7 @@ def third_order_a(alpha: int | Fraction | float) -> Tableau:
 
     **Raises:** `ValueError` for `alpha` 0 or 1/3, where the weights divide by zero.
 
-    Source: Celledoni, Marthinsen & Owren, FGCS 19 (2003).
+    Source: Celledoni, Marthinsen & Owren, FGCS 19 (2003), doi:10.1016/S0167-739X(02)00161-9.
     """
     x = _parameter(alpha, {Fraction(0): "6 alpha", Fraction(1, 3): "3 alpha - 1"})
     third = Fraction(1, 3)
@@ -334,7 +334,7 @@ def third_order_b(alpha: int | Fraction | float) -> Tableau:
 
     **Raises:** `ValueError` for `alpha` 1 or 1/3, where the coefficients divide by zero.
 
-    Source: Celledoni, Marthinsen & Owren, FGCS 19 (2003).
+    Source: Celledoni, Marthinsen & Owren, FGCS 19 (2003), doi:10.1016/S0167-739X(02)00161-9.
     """
     x = _parameter(alpha, {Fraction(1): "1 - alpha", Fraction(1, 3): "3 alpha - 1"})
     # Never zero: 3x^2 - 3x + 1 = 3 (x - 1/2)^2 + 1/4.

@@ -173,9 +173,9 @@ def expm(a: Inexact[Array | np.ndarray, "n n"]) -> Inexact[Array, "n n"]:
 
     **Raises:** `ValueError` if `a` is not a square matrix, `TypeError` for another dtype.
 
-    Source: the polynomials have the form of Sastre, Linear Algebra Appl. 539 (2018), and of Sastre
-    & Ibáñez, Mathematics 9 (2021). Bounding the backward error by powers of a is from Al-Mohy &
-    Higham, SIAM J. Matrix Anal. Appl. 31 (2009).
+    Source: the polynomials have the form of Sastre, Linear Algebra Appl. 539 (2018),
+    doi:10.1016/j.laa.2017.11.010, and of Sastre & Ibáñez, Mathematics 9 (2021). Bounding the
+    backward error by powers of a is from Al-Mohy & Higham, SIAM J. Matrix Anal. Appl. 31 (2009).
     """
     a = jnp.asarray(a)
     weight, rest = expm_parts(a)

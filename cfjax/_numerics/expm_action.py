@@ -48,7 +48,8 @@ def phi_1_action(
     truncated Chebyshev series needs two or three products less than Taylor's. The choice depends
     on A's norm alone and not on `b`, so the derivatives are nearly as accurate.
 
-    Source: Tal-Ezer & Kosloff, J. Chem. Phys. 81 (1984), for Chebyshev series of skew operators.
+    Source: Tal-Ezer & Kosloff, J. Chem. Phys. 81 (1984), doi:10.1063/1.448136, for Chebyshev
+    series of skew operators.
     """
     # The value depends on the bound by less than rounding, so the derivative is zero.
     bound = max_over_batch(lax.stop_gradient(bound))

@@ -39,7 +39,7 @@ def expm_minus_one_times(
     A alone and not on `x`, so derivatives are as accurate.
 
     Source: Al-Mohy & Higham, Computing the action of the matrix exponential, SIAM J. Sci. Comput.
-    33 (2011).
+    33 (2011), doi:10.1137/100788860.
     """
     norm = max_over_batch(lax.stop_gradient(norm))
     degrees, thetas = zip(*_DEGREES[jnp.finfo(x.dtype).dtype.name], strict=True)

@@ -244,7 +244,8 @@ class CF3(AbstractCommutatorFree, diffrax.AbstractAdaptiveSolver):
     The estimate, with an embedded method of order 2, costs 1 flow more. Dense output of order 2.
     `cfjax.third_order_a` and `cfjax.third_order_b` give the families it belongs to.
 
-    Source: Commutator-free Lie group methods, FGCS 19 (2003), equation (6).
+    Source: Commutator-free Lie group methods, FGCS 19 (2003), equation (6),
+    doi:10.1016/S0167-739X(02)00161-9.
     """
 
     tableau: ClassVar[Tableau] = _tableau.CF3
@@ -260,7 +261,8 @@ class CF4(AbstractCommutatorFree, diffrax.AbstractAdaptiveSolver):
     where it is small it is replaced by the distance of the last stage from the end, times its ratio
     to the way from the start. Dense output of order 3.
 
-    Source: Commutator-free Lie group methods, FGCS 19 (2003), equation (7).
+    Source: Commutator-free Lie group methods, FGCS 19 (2003), equation (7),
+    doi:10.1016/S0167-739X(02)00161-9.
     """
 
     tableau: ClassVar[Tableau] = _tableau.CF4
@@ -291,7 +293,7 @@ class CF54(AbstractCommutatorFree, diffrax.AbstractAdaptiveSolver):
     of an order above 4 has positive weights.
 
     Source: derived for this package from the order conditions; see `cfjax.order`. Weights:
-    Hofstatter & Koch, Numer. Math. 141 (2019).
+    Hofstätter & Koch, Numer. Math. 141 (2019), arXiv:1709.08473.
     """
 
     tableau: ClassVar[Tableau] = _pairs.CF54
@@ -303,8 +305,8 @@ class CG3(AbstractCommutatorFree, diffrax.AbstractAdaptiveSolver):
     The estimate, with an embedded method of order 2, costs 3 flows more. Dense output of order 2.
     Flows go backwards in time too: not for fields that hold strong dissipation, see `CF54`.
 
-    Source: Crouch & Grossman, J. Nonlinear Sci. 3 (1993); coefficients of Owren & Marthinsen,
-    BIT 39 (1999).
+    Source: Crouch & Grossman, J. Nonlinear Sci. 3 (1993), doi:10.1007/BF02429858; coefficients of
+    Owren & Marthinsen, BIT 39 (1999), doi:10.1023/A:1022325426017.
     """
 
     tableau: ClassVar[Tableau] = _tableau.CG3
@@ -316,7 +318,8 @@ class CG4(AbstractCommutatorFree):
     Dense output of order 3.
     Flows go backwards in time too: not for fields that hold strong dissipation, see `CF54`.
 
-    Source: Jackiewicz, Marthinsen & Owren, Adv. Comput. Math. 13 (2000).
+    Source: Jackiewicz, Marthinsen & Owren, Adv. Comput. Math. 13 (2000),
+    doi:10.1023/A:1016645730465.
     """
 
     tableau: ClassVar[Tableau] = _tableau.CG4
@@ -328,7 +331,8 @@ class CG5(AbstractCommutatorFree):
     Dense output of order 4, which uses the field at the end of the step.
     Flows go backwards in time too: not for fields that hold strong dissipation, see `CF54`.
 
-    Source: Jackiewicz, Marthinsen & Owren, Adv. Comput. Math. 13 (2000).
+    Source: Jackiewicz, Marthinsen & Owren, Adv. Comput. Math. 13 (2000),
+    doi:10.1023/A:1016645730465.
     """
 
     tableau: ClassVar[Tableau] = _tableau.CG5

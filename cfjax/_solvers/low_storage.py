@@ -93,7 +93,8 @@ def _tableau(a: Row, b: Row, embedded: Callable[[Product], Any] | None = None) -
 class Williamson3(AbstractLowStorage):
     """Order 3, 3 evaluations, 3 flows. Dense output of order 2.
 
-    Source: Williamson, J. Comput. Phys. 35 (1980); Bazavov, BIT 62 (2022).
+    Source: Williamson, J. Comput. Phys. 35 (1980), doi:10.1016/0021-9991(80)90033-9; Bazavov,
+    BIT 62 (2022), doi:10.1007/s10543-021-00892-x.
     """
 
     a: ClassVar[Row] = (Fraction(0), Fraction(-5, 9), Fraction(-153, 128))
@@ -104,7 +105,7 @@ class Williamson3(AbstractLowStorage):
 class BWRRK33(AbstractLowStorage):
     """Order 3, 3 evaluations, 3 flows. Dense output of order 2.
 
-    Source: Bazavov, BIT 62 (2022).
+    Source: Bazavov, BIT 62 (2022), doi:10.1007/s10543-021-00892-x.
     """
 
     a: ClassVar[Row] = (Fraction(0), -0.637694471842202, -1.306647717737108)
@@ -116,7 +117,7 @@ class BWRRK53(AbstractLowStorage, diffrax.AbstractAdaptiveSolver):
     """Order 3, 5 evaluations, 5 flows. The estimate, of order 2, costs nothing. Dense output
     of order 3.
 
-    Source: Bazavov, BIT 62 (2022).
+    Source: Bazavov, BIT 62 (2022), doi:10.1007/s10543-021-00892-x.
     """
 
     a: ClassVar[Row] = (
@@ -180,7 +181,8 @@ class Luscher3(AbstractLowStorage, diffrax.AbstractAdaptiveSolver):
     """Order 3, 3 evaluations, 3 flows. The estimate, of order 2, costs 1 flow more, and two more
     copies of the state. Dense output of order 2.
 
-    Source: Luscher, JHEP 08 (2010) 071; estimate: Fritzsch & Ramos, JHEP 10 (2013) 008.
+    Source: Lüscher, JHEP 08 (2010) 071, doi:10.1007/JHEP08(2010)071; estimate: Fritzsch & Ramos,
+    JHEP 10 (2013) 008, doi:10.1007/JHEP10(2013)008.
     """
 
     a: ClassVar[Row] = (Fraction(0), Fraction(-17, 32), Fraction(-32, 27))
@@ -193,7 +195,7 @@ class YRK135(AbstractLowStorage):
 
     Flows go backwards in time too: not for fields that hold strong dissipation, see `CF54`.
 
-    Source: Yan (2017); Bazavov, BIT 62 (2022).
+    Source: Yan (2017); Bazavov, BIT 62 (2022), doi:10.1007/s10543-021-00892-x.
     """
 
     a: ClassVar[Row] = (

@@ -86,7 +86,7 @@ class RKMK3(AbstractMuntheKaas):
     Dense output of order 2.
 
     Source: Munthe-Kaas & Owren, Computations in a free Lie algebra, Phil. Trans. R. Soc. A 357
-    (1999).
+    (1999), doi:10.1098/rsta.1999.0361.
     """
 
     b: ClassVar[Row] = _sixths(1, 4, 1, -1)
@@ -110,7 +110,8 @@ class RKMK4(AbstractMuntheKaas):
     Dense output of order 3.
 
     Source: Munthe-Kaas & Owren, Computations in a free Lie algebra, Phil. Trans. R. Soc. A 357
-    (1999). Their two brackets of the last line, `-[Q1, Q2]/6 - [Q1, Q4]/12`, are `-[K1, K4]/12`.
+    (1999), doi:10.1098/rsta.1999.0361. Their two brackets of the last line,
+    `-[Q1, Q2]/6 - [Q1, Q4]/12`, are `-[K1, K4]/12`.
     """
 
     b: ClassVar[Row] = _sixths(1, 2, 2, 1, Fraction(-1, 2))
@@ -145,7 +146,8 @@ class RKMK(AbstractMuntheKaas):
 
     **Raises** `TypeError` if it is something else, `ValueError` if the method is implicit.
 
-    Source: Munthe-Kaas, High order Runge-Kutta methods on manifolds, Appl. Numer. Math. 29 (1999).
+    Source: Munthe-Kaas, High order Runge-Kutta methods on manifolds, Appl. Numer. Math. 29 (1999),
+    doi:10.1016/S0168-9274(98)00030-0.
     """
 
     # Tuples: unlike diffrax's tableau they compare by value, as a static field must.

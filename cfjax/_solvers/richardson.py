@@ -66,8 +66,9 @@ class Richardson(diffrax.AbstractAdaptiveSolver, diffrax.AbstractWrappedSolver):
     unknown.
 
     Source: Celledoni, Marthinsen & Owren, Commutator-free Lie group methods, FGCS 19 (2003),
-    Section 3.3; Hairer, Norsett & Wanner, Solving Ordinary Differential Equations I (1993),
-    Section II.4; for proportionality, Higham, IMA J. Numer. Anal. 11 (1991).
+    Section 3.3, doi:10.1016/S0167-739X(02)00161-9; Hairer, Norsett & Wanner, Solving Ordinary
+    Differential Equations I (1993), Section II.4, doi:10.1007/978-3-540-78862-1; for
+    proportionality, Higham, IMA J. Numer. Anal. 11 (1991).
     """
 
     solver: diffrax.AbstractSolver

@@ -83,8 +83,7 @@ def elements(
         along = jtu.tree_map(lambda f: _combination(row, f), stages)
         return _put(stages, k, _like(first, element(c, along))), None
 
-    padded = [[*row, *[0.0] * (n - len(row))] for row in rows]
-    xs = jnp.arange(1, n), jnp.asarray(padded[1:]), jnp.asarray(times[1:])
+    xs = jnp.arange(1, n), _padded(rows[1:], n), jnp.asarray(times[1:])
     stages, _ = lax.scan(body, _stack(first, n), xs)
     return [_at(stages, k) for k in range(n)]
 
@@ -140,10 +139,9 @@ def run(
 
     # One more row for what is no stage.
     carry = _stack(moving, len(flows) + 1), _stack(first, num_stages + 1)
-    rows = [[*map(float, f.row), *[0.0] * (num_stages - len(f.row))] for f in flows]
     xs = (
         jnp.asarray([f.source for f in flows]),
-        jnp.asarray(rows),
+        _padded([f.row for f in flows], num_stages),
         jnp.asarray([f.target for f in flows]),
         jnp.asarray([num_stages if f.stage is None else f.stage for f in flows]),
         jnp.asarray([f.c for f in flows]),
@@ -153,6 +151,10 @@ def run(
         [_dressed(_at(points, k), rest) for k in range(len(flows) + 1)],
         [_at(fields, k) for k in range(num_stages)],
     )
+
+
+def _padded(rows: Sequence[Sequence[Any]], n: int) -> Array:
+    return jnp.asarray([[*map(float, row), *[0.0] * (n - len(row))] for row in rows])
 
 
 def _like(first: PyTree, value: PyTree) -> PyTree:

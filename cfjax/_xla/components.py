@@ -33,8 +33,8 @@ from .pack import pack, pack_p, unpack, unpack_p
 from .scope import Place, is_numeric, is_on, is_short, unread, where, within
 
 # A state is taken apart if all of it is numbers and short vectors, so many entries together, and if
-# a step is not longer than that: counted in operations on single numbers. Longer programs take XLA
-# longer to compile than it saves.
+# a step is not longer than that, counted in operations on single numbers: the time to compile grows
+# with it, and more so in derivatives. `README.md` here has what that buys and costs.
 _MAX_ENTRIES = 16
 _MAX_OPERATIONS = 3000
 # Within a step arrays made from them too, and constants: the 4 x 4 matrix of a quaternion, and the

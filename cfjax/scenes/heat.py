@@ -7,7 +7,7 @@ u_1..u_{N-1}, so its 2-norm is theirs. The frozen field keeps the part with cons
 which the sine transform diagonalises, and freezes the rest.
 
 Source: Celledoni, Marthinsen & Owren, Commutator-free Lie group methods, FGCS 19 (2003),
-Section 3.3.
+Section 3.3, doi:10.1016/S0167-739X(02)00161-9.
 """
 
 from typing import Any, NamedTuple

@@ -5,7 +5,7 @@ dimensionless. The norm of y and the energy are constant. Frozen at y, the field
 space.
 
 Source: Celledoni, Marthinsen & Owren, Commutator-free Lie group methods, FGCS 19 (2003),
-Section 3.1.
+Section 3.1, doi:10.1016/S0167-739X(02)00161-9.
 """
 
 from typing import Any

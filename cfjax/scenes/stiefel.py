@@ -5,7 +5,7 @@
 the paper has p = 4 and n = 100 and 1000.
 
 Source: Celledoni, Marthinsen & Owren, Commutator-free Lie group methods, FGCS 19 (2003),
-Section 3.2.
+Section 3.2, doi:10.1016/S0167-739X(02)00161-9.
 """
 
 from collections.abc import Callable
