@@ -75,12 +75,12 @@ class AbstractFrozenField(eqx.Module):
             "velocity as an array."
         )
 
-    def displacement(self, point: Any) -> Any:
-        """`flow(point) - point`, with a rounding as small as the displacement; None if not offered.
+    def increment(self, point: Any) -> Any:
+        """`flow(point) - point`, with a rounding as small as the increment; None if not offered.
 
         A class that offers it gets compensated summation over the steps where it acts on matrices
         (`_solvers/base.py`). Not for a field whose flow keeps signs or relative accuracy: the sum
-        of point and displacement keeps absolute accuracy only.
+        of point and increment keeps absolute accuracy only.
         """
         return None
 
@@ -150,10 +150,10 @@ def flow(field: PyTree, point: PyTree) -> PyTree:
     """
 
     def flow_leaf(f, p):
-        if isinstance(p, Displaced) and is_field(f):
-            moved = f.displacement(p.value)
+        if isinstance(p, Incremented) and is_field(f):
+            moved = f.increment(p.value)
             if moved is not None:
-                return Displaced(p.start, p.displacement + moved)
+                return Incremented(p.start, p.increment + moved)
         p = value(p)
         if not is_field(f):
             return p + f
@@ -170,24 +170,26 @@ def flow(field: PyTree, point: PyTree) -> PyTree:
     return jtu.tree_map(flow_leaf, field, point, is_leaf=is_field)
 
 
-class Displaced(eqx.Module):
-    """A point as a start and the displacement from it, whose rounding is as small as it is."""
+class Incremented(eqx.Module):
+    """A point as a start and the increment from it, whose rounding is as small as it is."""
 
     start: Inexact[Array, "..."]
-    displacement: Inexact[Array, "..."]
+    increment: Inexact[Array, "..."]
 
     @property
     def value(self) -> Inexact[Array, "..."]:
-        return self.start + self.displacement
+        return self.start + self.increment
 
 
-def is_displaced(x: Any) -> bool:
-    return isinstance(x, Displaced)
+def is_incremented(x: Any) -> bool:
+    return isinstance(x, Incremented)
 
 
 def value(point: PyTree) -> PyTree:
-    """The point with every `Displaced` in it summed up."""
-    return jtu.tree_map(lambda p: p.value if is_displaced(p) else p, point, is_leaf=is_displaced)
+    """The point with every `Incremented` in it summed up."""
+    return jtu.tree_map(
+        lambda p: p.value if is_incremented(p) else p, point, is_leaf=is_incremented
+    )
 
 
 def tangent(field: PyTree, point: PyTree) -> PyTree:

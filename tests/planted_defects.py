@@ -131,8 +131,8 @@ DEFECTS = [
     ),
     Defect(
         "_solvers/base.py",
-        "a, b = end.start, end.displacement + lax.stop_gradient(self.lost)",
-        "a, b = end.start, end.displacement",
+        "a, b = end.start, end.increment + lax.stop_gradient(self.lost)",
+        "a, b = end.start, end.increment",
         "a dropped compensation of rounding",
         "integrate/test_integrate.py -k compensation",
     ),
@@ -246,7 +246,7 @@ DEFECTS = [
         "_fields/matrix.py",
         "return (weight - 1) * point + moved",
         "return weight * point + moved",
-        "a displacement that holds the point itself",
+        "an increment that holds the point itself",
         "fields/test_matrix.py solvers/test_one_step.py",
     ),
     Defect(

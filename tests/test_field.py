@@ -241,9 +241,9 @@ SPIN = np.array([[0.0, -0.3, 0.2], [0.3, 0.0, -0.7], [-0.2, 0.7, 0.0]])
     ],
 )
 @pytest.mark.parametrize("size", [1e-7, 1.0, 30.0])
-def test_displacement_has_the_rounding_of_the_displacement(make, size):
+def test_increment_has_the_rounding_of_the_increment(make, size):
     a = size * SPIN
-    moved = make(jnp.asarray(a)).displacement(jnp.eye(3))
+    moved = make(jnp.asarray(a)).increment(jnp.eye(3))
     with mpmath.workdps(40):
         exact = np.array((mpmath.expm(mpmath.matrix(a)) - mpmath.eye(3)).tolist(), float)
     # Eight units times the largest entry; an angle beyond one multiplies its own rounding.

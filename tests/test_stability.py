@@ -403,7 +403,7 @@ def test_single_precision_does_not_get_worse_with_more_steps():
         ]
     )
     # The sums of the steps are compensated. So what is lost is the last rounding of three entries
-    # of at most 1, and of each displacement, which is smaller than they are by h; to t = 10 the
+    # of at most 1, and of each increment, which is smaller than they are by h; to t = 10 the
     # flow itself lets an error grow a few times. Without, it is a random walk.
     assert np.all((floor > 0.3 * 2.0**-24) & (floor < 6 * 2.0**-24))
     assert abs(problems.slope(steps, floor)) < 0.25

@@ -29,7 +29,7 @@ def check_field(fields: Sequence[AbstractFrozenField], point: PyTree) -> None:
     - the flow of the zero field is the identity, that of 0.4 of a field after 0.6 of it is that of
       the whole, and `tangent` is its derivative at time zero;
     - `combine` is linear: the tangent of a sum is the sum of the tangents;
-    - `displacement`, if offered, is `flow(point) - point`; `enter` and `leave` lead back to the
+    - `increment`, if offered, is `flow(point) - point`; `enter` and `leave` lead back to the
       point and to the same flow; and where `defect` says how far a point is off the manifold, the
       flow stays on it;
     - for algebra elements, `[a, b]` has the sign and the size that `cfjax.AbstractAlgebraElement`
@@ -122,7 +122,7 @@ def _of_flow(given: Any, field: Any, first: Any, start: Any, point: PyTree) -> _
     end = first.leave(end)
     velocity = jax.jvp(lambda t: first.leave(moved(t, start)), (0 * times[0],), (times[2],))[1]
     tangent = given.tangent(here)
-    displacement = given.displacement(point)
+    increment = given.increment(point)
     facts: _Facts = [
         (
             "flow of the zero field must be the identity",
@@ -143,10 +143,10 @@ def _of_flow(given: Any, field: Any, first: Any, start: Any, point: PyTree) -> _
             _size((here, end)),
         ),
     ]
-    if displacement is not None:
+    if increment is not None:
         expected = jtu.tree_map(jnp.subtract, given.flow(point), point)
-        promise = "displacement must be flow(point) - point"
-        facts.append((promise, displacement, expected, _size((point, expected))))
+        promise = "increment must be flow(point) - point"
+        facts.append((promise, increment, expected, _size((point, expected))))
     return facts
 
 

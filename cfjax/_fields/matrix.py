@@ -38,11 +38,11 @@ class AbstractMatrix(AbstractAlgebraElement):
     def flow(self, point: Inexact[Array, "..."]) -> Inexact[Array, "..."]:
         self._check_point(point)
         if _is_thin(self.a, point):
-            return point + self.displacement(point)
+            return point + self.increment(point)
         weight, moved = self._dense(point)
         return weight * point + moved
 
-    def displacement(self, point: Inexact[Array, "..."]) -> Inexact[Array, "..."]:
+    def increment(self, point: Inexact[Array, "..."]) -> Inexact[Array, "..."]:
         self._check_point(point)
 
         def dense() -> Array:

@@ -7,7 +7,7 @@ import jax.numpy as jnp
 from jaxtyping import Array, Float
 
 from .._field import AbstractAlgebraElement
-from .._numerics.rotate import cross, displacement, rotate
+from .._numerics.rotate import cross, increment, rotate
 
 
 class Rotation(AbstractAlgebraElement):
@@ -37,9 +37,9 @@ class Rotation(AbstractAlgebraElement):
         _check_point(point)
         return rotate(self.omega, point)
 
-    def displacement(self, point: Float[Array, "3 *k"]) -> Float[Array, "3 *k"]:
+    def increment(self, point: Float[Array, "3 *k"]) -> Float[Array, "3 *k"]:
         _check_point(point)
-        return displacement(self.omega, point)
+        return increment(self.omega, point)
 
     def tangent(self, point: Float[Array, "3 *k"]) -> Float[Array, "3 *k"]:
         _check_point(point)

@@ -19,11 +19,11 @@ def rotate(a: Float[Array, "3"], x: Float[Array, "3 *k"]) -> Float[Array, "3 *k"
     Rodrigues' formula `x + c_1 a*x + c_2 a*(a*x)` with cross products and Stumpff functions
     of `|a|^2`.
     """
-    return x + displacement(a, x)
+    return x + increment(a, x)
 
 
 @jax.jit
-def displacement(a: Float[Array, "3"], x: Float[Array, "3 *k"]) -> Float[Array, "3 *k"]:
+def increment(a: Float[Array, "3"], x: Float[Array, "3 *k"]) -> Float[Array, "3 *k"]:
     """`rotate(a, x) - x`, with a rounding as small as it is.
 
     The rounding of c_1 and c_2 is the same in every step of equal angle, so lengths would drift

@@ -13,7 +13,7 @@ import numpy as np
 from jax import lax
 from jaxtyping import Array, Inexact, PyTree, Real
 
-from .._field import Displaced, flow, is_displaced, is_field, value
+from .._field import Incremented, flow, is_field, is_incremented, value
 from .._term import product
 from .._xla import by_components, once_for_sums
 from .dense import Interpolation, Path
@@ -40,7 +40,7 @@ class AbstractLieSolver(diffrax.AbstractSolver):
     fields, any other diffrax term for a linear space.
 
     Rounding the state after every flow makes lengths, orthogonality and the like drift as a random
-    walk. Where the field offers displacements, these are summed first, and over the steps with
+    walk. Where the field offers increments, these are summed first, and over the steps with
     compensation: the state of the solver is what the last sum lost. (Hairer, Lubich & Wanner,
     Geometric Numerical Integration, Section VIII.5.) It costs small vectors a tenth of the time.
     """
@@ -74,10 +74,10 @@ class AbstractLieSolver(diffrax.AbstractSolver):
         field, end = eqx.filter_eval_shape(first_flow, y0)
 
         def no_loss(end, y):
-            # Where the field offers no displacement, its flow ends in a plain point.
-            return _Sum(jnp.zeros_like(y)) if is_displaced(end) else None
+            # Where the field offers no increment, its flow ends in a plain point.
+            return _Sum(jnp.zeros_like(y)) if is_incremented(end) else None
 
-        lost = jtu.tree_map(no_loss, end, y0, is_leaf=is_displaced)
+        lost = jtu.tree_map(no_loss, end, y0, is_leaf=is_incremented)
         first = terms.vf(t0, y0, args) if self.first_same_as_last else None
         return State.checked(lost, first, _admitted(jnp.asarray(t0), t1, field, y0))
 
@@ -222,27 +222,27 @@ def _admitted(t0: Array, t1: Any, field: PyTree, y0: PyTree) -> Real[Array, ""]:
 
 
 class _Sum(eqx.Module):
-    """Says that a part of the state is a start and displacements, and keeps what its sum lost."""
+    """Says that a part of the state is a start and increments, and keeps what its sum lost."""
 
     lost: Array
 
-    def up_to(self, end: Displaced) -> tuple[Array, "_Sum"]:
+    def up_to(self, end: Incremented) -> tuple[Array, "_Sum"]:
         """The end with what the step before lost, and what this sum loses (Dekker's FastTwoSum)."""
-        a, b = end.start, end.displacement + lax.stop_gradient(self.lost)
+        a, b = end.start, end.increment + lax.stop_gradient(self.lost)
         total = a + b
         return total, _Sum(lax.stop_gradient(b - (total - a)))
 
 
 def _shared(lost: Any, end: Any) -> Any:
-    """The end of a step. A compensated sum uses the displacement several times."""
+    """The end of a step. A compensated sum uses the increment several times."""
     if not isinstance(lost, _Sum):
         return end
-    return Displaced(end.start, once_for_sums(end.displacement))
+    return Incremented(end.start, once_for_sums(end.increment))
 
 
 def _is_leaf(x: Any) -> bool:
     return x is None or isinstance(x, _Sum)
 
 
-def _at_rest(y: Inexact[Array, "..."]) -> Displaced:
-    return Displaced(y, jnp.zeros_like(y))
+def _at_rest(y: Inexact[Array, "..."]) -> Incremented:
+    return Incremented(y, jnp.zeros_like(y))

@@ -16,7 +16,7 @@ from .._field import (
     combine,
     enter,
     flow,
-    is_displaced,
+    is_incremented,
     leave,
     tangent,
     value,
@@ -172,12 +172,12 @@ def _difference(a: Product, b: Product) -> Row:
 
 
 def minus(a: PyTree, b: PyTree) -> PyTree:
-    """The difference of two points of a step that may be displaced from the same start."""
+    """The difference of two points of a step that may be increments from the same start."""
     return jtu.tree_map(
-        lambda p, q: p.displacement - q.displacement if is_displaced(p) else p - q,
+        lambda p, q: p.increment - q.increment if is_incremented(p) else p - q,
         a,
         b,
-        is_leaf=is_displaced,
+        is_leaf=is_incremented,
     )
 
 

@@ -10,7 +10,7 @@ import jax.tree_util as jtu
 from jax import lax
 from jaxtyping import Array, PyTree, Real
 
-from .._field import AbstractFrozenField, Displaced, flow, is_displaced, is_field
+from .._field import AbstractFrozenField, Incremented, flow, is_field, is_incremented
 from .._xla import is_rewritten, pack
 
 _is_written_out: ContextVar[bool] = ContextVar("is_written_out", default=False)
@@ -188,17 +188,17 @@ def _types(tree: PyTree) -> list[tuple[tuple[int, ...], Any]]:
 
 
 def _stripped(point: PyTree) -> tuple[PyTree, PyTree]:
-    """What differs between the points of a step, and what does not: starts of displacements."""
-    leaves = lambda f: jtu.tree_map(f, point, is_leaf=is_displaced)  # noqa: E731
+    """What differs between the points of a step, and what does not: starts of increments."""
+    leaves = lambda f: jtu.tree_map(f, point, is_leaf=is_incremented)  # noqa: E731
     return (
-        leaves(lambda p: p.displacement if is_displaced(p) else p),
-        leaves(lambda p: p.start if is_displaced(p) else None),
+        leaves(lambda p: p.increment if is_incremented(p) else p),
+        leaves(lambda p: p.start if is_incremented(p) else None),
     )
 
 
 def _dressed(moving: PyTree, rest: PyTree) -> PyTree:
     return jtu.tree_map(
-        lambda start, p: p if start is None else Displaced(start, p),
+        lambda start, p: p if start is None else Incremented(start, p),
         rest,
         moving,
         is_leaf=lambda x: x is None,

@@ -140,9 +140,9 @@ MISTAKES = {
         dict(flow=lambda self, point: point + jnp.sqrt(self.b * self.b)),
         r"what is expected is not finite\. .* cfjax\.stumpff",
     ),
-    "displacement": (
-        dict(displacement=lambda self, point: self.flow(point)),
-        r"displacement must be flow\(point\) - point",
+    "increment": (
+        dict(increment=lambda self, point: self.flow(point)),
+        r"increment must be flow\(point\) - point",
     ),
     "sum of twice": (dict(combine=classmethod(doubled)), "tangent must be the derivative"),
     "structure that is a coordinate": (

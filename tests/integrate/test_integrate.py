@@ -810,7 +810,7 @@ def test_a_large_matrix_stays_orthogonal():
 
 
 @pytest.mark.slow
-def test_compensation_serves_every_part_whose_field_offers_a_displacement():
+def test_compensation_serves_every_part_whose_field_offers_an_increment():
     y0 = {
         "vector": jnp.arange(1.0, 4.0),
         "long": jnp.ones(9),

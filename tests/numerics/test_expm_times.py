@@ -49,8 +49,8 @@ def flow(field, point):
 
 
 @jax.jit
-def displacement(field, point):
-    return field.displacement(point)
+def increment(field, point):
+    return field.increment(point)
 
 
 @pytest.mark.parametrize(("precision", "unit"), [("float32", 2.0**-24), ("float64", 2.0**-53)])
@@ -109,7 +109,7 @@ def test_every_norm(cls, kind, dtype, point_dtype):
         np.testing.assert_allclose(got, act(cls, e, point), rtol=0, atol=tolerance)
         if norm < 2.2:
             # What is added is as accurate as it is small.
-            change = np.asarray(displacement(cls(a), point))
+            change = np.asarray(increment(cls(a), point))
             exact = act(cls, e - np.eye(N), point) if norm > 1e-2 else act(cls, a, point)
             atol = 8 * norm * scale + (norm**2 * np.linalg.norm(point) if norm <= 1e-2 else 0)
             np.testing.assert_allclose(change, exact, rtol=0, atol=atol)
