@@ -285,7 +285,10 @@ def _flattened(program: ClosedJaxpr, *operands: Array) -> list[Array]:
                 outs = run(eqn.params[_CALLS[name]], [_read(v, env) for v in eqn.invars])
             else:
                 keys = (
-                    (str(v.aval), repr(v.val)) if isinstance(v, Literal) else id(env[v])
+                    # Every bit: as text, numbers that agree in eight digits would be one.
+                    (str(v.aval), np.asarray(v.val).tobytes())
+                    if isinstance(v, Literal)
+                    else id(env[v])
                     for v in eqn.invars
                 )
                 dropped = [isinstance(v, DropVar) for v in eqn.outvars]

@@ -106,6 +106,16 @@ def test_directions_that_are_many():
     check(quick(lambda: along(whole))(), along(plain))
 
 
+def test_constants_that_agree_in_nine_digits_stay_apart():
+    def fun(x):
+        a = unpack(x)[0]
+        return a * (1 / 3 + 1e-10) - a * (1 / 3)
+
+    found = quick(lambda x: operation(fun, x, place="step"))(X)
+    # The rounding of two numbers of size 0.1.
+    np.testing.assert_allclose(found, 1e-10 * X[0], rtol=0, atol=1e-16)
+
+
 def test_closing_over_traced_values():
     fun = lambda scale: operation(lambda x: turn(x, scale, 6), X, place="step")[0]  # noqa: E731
     check(quick(jax.jacrev(fun))(SCALE), jax.jacfwd(lambda scale: plain(X, scale)[0])(SCALE))
