@@ -92,6 +92,18 @@ def test_third_derivatives():
     check(quick(third(whole))(X, SCALE), third(plain)(X, SCALE))
 
 
+def test_derivatives_in_batches_are_cut_earlier(monkeypatch):
+    monkeypatch.setattr(module, "_PIECE", 12)
+    monkeypatch.setattr(module, "_GROUP", 30)
+    monkeypatch.setattr(module, "_WHOLE_IN_BATCHES", (0, 0, 0))
+    xs, gradient = jnp.outer(jnp.linspace(0.1, 1, 40), X), jax.grad(size(whole))
+    batch = jax.vmap(gradient, (0, None))
+    check(quick(batch)(xs, SCALE), jax.vmap(jax.grad(size(plain)), (0, None))(xs, SCALE))
+    # What is shared by two pieces of a batch goes through a call.
+    texts = [jax.jit(fun).lower(x, SCALE).as_text() for fun, x in ((gradient, X), (batch, xs))]
+    assert ["inlineable" in text for text in texts] == [False, True]
+
+
 @pytest.mark.slow
 def test_directions_that_are_many():
     """More than are computed one by one."""
