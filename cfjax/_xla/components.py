@@ -63,6 +63,7 @@ _SCATTERS: dict[str, Callable[[Any, Any], Any]] = {
     "scatter_mul": operator.mul,
 }
 _CALLS = frozenset(("jit", "pjit"))
+_CONTROL = frozenset(("cond", "scan", "while"))
 
 
 @jtu.register_pytree_node_class
@@ -134,7 +135,8 @@ class Program(NamedTuple):
 def trace(fun: Callable[[PyTree], PyTree], y: PyTree, place: Place) -> Program | None:
     """`fun` as a program to take apart at `y`; None if that does not pay or cannot be done.
 
-    It must have no effects, and no function with a rule for reverse mode alone.
+    It must have no effects, no branches or loops, and no function with a rule for reverse mode
+    alone.
     """
     if not is_on() or not _is_small_state(y):
         return None
@@ -144,7 +146,7 @@ def trace(fun: Callable[[PyTree], PyTree], y: PyTree, place: Place) -> Program |
     consts = [_constant(x) for x in jaxpr.consts]
     try:
         code = without_dead_code(jaxpr.jaxpr)
-        if jaxpr.effects or not _has_jvp(code) or _operations(code) > _MAX_OPERATIONS:
+        if jaxpr.effects or not _is_readable(code) or _operations(code) > _MAX_OPERATIONS:
             return None
     except Exception as error:
         return unread(error)
@@ -185,10 +187,16 @@ def _is_small_state(y: PyTree) -> bool:
     )
 
 
-def _has_jvp(jaxpr: Jaxpr) -> bool:
-    """Whether no function in it has a rule for reverse mode alone."""
+def _is_readable(jaxpr: Jaxpr) -> bool:
+    """Whether there are no branches and loops, nor functions with a rule for reverse mode alone.
+
+    Branches and loops stay whole, as in the exponential of a matrix. What is around them, taken
+    apart, XLA would compute anew for each of the entries that go in.
+    """
     return all(
-        "custom_vjp" not in eqn.primitive.name and all(map(_has_jvp, jaxprs_in_params(eqn.params)))
+        eqn.primitive.name not in _CONTROL
+        and "custom_vjp" not in eqn.primitive.name
+        and all(map(_is_readable, jaxprs_in_params(eqn.params)))
         for eqn in jaxpr.eqns
     )
 
