@@ -26,7 +26,7 @@ test-all: .venv/dev
 
 # Whether a version works at all.
 test-quick: .venv/dev
-	$(BIN)/python $(PYTEST) $(QUICK)
+	$(BIN)/python $(PYTEST) -m "slow or not slow" $(QUICK)
 
 # The tests on exactly the lowest versions in pyproject.toml.
 test-lowest: .venv-lowest/dev

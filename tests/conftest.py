@@ -7,6 +7,8 @@ import pytest
 jax.config.update("jax_enable_x64", True)
 jax.config.update("jax_numpy_dtype_promotion", "strict")
 jax.config.update("jax_numpy_rank_promotion", "raise")
+# Programs are compiled to run once. What looks at compiled programs asks for the usual ones.
+jax.config.update("jax_disable_most_optimizations", True)
 
 
 @pytest.fixture(autouse=True, scope="module")
@@ -14,6 +16,15 @@ def forget_compiled_programs():
     """A program keeps memory maps; past the 65 530 of a process on Linux, compiling crashes."""
     yield
     jax.clear_caches()
+
+
+@pytest.fixture
+def rewritten():
+    """Programs of small systems are rewritten, also where that is switched off for other tests."""
+    import cfjax  # Not before the import hook.
+
+    with cfjax.rewriting(True):
+        yield
 
 
 @pytest.fixture

@@ -1,6 +1,7 @@
 """Every solver and every field once, with a gradient: minutes tell whether a version works at all.
 
-`make test-quick` runs this with the canary and the public names.
+`make test-quick` runs this with the canary and the public names. In `make test` other tests see the
+same solvers and fields.
 """
 
 import inspect
@@ -80,12 +81,13 @@ def check(solver, field, y0, has_gradient):
         assert found == pytest.approx(float(slope), rel=1e-6, abs=1e-8)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("name", SOLVERS)
 def test_every_solver(name):
     check(SOLVERS[name](), unit, FRAME if name == "CayleyRK4" else ON_SPHERE, has_gradient=False)
 
 
-@pytest.mark.representatives(4)
+@pytest.mark.slow
 @pytest.mark.parametrize("name", FIELDS)
 def test_every_field(name):
     check(cfjax.CF3(), *FIELDS[name], has_gradient=True)

@@ -332,6 +332,7 @@ def test_a_hessian():
 # What the compiler makes of it
 
 
+@pytest.mark.usefixtures("rewritten")
 @pytest.mark.skipif(jax.default_backend() != "cpu", reason="the loops of XLA on CPU")
 def test_a_step_of_a_small_system_is_few_operations_also_backwards():
     """XLA runs a loop of few operations as one function, and every operation apart otherwise."""

@@ -61,6 +61,9 @@ def test_ranking_with_every_commutator_is_the_papers(trajectories):
     assert 0.9 * last["CF4"] < last["RKMK4, full series"] < last["CF4"]
 
 
+@pytest.mark.skipif(
+    os.environ.get("CFJAX_REWRITE") == "0", reason="another program has other flops"
+)
 def test_flops_of_a_step(work):
     flops = {name: rigid_body.flops_of_step(method) for name, method in rigid_body.METHODS.items()}
     assert flops["CF3"] < flops["RKMK3"] < flops["RKMK4"] < flops["CF4"] < 1.25 * flops["RKMK4"]

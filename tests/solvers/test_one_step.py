@@ -4,6 +4,7 @@ The order conditions check the coefficients exactly, in methods/test_order_condi
 step that is right to rounding the order follows, so observed slopes are for few methods.
 """
 
+import functools
 from typing import Any
 
 import jax
@@ -184,7 +185,7 @@ def one_step(solver, problem) -> Any:
     field, y0, args, _ = problem
     term = cfjax.LieTerm(field)
 
-    @jax.jit
+    @functools.partial(jax.jit, compiler_options=problems.QUICK)
     def step(t0, t1, y0, args):
         state = solver.init(term, t0, t1, y0, args)
         y1, error, info, state, _ = solver.step(term, t0, t1, y0, args, state, made_jump=False)

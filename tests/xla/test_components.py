@@ -15,6 +15,8 @@ from cfjax._xla import components
 from cfjax._xla.components import by_components
 from cfjax._xla.held import held
 
+pytestmark = pytest.mark.usefixtures("rewritten")
+
 Y = np.array([0.3, -0.7, 1.1])
 W = np.array([1.3, 0.4, -0.8])
 M = np.array([[0.2, -1.0, 0.5], [0.7, 0.3, -0.4], [-0.6, 0.9, 1.2]])

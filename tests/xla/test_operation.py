@@ -59,7 +59,7 @@ def test_values():
     check(whole(X, SCALE), plain(X, SCALE))
 
 
-@pytest.mark.representatives(4)
+@pytest.mark.representatives(3)
 @pytest.mark.parametrize("axes", [(0, None), (None, 0), (0, 0)])
 @pytest.mark.parametrize("count", [2, 40])
 def test_batches(axes, count):
@@ -75,7 +75,7 @@ def test_batches(axes, count):
 MODES = jax.jacfwd, jax.jacrev
 
 
-@pytest.mark.representatives(5)
+@pytest.mark.representatives(3)
 @pytest.mark.parametrize("outer", MODES)
 @pytest.mark.parametrize("inner", MODES)
 @pytest.mark.parametrize("argument", [0, 1])
