@@ -113,7 +113,7 @@ class WorkPrecision(NamedTuple):
         for name, style in _style.styles(names).items():
             rows = np.array(self.method) == name
             best, upper = np.percentile(self.seconds[rows], (0, 75), axis=-1)
-            # Lists: matplotlib before 3.11 takes arrays of one entry for numbers, which NumPy warns of.
+            # Lists: matplotlib before 3.11 takes an array of one entry for a number.
             spread = np.zeros_like(best).tolist(), (upper - best).tolist()
             left.errorbar(best, self.error[rows], xerr=spread, capsize=3, label=name, **style)
             right.plot(work[rows], self.error[rows], **style)
