@@ -431,6 +431,8 @@ def failure(folder: Path, arguments: list[str]) -> str:
     done = subprocess.run(command, cwd=folder, env=environment, capture_output=True, text=True)
     if done.returncode == 0:
         return ""
+    if "ImportError while loading conftest" in done.stdout + done.stderr:
+        return "the import of cfjax"
     # FAILED and a test, or ERROR and a file that cannot be imported. Else no test has run.
     found = re.findall("^(?:FAILED|ERROR) (?:tests/)?(.*?)(?: - .*)?$", done.stdout, re.MULTILINE)
     if not found:
