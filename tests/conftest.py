@@ -7,7 +7,7 @@ import pytest
 jax.config.update("jax_enable_x64", True)
 jax.config.update("jax_numpy_dtype_promotion", "strict")
 jax.config.update("jax_numpy_rank_promotion", "raise")
-# Programs are compiled to run once. What looks at compiled programs asks for the usual ones.
+# Programs are compiled to run once. This leaves out what LLVM does, and not what XLA does before.
 jax.config.update("jax_disable_most_optimizations", True)
 
 
