@@ -11,7 +11,7 @@ from .expm import max_over_batch
 
 # So many terms of Taylor's series, and the largest norm for which they have a backward error below
 # half a unit in the last place, up to where the terms grow and cancel. As in Table 3.1 of the
-# source; tests/functions/test_expm_times.py derives them.
+# source; tests/numerics/test_expm_times.py derives them.
 _DEGREES = {
     "float32": ((5, 0.1308), (10, 0.9951), (15, 2.217)),
     "float64": ((12, 0.2996), (16, 0.7802), (20, 1.438), (25, 2.428)),

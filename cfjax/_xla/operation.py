@@ -315,7 +315,7 @@ def parameters(eqn: JaxprEqn) -> Hashable:
 
 def evaluate(jaxpr: Jaxpr, eqn: JaxprEqn, values: Sequence[Any]) -> Sequence[Any]:
     """The results of one operation of a program; None for those that are dropped."""
-    # Most are of this kind, and the other way takes ten times as long.
+    # Most are of this kind, and the other way makes a program of each.
     if not eqn.primitive.multiple_results and not any(jaxprs_in_params(eqn.params)):
         return [eqn.primitive.bind(*values, **eqn.params)]
     known = {v: x for v, x in zip(eqn.invars, values, strict=True) if not isinstance(v, Literal)}

@@ -307,6 +307,20 @@ def test_values(name):
     assert_same(jax.jit(whole(fun))(y), want, VALUE)
 
 
+@pytest.mark.parametrize(
+    "fun",
+    [
+        lambda y: lax.cond(y[0] > 0, jnp.sin, jnp.cos, y),
+        lambda y: lax.fori_loop(0, 3, lambda _, x: x * y, y),
+        lambda y: cfjax.flow(cfjax.LeftMatrix(jnp.outer(y, y)), y),
+    ],
+    ids=["branches", "loop", "exponential of a matrix"],
+)
+def test_branches_and_loops_are_left_alone(fun):
+    assert components.trace(fun, jnp.asarray(Y), "step") is None
+    assert components.trace(jnp.sin, jnp.asarray(Y), "step") is not None
+
+
 @pytest.mark.parametrize("name", ["arithmetic", "elementary", "constants out", "integers", "loops"])
 def test_values_outside_of_jit(name):
     fun, y = ZOO[name]
