@@ -94,12 +94,11 @@ class AbstractFrozenField(eqx.Module):
             _check_coordinates(f"{cls.__name__}{jtu.keystr(path)}", leaf)
         return jtu.tree_map(lambda *leaves: _linear_combination(weights, leaves), *fields)
 
-    @classmethod
-    def defect(cls, point: Any) -> tuple[Real[Array, ""], str] | None:
+    def defect(self, point: Any) -> tuple[Real[Array, ""], str] | None:
         """How far `point` is off the manifold that such fields act on, and what is expected of it.
 
         None, the default, if they act on every point. A solve refuses a start that is off by more
-        than the root of a unit of rounding.
+        than the root of a unit of rounding. It asks a field whose arrays are shapes and dtypes.
         """
         del point
         return None

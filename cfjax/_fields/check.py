@@ -88,7 +88,7 @@ def _check_arguments(fields: Any, point: PyTree) -> None:
             raise TypeError(
                 f"point{jtu.keystr(path)} must be floating or complex, got {leaf.dtype}."
             )
-    defect = type(fields[0]).defect(point)
+    defect = fields[0].defect(point)
     if defect is not None and not defect[0] < np.sqrt(jnp.finfo(defect[0].dtype).eps):
         raise ValueError(f"point must have {defect[1]}, and is off by {float(defect[0]):.1g}.")
 
@@ -102,7 +102,7 @@ def _of_start(given: Any, field: Any, start: Any, point: PyTree) -> _Facts:
         ("enter and leave must lead back to the point", here, point, size),
         ("flow must be the same before and after enter", end, entered, size),
     ]
-    defect = type(given).defect(end)
+    defect = given.defect(end)
     if defect is not None:
         facts.append((f"flow must keep {defect[1]}", defect[0], jnp.zeros_like(defect[0]), 1))
     return facts

@@ -13,15 +13,15 @@ from jaxtyping import Array, Float
 from .._field import AbstractAlgebraElement, AbstractFrozenField, Weight, combine
 from .._numerics.expm_action import phi_1_action
 from .._numerics.matmul import matmul
+from .elementwise import check_point, each, elementwise
 
 
 class AbstractSkew(AbstractFrozenField):
     """A skew field, which acts on orthonormal columns."""
 
-    @classmethod
-    def defect(cls, point: Float[Array, "n p"]) -> tuple[Array, str]:
-        off = jnp.eye(point.shape[1], dtype=point.dtype) - _square(point)
-        return jnp.max(jnp.abs(off)), "orthonormal columns (in entries of y0.T @ y0)"
+    def defect(self, point: Float[Array, "*batch n p"]) -> tuple[Array, str]:
+        off = each(_defect, point.ndim - 2)(point)
+        return jnp.max(jnp.abs(off), initial=0), "orthonormal columns (in entries of y0.T @ y0)"
 
 
 class LowRankSkew(AbstractSkew):
@@ -38,7 +38,9 @@ class LowRankSkew(AbstractSkew):
     bracket, as that depends on the point y. Every step starts from
     `y (3 I - y^T y) / 2`, so that rounding does not add up.
 
-    **Arguments:** `g`, shape `(n, p)` with n >= p, float32 or float64.
+    With leading axes, shape `(*batch, n, p)`, each element moves on its own.
+
+    **Arguments:** `g`, shape `(*batch, n, p)` with n >= p, float32 or float64.
 
     **Raises** `ValueError` for another shape, `TypeError` for another dtype. A solve that starts
     from columns that are not orthonormal, by more than the root of a unit of rounding in an entry
@@ -48,25 +50,30 @@ class LowRankSkew(AbstractSkew):
     Numer. Algorithms 32 (2003), for exponentials of low rank.
     """
 
-    g: Float[Array, "n p"] = eqx.field(converter=jnp.asarray)
+    g: Float[Array, "*batch n p"] = eqx.field(converter=jnp.asarray)
 
     def __check_init__(self):
         _check_factor("g", self.g)
 
-    def flow(self, point: Float[Array, "n p"]) -> Float[Array, "n p"]:
+    def flow(self, point: Float[Array, "*batch n p"]) -> Float[Array, "*batch n p"]:
         """The point that `point`, taken as the one where the field is frozen, reaches."""
         field, start = self.enter(point, ())
         return field.leave(field.flow(start))
 
-    def tangent(self, point: Float[Array, "n p"]) -> Float[Array, "n p"]:
-        _check_point(self, self.g, point)
+    def tangent(self, point: Float[Array, "*batch n p"]) -> Float[Array, "*batch n p"]:
+        _check_point(self, "g", point)
+        if self.g.ndim > 2:
+            return elementwise(self, self.g.ndim - 2).tangent(point)
         return matmul(self.g, matmul(point.T, point)) - matmul(point, matmul(self.g.T, point))
 
-    def enter(self, point: Any, earlier: Sequence[Any]) -> tuple["SpanSkew", "SpanPoint"]:
+    def enter(self, point: Any, earlier: Sequence[Any]) -> tuple[Any, Any]:
+        if not earlier:
+            _check_point(self, "g", point)
+        if self.g.ndim > 2:
+            return elementwise(self, self.g.ndim - 2).enter(point, earlier)
         if earlier:
             span, frozen_at = earlier[-1].span, point.z
         else:
-            _check_point(self, self.g, point)
             span = _Span((point,), _square(point))
             frozen_at = jnp.eye(point.shape[1], dtype=point.dtype)
             point = SpanPoint(frozen_at + _correction(span.gram), span.blocks)
@@ -96,7 +103,9 @@ class BorderedSkew(AbstractSkewElement):
 
     Every step starts from `y (3 I - y^T y) / 2`, so that rounding does not add up.
 
-    **Arguments:** `gamma`, shape `(n, p)` with n >= p, float32 or float64.
+    With leading axes, shape `(*batch, n, p)`, each element moves on its own.
+
+    **Arguments:** `gamma`, shape `(*batch, n, p)` with n >= p, float32 or float64.
 
     **Raises** `ValueError` for another shape, `TypeError` for another dtype. A solve that starts
     from columns that are not orthonormal, by more than the root of a unit of rounding in an entry
@@ -106,13 +115,15 @@ class BorderedSkew(AbstractSkewElement):
     Section 3.2, doi:10.1016/S0167-739X(02)00161-9.
     """
 
-    gamma: Float[Array, "n p"] = eqx.field(converter=jnp.asarray)
+    gamma: Float[Array, "*batch n p"] = eqx.field(converter=jnp.asarray)
 
     def __check_init__(self):
         _check_factor("gamma", self.gamma)
 
-    def flow(self, point: Float[Array, "n p"]) -> Float[Array, "n p"]:
-        _check_point(self, self.gamma, point)
+    def flow(self, point: Float[Array, "*batch n p"]) -> Float[Array, "*batch n p"]:
+        _check_point(self, "gamma", point)
+        if self.gamma.ndim > 2:
+            return elementwise(self, self.gamma.ndim - 2).flow(point)
         p = point.shape[1]
         corner, border = self.gamma[:p], self.gamma[p:]
         corner = corner - corner.T
@@ -143,18 +154,25 @@ class BorderedSkew(AbstractSkewElement):
         )
         return jnp.concatenate([top + change[:p], rest + matmul(border, change[p:])])
 
-    def tangent(self, point: Float[Array, "n p"]) -> Float[Array, "n p"]:
-        _check_point(self, self.gamma, point)
+    def tangent(self, point: Float[Array, "*batch n p"]) -> Float[Array, "*batch n p"]:
+        _check_point(self, "gamma", point)
+        if self.gamma.ndim > 2:
+            return elementwise(self, self.gamma.ndim - 2).tangent(point)
         p = point.shape[1]
         velocity = matmul(self.gamma, point[:p])
         return jnp.concatenate([velocity[:p] - matmul(self.gamma.T, point), velocity[p:]])
 
-    def bracket(self, other: Any) -> "SpanSkew":
+    def bracket(self, other: Any) -> Any:
+        if self.gamma.ndim > 2:
+            pair: list[Any] = [elementwise(field, self.gamma.ndim - 2) for field in (self, other)]
+            return pair[0].bracket(pair[1])
         return _spanned(self).bracket(other)
 
-    def enter(self, point: Any, earlier: Sequence[Any]) -> tuple["BorderedSkew", Any]:
+    def enter(self, point: Any, earlier: Sequence[Any]) -> tuple[AbstractFrozenField, Any]:
+        if self.gamma.ndim > 2:
+            return elementwise(self, self.gamma.ndim - 2).enter(point, earlier)
         if not earlier:
-            _check_point(self, self.gamma, point)
+            _check_point(self, "gamma", point)
             point = point + matmul(point, _correction(_square(point)))
         return self, point
 
@@ -331,6 +349,10 @@ def _correction(square: Float[Array, "p p"]) -> Float[Array, "p p"]:
     return jnp.where(near, defect / 2, jnp.nan)
 
 
+def _defect(y: Float[Array, "n p"]) -> Float[Array, "p p"]:
+    return jnp.eye(y.shape[1], dtype=y.dtype) - _square(y)
+
+
 def _square(y: Float[Array, "n p"]) -> Float[Array, "p p"]:
     """`y^T y`, in blocks of rows: the rounding of long sums is what would limit orthonormality."""
     n, p = y.shape
@@ -341,15 +363,19 @@ def _square(y: Float[Array, "n p"]) -> Float[Array, "p p"]:
 
 
 def _check_factor(name: str, factor: Array) -> None:
-    if factor.ndim != 2 or factor.shape[0] < factor.shape[1] or factor.shape[1] < 1:
-        raise ValueError(f"{name} must have shape (n, p) with n >= p >= 1, got {factor.shape}.")
+    if factor.ndim < 2 or factor.shape[-2] < factor.shape[-1] or factor.shape[-1] < 1:
+        raise ValueError(
+            f"{name} must have shape (n, p) or (*batch, n, p) with n >= p >= 1, got {factor.shape}."
+        )
     if factor.dtype not in (jnp.float32, jnp.float64):
         raise TypeError(f"{name} must be float32 or float64, got {factor.dtype}.")
 
 
-def _check_point(field: AbstractFrozenField, factor: Array, point: Array) -> None:
-    if point.shape != factor.shape or point.dtype != factor.dtype:
+def _check_point(field: AbstractFrozenField, name: str, point: Array) -> None:
+    factor = getattr(field, name)
+    check_point(field, name, factor.ndim - 2, [factor.shape[-2:]], point)
+    if point.dtype != factor.dtype:
         raise ValueError(
-            f"{type(field).__name__} of shape {factor.shape} and type {factor.dtype} acts on "
-            f"points of the same, got shape {point.shape} and type {point.dtype}."
+            f"{type(field).__name__} of type {factor.dtype} acts on points of the same, got "
+            f"{point.dtype}."
         )

@@ -12,14 +12,14 @@ from .._field import AbstractAlgebraElement
 from .._numerics.expm import expm_parts, one_norm
 from .._numerics.expm_times import expm_minus_one_times
 from .._numerics.matmul import matmul
+from .elementwise import check_point, each
 
 
 class AbstractMatrix(AbstractAlgebraElement):
     """An element of a matrix Lie algebra. A subclass is one of its actions on points."""
 
-    a: Inexact[Array, "n n"] = eqx.field(converter=jnp.asarray)
-    # The shapes that the matrix acts on, and which of their axes it multiplies.
-    shapes: ClassVar[str]
+    a: Inexact[Array, "*batch n n"] = eqx.field(converter=jnp.asarray)
+    # Which axis of a matrix it multiplies.
     axis: ClassVar[int]
 
     @staticmethod
@@ -28,8 +28,8 @@ class AbstractMatrix(AbstractAlgebraElement):
         """The product of a matrix with a point, from the side that this class acts from."""
 
     def __check_init__(self):
-        if self.a.ndim != 2 or self.a.shape[0] != self.a.shape[1]:
-            raise ValueError(f"a must have shape (n, n), got {self.a.shape}.")
+        if self.a.ndim < 2 or self.a.shape[-2] != self.a.shape[-1]:
+            raise ValueError(f"a must have shape (n, n) or (*batch, n, n), got {self.a.shape}.")
         if self.a.dtype not in (jnp.float32, jnp.float64, jnp.complex64, jnp.complex128):
             raise TypeError(
                 f"a must be float32, float64, complex64 or complex128, got {self.a.dtype}."
@@ -37,25 +37,15 @@ class AbstractMatrix(AbstractAlgebraElement):
 
     def flow(self, point: Inexact[Array, "..."]) -> Inexact[Array, "..."]:
         self._check_point(point)
-        if _is_thin(self.a, point):
-            return point + self.increment(point)
-        weight, moved = self._dense(point)
-        return weight * point + moved
+        return each(self._flow, self._num_axes)(self.a, point)
 
     def increment(self, point: Inexact[Array, "..."]) -> Inexact[Array, "..."]:
         self._check_point(point)
-
-        def dense() -> Array:
-            weight, moved = self._dense(point)
-            return (weight - 1) * point + moved
-
-        if not _is_thin(self.a, point):
-            return dense()
-        return expm_minus_one_times(lambda x: self.act(self.a, x), point, one_norm(self.a), dense)
+        return each(self._increment, self._num_axes)(self.a, point)
 
     def tangent(self, point: Inexact[Array, "..."]) -> Inexact[Array, "..."]:
         self._check_point(point)
-        return self.act(self.a, point)
+        return each(self.act, self._num_axes)(self.a, point)
 
     def bracket(self, other: Any) -> "AbstractMatrix":
         if not isinstance(other, type(self)):
@@ -64,23 +54,42 @@ class AbstractMatrix(AbstractAlgebraElement):
                 f"{name} has a bracket with another {name} only, got {type(other).__name__}."
             )
         # Flows from the right compose the other way round, and so do these products.
-        return type(self)(self.act(self.a, other.a) - self.act(other.a, self.a))
+        act = each(self.act, self._num_axes)
+        return type(self)(act(self.a, other.a) - act(other.a, self.a))
+
+    @property
+    def _num_axes(self) -> int:
+        return self.a.ndim - 2
 
     def _check_point(self, point: Array) -> None:
-        n = len(self.a)
-        if point.ndim not in (1, 2) or point.shape[self.axis] != n:
-            name = type(self).__name__
-            raise ValueError(
-                f"{name} with a of shape (n, n) acts on shapes {self.shapes}, got {point.shape} "
-                f"with n = {n}."
-            )
+        n = self.a.shape[-1]
+        matrix = (n, "k") if self.axis == 0 else ("k", n)
+        check_point(self, "a", self._num_axes, [(n,), matrix], point)
 
-    def _dense(self, point: Array) -> tuple[Array, Array]:
+    @classmethod
+    def _flow(cls, a: Array, point: Array) -> Array:
+        if _is_thin(a, point):
+            return point + cls._increment(a, point)
+        weight, moved = cls._dense(a, point)
+        return weight * point + moved
+
+    @classmethod
+    def _increment(cls, a: Array, point: Array) -> Array:
+        def dense() -> Array:
+            weight, moved = cls._dense(a, point)
+            return (weight - 1) * point + moved
+
+        if not _is_thin(a, point):
+            return dense()
+        return expm_minus_one_times(lambda x: cls.act(a, x), point, one_norm(a), dense)
+
+    @classmethod
+    def _dense(cls, a: Array, point: Array) -> tuple[Array, Array]:
         """`w, z` with `w x + z` the point that x moves to."""
-        weight, rest = expm_parts(self.a)
+        weight, rest = expm_parts(a)
         weight = weight.astype(point.dtype)
         # With a itself the product is exact but for the rounding of its sums, which is random.
-        return weight, weight * self.act(self.a, point) + self.act(rest, point)
+        return weight, weight * cls.act(a, point) + cls.act(rest, point)
 
 
 class LeftMatrix(AbstractMatrix):
@@ -90,17 +99,20 @@ class LeftMatrix(AbstractMatrix):
     or complex: with a skew `a` the flow keeps orthonormal columns, with a skew-Hermitian one it
     keeps unitary ones, and so on.
 
+    With leading axes, shape `(*batch, n, n)`, it acts on shapes `(*batch, n)` and `(*batch, n, k)`:
+    each element moves on its own, as the links of a lattice do. An axis of 1 is broadcast, and its
+    exponential is computed once.
+
     A flow costs one dense exponential, 4 or 5 products of size n and one for each squaring, and a
     product with the point. For few columns, `8 k <= n` (`16 k <= n` if complex), and a 1-norm of
     `a` up to 2.4 it costs 12 to 25 products with the point and no exponential.
 
-    **Arguments:** `a`, shape `(n, n)`, float32, float64, complex64 or complex128. A real `a` may
-    act on a complex point of the same precision.
+    **Arguments:** `a`, shape `(*batch, n, n)`, float32, float64, complex64 or complex128. A real
+    `a` may act on a complex point of the same precision.
 
     **Raises** `ValueError` for a shape that is not square, `TypeError` for another dtype.
     """
 
-    shapes: ClassVar[str] = "(n,) and (n, k)"
     axis: ClassVar[int] = 0
 
     @staticmethod
@@ -111,11 +123,10 @@ class LeftMatrix(AbstractMatrix):
 class RightMatrix(AbstractMatrix):
     """The linear field `x' = x a`, whose flow is `x -> x exp(a)`.
 
-    It acts on a row, shape `(n,)`, or a matrix, shape `(k, n)`. For an attitude matrix this is an
-    angular velocity in the moving frame. All else as for `LeftMatrix`.
+    It acts on a row, shape `(*batch, n)`, or a matrix, shape `(*batch, k, n)`. For an attitude
+    matrix this is an angular velocity in the moving frame. All else as for `LeftMatrix`.
     """
 
-    shapes: ClassVar[str] = "(n,) and (k, n)"
     axis: ClassVar[int] = -1
 
     @staticmethod

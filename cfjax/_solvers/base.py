@@ -203,7 +203,7 @@ def _admitted(t0: Array, t1: Any, field: PyTree, y0: PyTree) -> Real[Array, ""]:
     zero = eqx.error_if(zero, is_nan, "t0, t1 and dt0 must be numbers, got NaN.")
     parts, treedef = jtu.tree_flatten_with_path(field, is_leaf=is_field)
     for (path, part), point in zip(parts, treedef.flatten_up_to(y0), strict=True):
-        defect = type(part).defect(point) if is_field(part) else None
+        defect = part.defect(point) if is_field(part) else None
         if defect is None:
             continue
         off, expected = lax.stop_gradient(defect[0]), defect[1]

@@ -7,6 +7,7 @@ import jax.tree_util as jtu
 from jaxtyping import Array, Float, PyTree
 
 from .._field import combine, is_field, tangent
+from .._fields.elementwise import each
 from .._fields.low_rank import BorderedSkew, LowRankSkew
 from .._methods.continuous_extension import runge_kutta_extension
 from .._numerics.matmul import matmul
@@ -49,7 +50,7 @@ class CayleyRK4(AbstractLieSolver):
         def rate(c: float, v: PyTree) -> PyTree:
             y = end(v, y0)
             return jtu.tree_map(
-                lambda c, q, v, f: _Cayley(q, v).rate(f) if c else f,
+                lambda c, q, v, f: each(_rate, q.ndim - 2)(q, v, f) if c else f,
                 curved,
                 y0,
                 v,
@@ -72,7 +73,9 @@ class _End(NamedTuple):
 
     def __call__(self, v: PyTree, q: PyTree) -> PyTree:
         curved = jtu.tree_unflatten(jtu.tree_structure(q), self.curved)
-        return jtu.tree_map(lambda c, q, v: _Cayley(q, v).end() if c else q + v, curved, q, v)
+        return jtu.tree_map(
+            lambda c, q, v: each(_end, q.ndim - 2)(q, v) if c else q + v, curved, q, v
+        )
 
 
 def _check(field: PyTree) -> None:
@@ -83,6 +86,14 @@ def _check(field: PyTree) -> None:
                 f"cfjax.LowRankSkew or cfjax.BorderedSkew, got {type(part).__name__}. Use a "
                 "commutator-free method, for example cfjax.CF4()."
             )
+
+
+def _end(q: Array, v: Array) -> Array:
+    return _Cayley(q, v).end()
+
+
+def _rate(q: Array, v: Array, velocity: Array) -> Array:
+    return _Cayley(q, v).rate(velocity)
 
 
 class _Cayley:

@@ -11,6 +11,7 @@ from jax import lax
 from jaxtyping import Array, PyTree, Real
 
 from .._field import AbstractFrozenField, Incremented, flow, is_field, is_incremented
+from .._fields.elementwise import Elementwise
 from .._xla import is_rewritten, pack
 
 _is_written_out: ContextVar[bool] = ContextVar("is_written_out", default=False)
@@ -48,7 +49,7 @@ def can_loop(field: PyTree) -> bool:
     A step that is rewritten for XLA is faster written out. So are fields that combine in a way of
     their own or work in coordinates of the step, whose arrays grow from stage to stage.
     """
-    parts = [type(part) for part in jtu.tree_leaves(field, is_leaf=is_field) if is_field(part)]
+    parts = [part for part in jtu.tree_leaves(field, is_leaf=is_field) if is_field(part)]
     return (
         not is_rewritten()
         and not _is_written_out.get()
@@ -57,7 +58,8 @@ def can_loop(field: PyTree) -> bool:
     )
 
 
-def _is_plain(cls: Any) -> bool:
+def _is_plain(field: AbstractFrozenField) -> bool:
+    cls: Any = type(field.field if isinstance(field, Elementwise) else field)
     usual: Any = AbstractFrozenField
     return (
         cls.combine.__func__ is usual.combine.__func__

@@ -370,10 +370,10 @@ def test_n_of_a_hundred_thousand():
 
 
 @BOTH
-@pytest.mark.parametrize("shape", [(), (3,), (2, 3), (3, 0), (2, 3, 3)])
+@pytest.mark.parametrize("shape", [(), (3,), (2, 3), (3, 0), (2, 2, 3)])
 def test_wrong_shape_of_the_factor(cls, shape, no_shape_hook):
     name = "g" if cls is LowRankSkew else "gamma"
-    with pytest.raises(ValueError, match=rf"{name} must have shape \(n, p\) with n >= p >= 1, got"):
+    with pytest.raises(ValueError, match=rf"{name} must have shape \(n, p\) or .* >= 1, got"):
         cls(jnp.ones(shape))
 
 
@@ -388,9 +388,9 @@ def test_wrong_dtype_of_the_factor(cls, dtype, no_shape_hook):
 @pytest.mark.parametrize("point", [np.ones((4, 2)), np.ones(3), np.ones((3, 2), np.float32)])
 def test_wrong_point(cls, point, no_shape_hook):
     field = lambda t, y, args: cls(np.ones((3, 2)))  # noqa: E731
-    with pytest.raises(ValueError, match=rf"{cls.__name__} for y.*\(3, 2\).*float64"):
+    with pytest.raises(ValueError, match=rf"{cls.__name__} for y.*(\(3, 2\)|float64)"):
         cfjax.integrate(cfjax.LieTerm(field), cfjax.CF4(), 0.0, 1.0, point, num_steps=1)
-    with pytest.raises(ValueError, match=rf"{cls.__name__} of shape"):
+    with pytest.raises(ValueError, match=rf"{cls.__name__} (with|of type)"):
         cls(np.ones((3, 2))).flow(jnp.asarray(point))
 
 

@@ -209,9 +209,9 @@ def test_vmap(cls):
 
 
 @BOTH
-@pytest.mark.parametrize("shape", [(), (3,), (2, 3), (2, 2, 2)])
+@pytest.mark.parametrize("shape", [(), (3,), (2, 3), (2, 2, 3)])
 def test_not_square(cls, shape):
-    with pytest.raises(ValueError, match=r"a must have shape \(n, n\), got"):
+    with pytest.raises(ValueError, match=r"a must have shape \(n, n\) or \(\*batch, n, n\), got"):
         cls(jnp.ones(shape))
 
 

@@ -205,7 +205,7 @@ def test_bracket():
 
 @pytest.mark.parametrize("omega", [np.ones(4), np.ones((3, 1)), np.ones(()), np.ones((0,))])
 def test_wrong_shape(omega):
-    with pytest.raises(ValueError, match=r"omega must have shape \(3,\), got"):
+    with pytest.raises(ValueError, match=r"omega must have shape \(3,\) or \(\*batch, 3\), got"):
         Rotation(omega)
 
 

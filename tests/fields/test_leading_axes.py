@@ -1,0 +1,298 @@
+"""Fields on leading axes: every element moves as it does alone, whatever the method."""
+
+from functools import partial
+from operator import itemgetter
+
+import diffrax
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+import cfjax
+
+RNG = np.random.default_rng(0)
+
+
+def normal(*shape):
+    return jnp.asarray(RNG.normal(size=shape))
+
+
+A3, A6 = normal(3, 3), normal(6, 6)
+FRAMES = jnp.asarray(np.linalg.qr(normal(4, 6, 2))[0])
+
+
+class Written(cfjax.AbstractAlgebraElement):
+    """A rotation as a user writes it, for one point."""
+
+    w: jax.Array
+
+    def flow(self, point):
+        return cfjax.Rotation(self.w).flow(point)
+
+    def tangent(self, point):
+        return jnp.cross(self.w, point)
+
+    def bracket(self, other):
+        return Written(jnp.cross(self.w, other.w))
+
+
+def of_matrices(cls, x, t):
+    return cls(0.3 * jnp.cos(t) * A3 @ x)
+
+
+# The field of one element at x, how its coordinates become those of many, and many points.
+FIELDS = {
+    "Rotation": (lambda t, x: cfjax.Rotation(jnp.sin(A3 @ x + t)), normal(5, 3)),
+    "Rotation of matrices": (
+        lambda t, x: cfjax.Rotation(jnp.sin(A3 @ x[:, 0] + t)),
+        normal(5, 3, 2),
+    ),
+    "LeftMatrix": (
+        lambda t, x: of_matrices(cfjax.LeftMatrix, x, t),
+        normal(4, 3, 3),
+    ),
+    "RightMatrix": (
+        lambda t, x: of_matrices(cfjax.RightMatrix, x, t),
+        normal(4, 3, 3),
+    ),
+    "LeftMatrix of vectors": (
+        lambda t, x: cfjax.LeftMatrix(0.1 * jnp.outer(x, jnp.cos(x + t))),
+        normal(2, 12),
+    ),
+    "LowRankSkew": (lambda t, x: cfjax.LowRankSkew(jnp.cos(t) * A6 @ x), FRAMES),
+    "BorderedSkew": (lambda t, x: cfjax.BorderedSkew(jnp.cos(t) * A6 @ x), FRAMES),
+    "elementwise": (lambda t, x: Written(jnp.sin(A3 @ x + t)), normal(5, 3)),
+    "elementwise of a pair": (lambda t, x: Pair(jnp.sin(A3 @ x["q"] + t)), None),
+}
+
+
+class Pair(cfjax.AbstractFrozenField):
+    """One that acts on a subtree: a rotation of q, and p goes along."""
+
+    acts_on_subtree = True
+    w: jax.Array
+
+    def flow(self, point):
+        return {"q": cfjax.Rotation(self.w).flow(point["q"]), "p": point["p"] + self.w}
+
+    def tangent(self, point):
+        return {"q": jnp.cross(self.w, point["q"]), "p": self.w}
+
+
+def points(name):
+    if name == "elementwise of a pair":
+        return {"q": normal(5, 3), "p": jnp.zeros((5, 3))}
+    return jnp.asarray(FIELDS[name][1])
+
+
+def of_all(name, num_axes=1):
+    """The field of all elements at once."""
+    one = FIELDS[name][0]
+
+    def field(t, y, args):
+        mapped = lambda y: one(t, y)  # noqa: E731
+        for _ in range(num_axes):
+            mapped = jax.vmap(mapped)
+        made = mapped(y)
+        return cfjax.elementwise(made, num_axes) if name.startswith("elementwise") else made
+
+    return field
+
+
+SOLVERS = {
+    "CF4": cfjax.CF4(),
+    "CF54": cfjax.CF54(),
+    "RKMK4": cfjax.RKMK4(),
+    "Williamson3": cfjax.Williamson3(),
+    "CayleyRK4": cfjax.CayleyRK4(),
+    "Richardson": cfjax.Richardson(cfjax.CF4()),
+}
+CASES = [
+    *((name, "CF4") for name in FIELDS),
+    *(("Rotation", solver) for solver in SOLVERS if solver not in ("CF4", "CayleyRK4")),
+    ("LowRankSkew", "CayleyRK4"),
+    ("LowRankSkew", "CF54"),
+    ("LowRankSkew", "RKMK4"),
+    ("BorderedSkew", "RKMK4"),
+    ("LeftMatrix", "Richardson"),
+    ("elementwise", "RKMK4"),
+]
+
+
+@pytest.mark.parametrize(("name", "solver"), CASES)
+def test_every_element_moves_as_it_does_alone(name, solver):
+    y0 = points(name)
+
+    @eqx.filter_jit
+    def solve(y0, field):
+        saveat = diffrax.SaveAt(ts=jnp.array([0.13, 0.7, 1.0]))
+        terms = cfjax.LieTerm(field)
+        return diffrax.diffeqsolve(terms, SOLVERS[solver], 0, 1, 0.1, y0, saveat=saveat).ys
+
+    together = solve(y0, of_all(name))
+    one = lambda t, y, args: FIELDS[name][0](t, y)  # noqa: E731
+    for k in range(len(jax.tree.leaves(y0)[0])):
+        found = jax.tree.map(itemgetter((slice(None), k)), together)
+        alone = solve(jax.tree.map(itemgetter(k), y0), one)
+        # The same operations, in another order at most: some roundings in each of ten steps.
+        jax.tree.map(partial(np.testing.assert_allclose, rtol=0, atol=1e-13), found, alone)
+
+
+@pytest.mark.parametrize("name", [name for name in FIELDS if "pair" not in name])
+def test_fields_keep_their_promises_on_two_leading_axes(name):
+    y = points(name)
+    y = jnp.stack([y, y[::-1]])
+    fields = [of_all(name, 2)(t, y, None) for t in (0.0, 0.4, 1.1)]
+    cfjax.check_field(fields, y)
+
+
+@pytest.mark.parametrize("name", ["Rotation", "LeftMatrix", "LowRankSkew", "elementwise"])
+def test_gradients(name):
+    y0 = points(name)
+
+    def end(field):
+        def of(y0, scale):
+            scaled = lambda t, y, args: cfjax.combine((scale,), (field(t, y, args),))  # noqa: E731
+            term = cfjax.LieTerm(scaled)
+            ys = cfjax.integrate(term, cfjax.CF4(), 0.0, 0.5, y0, num_steps=5).ys
+            return jnp.sum(jnp.sin(ys[-1]))
+
+        return jax.jit(jax.grad(of, argnums=(0, 1)))
+
+    together = end(of_all(name))(y0, 1.0)
+    one = end(lambda t, y, args: FIELDS[name][0](t, y))
+    by_start, by_scale = zip(*(one(y, 1.0) for y in y0), strict=True)
+    np.testing.assert_allclose(together[0], jnp.stack(by_start), rtol=0, atol=1e-12)
+    np.testing.assert_allclose(together[1], sum(by_scale), rtol=1e-11)
+
+
+# Leading axes of the coordinates say how many there are; those of 1 are broadcast.
+
+
+def test_the_coordinates_say_how_many_leading_axes_there_are():
+    x, w = normal(3, 3), normal(3)
+    columns = cfjax.Rotation(w).flow(x)
+    rows = cfjax.Rotation(w[None]).flow(x)
+    # One is a matrix whose columns turn, the other three vectors.
+    np.testing.assert_allclose(rows, cfjax.Rotation(w).flow(x.T).T, rtol=0, atol=1e-15)
+    assert jnp.max(jnp.abs(rows - columns)) > 0.1
+
+
+@pytest.mark.parametrize("sides", [(1, 4), (3, 1), (1, 1), (3, 4)])
+def test_broadcasting(sides):
+    x, w = normal(3, 4, 3), normal(*sides, 3)
+    full = jnp.broadcast_to(w, x.shape)
+    for a, b in [(w, full), (full, w)]:
+        found = cfjax.Rotation(a).bracket(cfjax.Rotation(b)).omega
+        np.testing.assert_array_equal(found, jnp.cross(a, b))
+    flow = cfjax.Rotation(w).flow(x)
+    np.testing.assert_array_equal(flow, cfjax.Rotation(full).flow(x))
+    matrices = normal(*sides, 3, 3)
+    found = cfjax.LeftMatrix(matrices).flow(x)
+    full = jnp.broadcast_to(matrices, (3, 4, 3, 3))
+    np.testing.assert_allclose(found, cfjax.LeftMatrix(full).flow(x), rtol=0, atol=1e-14)
+
+
+def test_what_is_broadcast_is_computed_once():
+    a, x = jnp.ones((1, 5, 5)), jnp.ones((7, 5, 5))
+    jaxpr = str(jax.make_jaxpr(lambda a, x: cfjax.LeftMatrix(a).flow(x))(a, x))
+    # The squarings and polynomials of the exponential have no leading axis.
+    products = [line for line in jaxpr.splitlines() if "dot_general" in line]
+    assert sum("f64[7,5,5]" in line for line in products) < 4 < len(products)
+
+
+def test_the_program_does_not_grow_with_the_batch():
+    term = cfjax.LieTerm(lambda t, y, args: cfjax.Rotation(jnp.sin(y + t)))
+
+    def lines(n):
+        def run(y0):
+            return cfjax.integrate(term, cfjax.CF4(), 0.0, 1.0, y0, num_steps=5).ys
+
+        return len(jax.jit(run).lower(jnp.ones((n, 3))).as_text().splitlines())
+
+    assert lines(7) == lines(1000)
+
+
+def test_a_stiefel_step_keeps_one_span_for_its_stages():
+    # Two equal blocks in it would be a sign that an array was taken for two.
+    y = FRAMES
+    start = y
+    entered = []
+    for t in (0.0, 0.4, 1.1):
+        field, start = cfjax.LowRankSkew(jnp.cos(t) * A6 @ y).enter(start, entered)
+        entered.append(field)
+    assert len(entered[-1].field.span.blocks) == 4
+    total = cfjax.combine((1.0, 1.0, 1.0), entered)
+    assert len(total.field.span.blocks) == 4
+
+
+# What is refused, at trace time
+
+
+@pytest.mark.parametrize(
+    ("field", "shape", "text"),
+    [
+        (
+            lambda: cfjax.Rotation(np.ones((5, 3))),
+            (4, 3),
+            r"Rotation with omega of shape \(5, 3\) acts on shapes \(5, 3\) and \(5, 3, k\), got "
+            r"\(4, 3\)",
+        ),
+        (
+            lambda: cfjax.Rotation(np.ones((1, 4, 3))),
+            (4, 3),
+            r"acts on shapes \(l0, 4, 3\) and \(l0, 4, 3, k\), got \(4, 3\)",
+        ),
+        (
+            lambda: cfjax.Rotation(np.ones(3)),
+            (100, 3),
+            r"got \(100, 3\). For one motion of each point give omega leading axes: shape "
+            r"\(100, 3\), or \(1, 3\) for equal motions",
+        ),
+        (
+            lambda: cfjax.LeftMatrix(np.ones((16, 3, 3))),
+            (3, 3),
+            r"a of shape \(16, 3, 3\) acts on shapes \(16, 3\) and \(16, 3, k\), got \(3, 3\)",
+        ),
+        (
+            lambda: cfjax.LowRankSkew(np.ones((2, 6, 2))),
+            (3, 6, 2),
+            r"g of shape \(2, 6, 2\) acts on shapes \(2, 6, 2\), got \(3, 6, 2\)",
+        ),
+        (
+            lambda: cfjax.elementwise(Written(jnp.ones((5, 3)))),
+            (4, 3),
+            r"leading axes must agree or be 1, got lengths \[4, 5\]",
+        ),
+    ],
+)
+def test_axes_that_do_not_fit(field, shape, text, no_shape_hook):
+    term = cfjax.LieTerm(lambda t, y, args: field())
+    with pytest.raises(ValueError, match=text):
+        cfjax.integrate(term, cfjax.CF4(), 0.0, 1.0, np.ones(shape), num_steps=1)
+
+
+def test_a_start_off_the_manifold_is_refused():
+    y0 = FRAMES.at[2].multiply(1.001)
+    term = cfjax.LieTerm(of_all("LowRankSkew"))
+    with pytest.raises(RuntimeError, match="orthonormal columns"):
+        cfjax.integrate(term, cfjax.CF4(), 0.0, 1.0, y0, num_steps=1)
+
+
+def test_elementwise_refuses_what_it_cannot_map(no_shape_hook):
+    with pytest.raises(TypeError, match="field must be a frozen vector field, got"):
+        cfjax.elementwise(np.ones(3))  # pyright: ignore[reportArgumentType]
+    with pytest.raises(TypeError, match="num_axes must be a positive int, got 0"):
+        cfjax.elementwise(Written(jnp.ones((5, 3))), 0)
+    with pytest.raises(
+        ValueError, match=r"must have 2 leading axes, got shape \(5,\) for Written.w"
+    ):
+        cfjax.elementwise(Written(jnp.ones(5)), 2)
+
+
+def test_elementwise_of_elementwise_has_the_axes_of_both():
+    field = cfjax.elementwise(cfjax.elementwise(Written(jnp.ones((5, 4, 3)))))
+    x = normal(5, 4, 3)
+    np.testing.assert_array_equal(field.flow(x), cfjax.Rotation(jnp.ones((1, 1, 3))).flow(x))
