@@ -51,7 +51,8 @@ def main(argv: Sequence[str] | None = None) -> int:
         help="chart speed against accuracy for a scene",
         description=(
             "Measures what an error costs with each method, prints the table, and draws the chart "
-            "as PNG and PDF. The table is written as CSV, too. In float64. " + _CHART_TIME
+            "as PNG and PDF, and a picture of the scene if it has one. The table is written as "
+            "CSV, too. In float64. " + _CHART_TIME
         ),
     )
     chart.add_argument("scene", metavar="SCENE", choices=_SCENES, help=", ".join(_SCENES))
@@ -86,7 +87,9 @@ def main(argv: Sequence[str] | None = None) -> int:
         experiments, patience = _paper.EXPERIMENTS, _PAPER_TIME
     else:
         scene, budget = arguments.scene, arguments.budget
-        experiments = [lambda progress: _report.chart(scene, _SCENES[scene], budget, progress)]
+        picture = getattr(getattr(scenes, scene, None), "picture", None)
+        measure = _SCENES[scene]
+        experiments = [lambda progress: _report.chart(scene, measure, budget, progress, picture)]
         patience = f"{_CHART_TIME} Then measures for {budget:g} seconds."
     try:
         _report.run(arguments.output, experiments, patience)

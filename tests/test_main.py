@@ -61,14 +61,14 @@ def test_every_chart_says_what_it_shows():
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("name", ["heat", "stiefel_first", "stiefel_second"])
+@pytest.mark.parametrize("name", ["heat", "spins", "stiefel_first", "stiefel_second"])
 def test_charts_of_the_other_scenes(name, monkeypatch):
     module = getattr(scenes, name.partition("_")[0])
     original = module.work_precision
 
     def work_precision(*args, methods, num_steps=None, tolerances=None, **options):
         some = {"CF4": methods["CF4"]}
-        num_steps, tolerances = num_steps and [8, 16], tolerances and [1e-4, 1e-6]
+        num_steps, tolerances = num_steps and [32, 64], tolerances and [1e-4, 1e-6]
         settings = dict(num_steps=num_steps, tolerances=tolerances)
         return original(*args, methods=some, **(options | settings))
 

@@ -63,9 +63,16 @@ def _write(report: Report, output: Path) -> list[str]:
 
 
 def chart(
-    name: str, measure: Callable[..., WorkPrecision], budget: float, progress: Progress
+    name: str,
+    measure: Callable[..., WorkPrecision],
+    budget: float,
+    progress: Progress,
+    picture: Callable[[], Figure] | None = None,
 ) -> Report:
-    """The chart of a scene. The first line of the docstring of `measure` is in its caption."""
+    """The chart of a scene, and its picture if it has one.
+
+    The first line of the docstring of `measure` is in the chart's caption.
+    """
     work = measure(budget=budget, progress=progress)
     subject = (inspect.getdoc(measure) or name).splitlines()[0]
     figure = new_figure(
@@ -74,4 +81,7 @@ def chart(
         f"{jax.default_backend().upper()}; bars reach to the upper quartile. Flops: operations of "
         "one step as traced, times the steps.",
     )
-    return Report([work.table()], {name: work.plot(figure)}, {name: work})
+    figures = {name: work.plot(figure)}
+    if picture is not None:
+        figures[f"{name}_picture"] = picture()
+    return Report([work.table()], figures, {name: work})

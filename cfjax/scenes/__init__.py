@@ -2,4 +2,5 @@
 
 from . import heat as heat
 from . import rigid_body as rigid_body
+from . import spins as spins
 from . import stiefel as stiefel

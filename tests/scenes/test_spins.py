@@ -1,0 +1,129 @@
+"""The ferromagnet: lengths, energy, and its references."""
+
+import diffrax
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+import cfjax
+from cfjax.scenes import spins
+
+TERM = cfjax.LieTerm(spins.field)
+ARGS = spins.Magnet()
+FIELD_ALONE = spins.Magnet(anisotropy=0.0, applied=(0.0, 0.0, 1.3), damping=0.2)
+
+
+@pytest.mark.parametrize("z", [0.8, -0.8])
+def test_the_macrospin_against_its_closed_form(z):
+    start = np.array([0.6, 0.0, z])
+    times = np.linspace(0.0, 5.0, 6)
+    errors = []
+    for n in (50, 100):
+        found = cfjax.integrate(
+            TERM,
+            cfjax.CF4(),
+            0,
+            5,
+            start,
+            FIELD_ALONE,
+            num_steps=n,
+            save_every=n // 5,
+        ).ys
+        errors.append(np.abs(found - spins.macrospin(times, start, FIELD_ALONE)[1:]).max())
+    # Of order 4: 16, and more where the next order has not gone yet.
+    assert 14 < errors[0] / errors[1] < 20
+    assert errors[1] < 1e-6
+
+
+def test_the_closed_form_starts_and_moves_as_the_equation_says():
+    start = np.array([0.6, 0.0, -0.8])
+    np.testing.assert_allclose(spins.macrospin(0.0, start, FIELD_ALONE), start, rtol=0, atol=1e-15)
+    # Truncation h^2 / 6 and rounding eps / h.
+    h = 1e-5
+    t = np.linspace(0.0, 9.0, 10)
+    slope = spins.macrospin(t + h, start, FIELD_ALONE) - spins.macrospin(t - h, start, FIELD_ALONE)
+    s = spins.macrospin(t, start, FIELD_ALONE)
+    b = np.array([0.0, 0.0, 1.3])
+    precession = np.cross(s, b)
+    want = -(precession + 0.2 * np.cross(s, precession)) / 1.04
+    np.testing.assert_allclose(slope / (2 * h), want, rtol=0, atol=1e-10)
+
+
+def test_the_lattice_against_dop853():
+    start = spins.y0(3, 4)
+    reference = spins.reference(2.0, start, ARGS)
+    errors = [
+        np.abs(
+            cfjax.integrate(TERM, cfjax.CF4(), 0, 2, start, ARGS, num_steps=n).ys[-1] - reference
+        ).max()
+        for n in (40, 80)
+    ]
+    assert 14 < errors[0] / errors[1] < 19
+    assert errors[1] < 1e-6
+
+
+def test_lengths_are_kept_and_energy_falls():
+    start = spins.y0(6, 6, 2)
+    ys = cfjax.integrate(TERM, cfjax.CF4(), 0, 40, start, ARGS, num_steps=400, save_every=1).ys
+    # Sums over the steps are compensated. What is left is rounding of the entries and the norm.
+    np.testing.assert_allclose(np.linalg.norm(ys, axis=-1), 1, rtol=0, atol=8e-16)
+    energies = jax.vmap(spins.energy, in_axes=(0, None))(ys, ARGS)
+    assert np.all(np.diff(energies) <= 0)
+    # All spins end up: -3 for the bonds of each, and its own part.
+    assert energies[-1] < 0.9 * 72 * (-3 - 0.1 - 0.1)
+
+
+def test_without_damping_the_energy_stays():
+    args = ARGS._replace(damping=0.0)
+    start = spins.y0(4, 4)
+    errors = []
+    for n in (100, 200):
+        end = cfjax.integrate(TERM, cfjax.CF4(), 0, 5, start, args, num_steps=n).ys[-1]
+        errors.append(abs(spins.energy(end, args) - spins.energy(start, args)))
+    assert 10 < errors[0] / errors[1]
+    assert errors[1] < 1e-5
+
+
+def test_the_effective_field_is_minus_the_derivative_of_the_energy():
+    y = jnp.asarray(spins.y0(3, 4))
+    want = -jax.grad(spins.energy)(y, ARGS)
+    # Some sums of a handful of terms.
+    np.testing.assert_allclose(spins.effective_field(y, ARGS), want, rtol=0, atol=1e-14)
+
+
+def test_the_velocity_is_that_of_the_field():
+    y = jnp.asarray(spins.y0(3, 4))
+    want = spins.field(0.0, y, ARGS).tangent(y)
+    np.testing.assert_allclose(spins.velocity(0.0, y, ARGS), want, rtol=0, atol=1e-15)
+
+
+@pytest.mark.slow
+def test_error_control_and_the_gradient_of_a_lattice():
+    start = jnp.asarray(spins.y0(4, 4))
+
+    def end(damping):
+        return diffrax.diffeqsolve(
+            TERM,
+            cfjax.CF43(),
+            0,
+            2,
+            0.05,
+            start,
+            ARGS._replace(damping=damping),
+            stepsize_controller=diffrax.PIDController(rtol=1e-8, atol=1e-8),
+        ).ys[-1]
+
+    want = spins.reference(2.0, np.asarray(start), ARGS)
+    # A hundred steps with a tolerance of 1e-8 each.
+    np.testing.assert_allclose(end(0.1), want, rtol=0, atol=1e-6)
+    slope = jax.grad(lambda d: jnp.sum(end(d)[..., 2]))(0.1)
+    h = 1e-5
+    up, down = (
+        spins.reference(2.0, np.asarray(start), ARGS._replace(damping=0.1 + d)) for d in (h, -h)
+    )
+    np.testing.assert_allclose(slope, np.sum((up - down)[..., 2]) / (2 * h), rtol=0, atol=1e-4)
+
+
+def test_the_picture_has_one_panel_a_time():
+    assert len(spins.picture(side=4).axes) == 5
