@@ -61,9 +61,9 @@ def test_every_chart_says_what_it_shows():
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("name", ["heat", "spins", "stiefel_first", "stiefel_second"])
+@pytest.mark.parametrize("name", ["heat", "spins", "stiefel_first", "stiefel_second", "wilson_flow"])
 def test_charts_of_the_other_scenes(name, monkeypatch):
-    module = getattr(scenes, name.partition("_")[0])
+    module = sys.modules[__main__._SCENES[name].__module__]
     original = module.work_precision
 
     def work_precision(*args, methods, num_steps=None, tolerances=None, **options):

@@ -1,0 +1,182 @@
+"""The Wilson flow of lattice gauge theory: SU(3) links that move down the gradient of the action.
+
+`V' = Z(V) V` for each link, where Z is the traceless skew-Hermitian part of minus the link times
+the sum of its staples. The action, which counts every plaquette once,
+`S = sum_x sum_(mu < nu) Re tr(1 - P_mu_nu(x))`, never rises: the fields become smooth. Times are in
+squares of the lattice spacing. Frozen, the field is a left action on each link.
+
+A state has shape `(d, *sides, 3, 3)`: a periodic lattice of d axes with the links of each.
+
+Source: Lüscher, Properties and uses of the Wilson flow in lattice QCD, JHEP 08 (2010) 071,
+doi:10.1007/JHEP08(2010)071.
+"""
+
+from typing import TYPE_CHECKING, Any
+
+import diffrax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Complex, Float
+
+from .. import (
+    CF3,
+    CF4,
+    CK34,
+    CK54,
+    LeftMatrix,
+    LieTerm,
+    Luscher3,
+    WorkPrecision,
+    integrate,
+    work_precision,
+)
+from .._numerics.matmul import matmul
+
+if TYPE_CHECKING:
+    from matplotlib.figure import Figure
+
+t0, t1 = 0.0, 0.5
+
+Links = Complex[Array | np.ndarray, "d *sides 3 3"]
+
+
+def y0(side: int = 4, seed: int = 0, dimensions: int = 4) -> Complex[np.ndarray, "d *sides 3 3"]:
+    """Links in random directions, a lattice at strong coupling."""
+    shape = (dimensions, *[side] * dimensions, 3, 3)
+    real, imaginary = np.random.default_rng(seed).normal(size=(2, *shape))
+    # The unitary part of a normal matrix is uniform once its phases are taken out.
+    q, r = np.linalg.qr(real + 1j * imaginary)
+    diagonal = np.diagonal(r, axis1=-2, axis2=-1)
+    q = q * (diagonal / np.abs(diagonal))[..., None, :]
+    return q / np.linalg.det(q)[..., None, None] ** (1 / 3)
+
+
+def field(t: Any, y: Links, args: Any = None) -> LeftMatrix:
+    """The frozen field, with `a` of shape `(d, *sides, 3, 3)`."""
+    return LeftMatrix(generator(y))
+
+
+def generator(y: Links) -> Complex[Array, "d *sides 3 3"]:
+    """Z: minus the gradient of the action, in su(3)."""
+    d = y.shape[0]
+    loops = jnp.stack([matmul(y[mu], _staples(y, mu)) for mu in range(d)])
+    skew = (_dagger(loops) - loops) / 2
+    trace = jnp.trace(skew, axis1=-2, axis2=-1) / 3
+    return skew - trace[..., None, None] * jnp.eye(3, dtype=y.dtype).reshape(*[1] * (d + 1), 3, 3)
+
+
+def velocity(t: Any, y: Links, args: Any = None) -> Complex[Array, "d *sides 3 3"]:
+    """The same field in plain space, where no method keeps links unitary."""
+    return matmul(generator(y), y)
+
+
+def plaquettes(y: Links, mu: int, nu: int) -> Complex[Array, "*sides 3 3"]:
+    """The product of links around the square that leaves each point along `mu`, then `nu`."""
+    there = matmul(y[mu], _ahead(y[nu], mu))
+    back = matmul(y[nu], _ahead(y[mu], nu))
+    return matmul(there, _dagger(back))
+
+
+def density(y: Links) -> Float[Array, "*sides"]:
+    """The action of each point: `Re tr(1 - P)` of the squares that leave it."""
+    d = y.shape[0]
+    traces = (
+        jnp.real(jnp.trace(plaquettes(y, mu, nu), axis1=-2, axis2=-1))
+        for mu in range(d)
+        for nu in range(mu + 1, d)
+    )
+    return sum((3 - trace for trace in traces), jnp.zeros(y.shape[1:-2], jnp.finfo(y.dtype).dtype))
+
+
+def action(y: Links) -> Float[Array, ""]:
+    """The action S."""
+    return jnp.sum(density(y))
+
+
+def chart(**options: Any) -> WorkPrecision:
+    """The Wilson flow of 4^4 links of SU(3), 5 to 80 equal steps; Tsit5 in plain space."""
+    start = y0()
+    return work_precision(
+        LieTerm(field),
+        t0,
+        t1,
+        start,
+        methods={
+            "CF3": CF3(),
+            "CF4": CF4(),
+            "Luscher3": Luscher3(),
+            "CK34": CK34(),
+            "CK54": CK54(),
+            "Tsit5": (diffrax.ODETerm(velocity), diffrax.Tsit5()),
+        },
+        reference=reference(t1, start),
+        num_steps=[5 * 2**k for k in range(5)],
+        **options,
+    )
+
+
+def reference(
+    t: float, start: Complex[np.ndarray, "d *sides 3 3"]
+) -> Complex[np.ndarray, "d *sides 3 3"]:
+    """The links at time `t`, by SciPy's DOP853 in plain space, with a tolerance of 1e-12."""
+    from scipy.integrate import solve_ivp
+
+    d = len(start)
+
+    def rate(t: float, flat: np.ndarray) -> np.ndarray:
+        y = flat.view(complex).reshape(start.shape)
+        out = np.empty_like(y)
+        for mu in range(d):
+            total = np.zeros_like(y[mu])
+            for nu in set(range(d)) - {mu}:
+                ahead, side = np.roll(y[nu], -1, mu), np.roll(y[mu], -1, nu)
+                total += np.einsum("...ij,...kj,...lk->...il", ahead, side.conj(), y[nu].conj())
+                behind, across = np.roll(y[nu], 1, nu), np.roll(y[mu], 1, nu)
+                corner = np.roll(behind, -1, mu)
+                total += np.einsum("...ji,...kj,...kl->...il", corner.conj(), across.conj(), behind)
+            loop = y[mu] @ total
+            z = (loop.conj().swapaxes(-1, -2) - loop) / 2
+            z = z - np.trace(z, axis1=-2, axis2=-1)[..., None, None] * np.eye(3) / 3
+            out[mu] = z @ y[mu]
+        return out.ravel().view(float)
+
+    flat = np.ascontiguousarray(start).ravel().view(float)
+    found = solve_ivp(rate, (0.0, t), flat, "DOP853", rtol=1e-12, atol=1e-12)
+    return np.ascontiguousarray(found.y[:, -1]).view(complex).reshape(start.shape)
+
+
+def picture(side: int = 8) -> "Figure":
+    """A slice of a `side`^4 lattice: where the action is, as it flows away."""
+    from matplotlib.figure import Figure
+
+    start = y0(side)
+    # The links at t = 0.1, 0.2, ...
+    ys: Any = integrate(LieTerm(field), Luscher3(), t0, 3.0, start, num_steps=60, save_every=2).ys
+    states = {0.0: start, 0.1: ys[0], 0.3: ys[2], 1.0: ys[9], 3.0: ys[29]}
+    figure = Figure((2.2 * len(states), 2.5), layout="constrained")
+    for ax, (t, y) in zip(figure.subplots(1, len(states)), states.items(), strict=True):
+        values = np.asarray(density(jnp.asarray(y)))
+        ax.imshow(values[:, :, 0, 0], interpolation="bicubic", vmin=0, cmap="magma")
+        ax.set(xticks=[], yticks=[], title=f"t = {t:g}, S/point {values.mean():.2g}")
+    return figure
+
+
+def _staples(y: Links, mu: int) -> Complex[Array, "*sides 3 3"]:
+    """The sum over the other axes of what closes a link along `mu` to a square, on both sides."""
+    total = jnp.zeros_like(y[mu])
+    for nu in range(y.shape[0]):
+        if nu != mu:
+            back = matmul(y[nu], _ahead(y[mu], nu))
+            total = total + matmul(_ahead(y[nu], mu), _dagger(back))
+            below = matmul(_dagger(_ahead(y[nu], mu)), _dagger(y[mu]))
+            total = total + jnp.roll(matmul(below, y[nu]), 1, nu)
+    return total
+
+
+def _ahead(x: Array, axis: int) -> Array:
+    """The neighbours' values along a lattice axis."""
+    return jnp.roll(x, -1, axis)
+
+
+def _dagger(x: Array) -> Array:
+    return jnp.conj(jnp.swapaxes(x, -1, -2))
