@@ -22,6 +22,7 @@ from ._fields.low_rank import BorderedSkew as BorderedSkew
 from ._fields.low_rank import LowRankSkew as LowRankSkew
 from ._fields.matrix import LeftMatrix as LeftMatrix
 from ._fields.matrix import RightMatrix as RightMatrix
+from ._fields.quaternion import QuaternionRotation as QuaternionRotation
 from ._fields.rotation import Rotation as Rotation
 from ._integrate.batch import BatchResult as BatchResult
 from ._integrate.batch import map_batch as map_batch
@@ -32,6 +33,9 @@ from ._methods.stability import stability_function as stability_function
 from ._methods.tableau import Tableau as Tableau
 from ._methods.tableau import third_order_a as third_order_a
 from ._methods.tableau import third_order_b as third_order_b
+from ._numerics.attitude import quaternion_from_matrix as quaternion_from_matrix
+from ._numerics.attitude import quaternion_rotate as quaternion_rotate
+from ._numerics.attitude import quaternion_to_matrix as quaternion_to_matrix
 from ._numerics.expm import expm as expm
 from ._numerics.stumpff import stumpff as stumpff
 from ._numerics.transforms import AbstractTransform as AbstractTransform

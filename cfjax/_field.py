@@ -88,10 +88,15 @@ class AbstractFrozenField(eqx.Module):
     def combine(cls, weights: Sequence[Weight], fields: Sequence[Any]) -> Any:
         """The field `sum_i weights[i] * fields[i]`. Weights are real scalars.
 
-        **Raises** `TypeError` if a leaf of the class is not a floating or complex array.
+        **Raises** `TypeError` if a leaf of the class is not a floating or complex array, or fields
+        differ in more than these.
         """
         for path, leaf in jtu.tree_leaves_with_path(fields[0]):
             _check_coordinates(f"{cls.__name__}{jtu.keystr(path)}", leaf)
+        structure = jtu.tree_structure(fields[0])
+        if any(jtu.tree_structure(field) != structure for field in fields[1:]):
+            kinds = " and ".join(dict.fromkeys(map(describe, fields)))
+            raise TypeError(f"Fields that are added must agree in all but arrays, got {kinds}.")
         return jtu.tree_map(lambda *leaves: _linear_combination(weights, leaves), *fields)
 
     def defect(self, point: Any) -> tuple[Real[Array, ""], str] | None:

@@ -13,6 +13,10 @@ import cfjax
 PROMISED = [
     "LieTerm",
     "Rotation",
+    "QuaternionRotation",
+    "quaternion_to_matrix",
+    "quaternion_from_matrix",
+    "quaternion_rotate",
     "LeftMatrix",
     "RightMatrix",
     "LowRankSkew",

@@ -39,6 +39,10 @@ def unit(t, y, args):
 FIELDS = {
     "array": (lambda t, y, args: args * jnp.sin(y), ON_SPHERE),
     "Rotation": (unit, ON_SPHERE),
+    "QuaternionRotation": (
+        lambda t, y, args: cfjax.QuaternionRotation(args * y[1:] + t, frame="body", order="wxyz"),
+        np.array([0.1, 0.5, -0.5, 0.7]),
+    ),
     "LeftMatrix": (lambda t, y, args: cfjax.LeftMatrix(jnp.outer(args, y)), ON_SPHERE),
     "RightMatrix": (lambda t, y, args: cfjax.RightMatrix(jnp.outer(y, args)), ON_SPHERE),
     "LowRankSkew": (unit, FRAME),

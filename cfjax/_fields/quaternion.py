@@ -1,0 +1,94 @@
+"""Rotations of unit quaternions, which are attitudes in four numbers."""
+
+from functools import partial
+from typing import Any
+
+import equinox as eqx
+import jax.numpy as jnp
+import jax.tree_util as jtu
+from jaxtyping import Array, Float
+
+from .._field import AbstractAlgebraElement, describe
+from .._numerics.quaternion import Frame, Order, check_choice, increment, times, turn
+from .._numerics.rotate import cross
+from .elementwise import check_point, each
+
+
+class QuaternionRotation(AbstractAlgebraElement):
+    """The rotation of an attitude, a unit quaternion q, with angular velocity `omega`.
+
+    q takes body coordinates to fixed ones, `(0, x_fixed) = q (0, x_body) / q`. With
+    `frame="fixed"`, where `omega` is given in fixed coordinates, `q' = (0, omega) q / 2`; with
+    `frame="body"` `q' = q (0, omega) / 2`. So q moves as the matrix
+    `cfjax.quaternion_to_matrix(q, order=...)` moves along `cfjax.Rotation(omega)`, or along
+    `cfjax.RightMatrix` of the cross product with `omega`.
+
+    With leading axes, shape `(*batch, 3)`, it acts on shape `(*batch, 4)`: each element moves on
+    its own. An axis of 1 is broadcast.
+
+    The flow is a closed form, about 120 flops, exact to rounding for every angle, and so are its
+    derivatives of every order, also at `omega = 0`. A solve keeps the length of q to rounding,
+    however many steps. An angle beyond 2^46 (2^17 in float32), where rounding leaves no two digits
+    of the direction, gives NaN.
+
+    **Arguments:**
+
+    - `omega`: shape `(*batch, 3)`, float32 or float64, in radians per unit of time.
+    - `frame`: `"body"` or `"fixed"`, where `omega` is given.
+    - `order`: `"wxyz"` or `"xyzw"`, how q is stored; w is its scalar part.
+
+    Neither `frame` nor `order` has a default, as a wrong guess would go unseen.
+
+    **Raises** `ValueError` for another shape, frame or order, `TypeError` for another dtype, or
+    without frame or order. Fields of different frame or order cannot be added and have no bracket:
+    `TypeError`. A solve that starts from a quaternion whose squared length is off 1 by more than
+    the root of a unit of rounding is an error.
+    """
+
+    omega: Float[Array, "*batch 3"] = eqx.field(converter=jnp.asarray)
+    frame: Frame = eqx.field(static=True, kw_only=True)
+    order: Order = eqx.field(static=True, kw_only=True)
+
+    def __check_init__(self):
+        check_choice("frame", self.frame)
+        check_choice("order", self.order)
+        if self.omega.ndim < 1 or self.omega.shape[-1] != 3:
+            raise ValueError(f"omega must have shape (3,) or (*batch, 3), got {self.omega.shape}.")
+        if self.omega.dtype not in (jnp.float32, jnp.float64):
+            raise TypeError(f"omega must be float32 or float64, got {self.omega.dtype}.")
+
+    def flow(self, point: Float[Array, "*batch 4"]) -> Float[Array, "*batch 4"]:
+        return self._each(turn, point)
+
+    def increment(self, point: Float[Array, "*batch 4"]) -> Float[Array, "*batch 4"]:
+        return self._each(increment, point)
+
+    def tangent(self, point: Float[Array, "*batch 4"]) -> Float[Array, "*batch 4"]:
+        return self._each(times, point)
+
+    def bracket(self, other: Any) -> "QuaternionRotation":
+        kinds = jtu.tree_structure(self), jtu.tree_structure(other)
+        if kinds[0] != kinds[1]:
+            raise TypeError(
+                "QuaternionRotation has a bracket with another QuaternionRotation of the same "
+                f"frame and order only, got {describe(self)} and {describe(other)}."
+            )
+        # Flows from the right compose the other way round.
+        a, b = (self, other) if self.frame == "fixed" else (other, self)
+        omega = each(cross, self._num_axes)(a.omega, b.omega)
+        return QuaternionRotation(omega, frame=self.frame, order=self.order)
+
+    def defect(self, point: Float[Array, "*batch 4"]) -> tuple[Float[Array, ""], str]:
+        off = jnp.abs(jnp.sum(point * point, axis=-1) - 1)
+        return jnp.max(off, initial=0), "length 1 (in y0 @ y0)"
+
+    @property
+    def _num_axes(self) -> int:
+        return self.omega.ndim - 1
+
+    def _each(self, fun: Any, point: Array) -> Array:
+        check_point(self, "omega", self._num_axes, [(4,)], point)
+        if jnp.iscomplexobj(point):
+            raise TypeError(f"QuaternionRotation acts on real arrays, got {point.dtype}.")
+        moved = partial(fun, frame=self.frame, order=self.order)
+        return each(moved, self._num_axes)(self.omega, point)
