@@ -13,6 +13,8 @@ import cfjax
 PROMISED = [
     "LieTerm",
     "Rotation",
+    "RigidMotion",
+    "PlanarMotion",
     "LeftMatrix",
     "RightMatrix",
     "LowRankSkew",
