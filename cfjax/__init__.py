@@ -23,6 +23,8 @@ from ._fields.low_rank import LowRankSkew as LowRankSkew
 from ._fields.matrix import LeftMatrix as LeftMatrix
 from ._fields.matrix import RightMatrix as RightMatrix
 from ._fields.quaternion import QuaternionRotation as QuaternionRotation
+from ._fields.rigid_motion import PlanarMotion as PlanarMotion
+from ._fields.rigid_motion import RigidMotion as RigidMotion
 from ._fields.rotation import Rotation as Rotation
 from ._integrate.batch import BatchResult as BatchResult
 from ._integrate.batch import map_batch as map_batch

@@ -17,6 +17,8 @@ PROMISED = [
     "quaternion_to_matrix",
     "quaternion_from_matrix",
     "quaternion_rotate",
+    "RigidMotion",
+    "PlanarMotion",
     "LeftMatrix",
     "RightMatrix",
     "LowRankSkew",

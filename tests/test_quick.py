@@ -43,6 +43,16 @@ FIELDS = {
         lambda t, y, args: cfjax.QuaternionRotation(args * y[1:] + t, frame="body", order="wxyz"),
         np.array([0.1, 0.5, -0.5, 0.7]),
     ),
+    "RigidMotion": (
+        lambda t, y, args: cfjax.RigidMotion(omega=args * y[4:] + t, v=args, frame="body"),
+        np.array([0.6, 0.0, 0.8, 0.0, 0.3, -0.4, 0.5]),
+    ),
+    "PlanarMotion": (
+        lambda t, y, args: cfjax.PlanarMotion(
+            omega=args[0] * y[2] + t, v=args[1:] + y[2:], frame="fixed"
+        ),
+        np.array([0.6, 0.8, 0.3, -0.4]),
+    ),
     "LeftMatrix": (lambda t, y, args: cfjax.LeftMatrix(jnp.outer(args, y)), ON_SPHERE),
     "RightMatrix": (lambda t, y, args: cfjax.RightMatrix(jnp.outer(y, args)), ON_SPHERE),
     "LowRankSkew": (unit, FRAME),

@@ -79,16 +79,7 @@ def stumpff_1_2_apart(s: Float[Array, "*batch"]) -> tuple[Float[Array, "*batch"]
 
     So for a small s the roundings of d1 and d2 are as small as s.
     """
-    constants = _DOUBLE if s.dtype == jnp.float64 else _SINGLE
-    turns, inverse = _turns(s, constants)
-    near = jnp.where(turns == 0, 1, jnp.zeros_like(s))
-    scale = 1 - turns * ((2 * pi) * inverse)
-    square = scale * scale
-    z = s * square
-    p1, p2 = (polynomial(c[1:], z) for c in (constants.sin, constants.versin))
-    # So that little waits for the polynomials.
-    d1 = (scale * z) * p1 + scale * (1 - near)
-    return near, d1, (square * z) * p2 + square * ((1 - near) / 2)
+    return _apart(s)[:3]
 
 
 @stumpff_1_2_apart.defjvp
@@ -97,6 +88,38 @@ def _(primals, tangents):
     near, d1, d2 = stumpff_1_2_apart(s)
     _, c2, c3, c4 = _stumpff_1_to(4, s)
     return (near, d1, d2), (jnp.zeros_like(s), (c3 - c2) / 2 * s_dot, (c4 - c3 / 2) * s_dot)
+
+
+@jax.custom_jvp
+def stumpff_1_to_3_apart(s: Float[Array, "*batch"]) -> tuple[Float[Array, "*batch"], ...]:
+    """`n, d1, d2` as of `stumpff_1_2_apart`, and `c_3`, for the price of the three."""
+    return _apart(s)
+
+
+@stumpff_1_to_3_apart.defjvp
+def _(primals, tangents):
+    (s,), (s_dot,) = primals, tangents
+    near, d1, d2, c3 = stumpff_1_to_3_apart(s)
+    _, c2, _, c4, c5, _ = _stumpff_1_to(6, s)
+    slopes = (jnp.zeros_like(s), (c3 - c2) / 2, c4 - c3 / 2, (3 * c5 - c4) / 2)
+    return (near, d1, d2, c3), tuple(slope * s_dot for slope in slopes)
+
+
+def _apart(s: Float[Array, "*batch"]) -> tuple[Float[Array, "*batch"], ...]:
+    constants = _DOUBLE if s.dtype == jnp.float64 else _SINGLE
+    turns, inverse = _turns(s, constants)
+    near = jnp.where(turns == 0, 1, jnp.zeros_like(s))
+    excess = turns * ((2 * pi) * inverse)
+    scale = 1 - excess
+    square = scale * scale
+    z = s * square
+    p1, p2 = (polynomial(c[1:], z) for c in (constants.sin, constants.versin))
+    # So that little waits for the polynomials.
+    d1 = (scale * z) * p1 + scale * (1 - near)
+    d2 = (square * z) * p2 + square * ((1 - near) / 2)
+    # Without a full turn the inverse may be too large to be squared.
+    c3 = (excess * inverse) * inverse - (scale * square) * p1
+    return near, d1, d2, c3
 
 
 @functools.partial(jax.custom_jvp, nondiff_argnums=(0,))

@@ -12,7 +12,7 @@ import jax.numpy as jnp
 import numpy as np
 
 # Of vectors that are taken apart.
-_MAX_LENGTH = 6
+_MAX_LENGTH = 7
 
 # JAX compiles anew where it changes.
 _is_on = jax.make_user_context(os.environ.get("CFJAX_REWRITE", "1") != "0")

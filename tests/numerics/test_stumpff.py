@@ -8,7 +8,7 @@ import mpmath
 import numpy as np
 import pytest
 
-from cfjax._numerics.stumpff import stumpff, stumpff_1_2
+from cfjax._numerics.stumpff import stumpff, stumpff_1_2, stumpff_1_to_3_apart
 
 ORDERS = 3
 PI2 = math.pi**2
@@ -157,12 +157,18 @@ def test_what_is_not_finite_gives_nan(bad, dtype):
         assert np.isfinite(got[1]), n
 
 
+def three(s):
+    near, d1, d2, c3 = stumpff_1_to_3_apart(s)
+    return near + d1, near / 2 + d2, c3
+
+
+@pytest.mark.parametrize("together", [stumpff_1_2, three])
 @DTYPES
-def test_pair(dtype):
+def test_several_together(together, dtype):
     s = jnp.asarray(ARGUMENTS, dtype)
     ones = jnp.ones_like(s)
     for n, (got, slope) in enumerate(
-        zip(*jax.jit(lambda s: jax.jvp(stumpff_1_2, (s,), (ones,)))(s), strict=True), start=1
+        zip(*jax.jit(lambda s: jax.jvp(together, (s,), (ones,)))(s), strict=True), start=1
     ):
         want, want_slope = jax.jvp(lambda s, n=n: stumpff(n, s), (s,), (ones,))
         # The same formulas, but XLA may round them in another order: the bound of either, twice.

@@ -1,0 +1,205 @@
+"""Rigid motions of space and of the plane: the Lie algebras se(3) and se(2)."""
+
+from collections.abc import Sequence
+from dataclasses import KW_ONLY
+from functools import partial
+from typing import Any, ClassVar, Literal
+
+import equinox as eqx
+import jax.numpy as jnp
+from jaxtyping import Array, Float, Real
+
+from .._field import AbstractAlgebraElement, Weight
+from .._numerics import planar_motion, rigid_motion
+from .._numerics.matmul import matmul
+from .elementwise import check_point, each
+
+Frame = Literal["body", "fixed"]
+
+
+class AbstractMotion(AbstractAlgebraElement):
+    """What motions of space and of the plane share."""
+
+    omega: eqx.AbstractVar[Array]
+    v: eqx.AbstractVar[Array]
+    frame: eqx.AbstractVar[Frame]
+
+    dimension: ClassVar[int]
+    # A pose in one vector is a unit number of so many entries, and a position.
+    number: ClassVar[str]
+    number_size: ClassVar[int]
+    # The module with its tangent, increment and bracket.
+    numerics: ClassVar[Any]
+
+    def __check_init__(self):
+        n = self.dimension
+        if self.v.ndim < 1 or self.v.shape[-1] != n:
+            raise ValueError(f"v must have shape ({n},) or (*batch, {n}), got {self.v.shape}.")
+        expected = self.v.shape if n == 3 else self.v.shape[:-1]
+        if self.omega.shape != expected:
+            raise ValueError(
+                f"omega must have shape {expected} where v has {self.v.shape}, got "
+                f"{self.omega.shape}."
+            )
+        for name, x in (("omega", self.omega), ("v", self.v)):
+            if x.dtype not in (jnp.float32, jnp.float64):
+                raise TypeError(f"{name} must be float32 or float64, got {x.dtype}.")
+        if self.omega.dtype != self.v.dtype:
+            raise TypeError(
+                f"omega and v must have one dtype, got {self.omega.dtype} and {self.v.dtype}."
+            )
+        if self.frame not in ("body", "fixed"):
+            raise ValueError(f'frame must be "body" or "fixed", got {self.frame!r}.')
+
+    def flow(self, point: Float[Array, "..."]) -> Float[Array, "..."]:
+        return point + self.increment(point)
+
+    def increment(self, point: Float[Array, "..."]) -> Float[Array, "..."]:
+        return self._each(self.numerics.increment, point)
+
+    def tangent(self, point: Float[Array, "..."]) -> Float[Array, "..."]:
+        return self._each(self.numerics.tangent, point)
+
+    @classmethod
+    def combine(cls, weights: Sequence[Weight], fields: Sequence[Any]) -> Any:
+        for field in fields[1:]:
+            fields[0]._check_like(field, "added")
+        return super().combine(weights, fields)
+
+    def bracket(self, other: Any) -> "AbstractMotion":
+        self._check_like(other, "put in a bracket")
+        # In the frame of the body flows compose the other way round, and so does the bracket.
+        a, b = (self, other) if self.frame == "fixed" else (other, self)
+        bracket = each(self.numerics.bracket, self._num_axes)
+        omega, v = bracket(a.omega, a.v, b.omega, b.v)
+        return type(self)(omega=omega, v=v, frame=self.frame)
+
+    def defect(self, point: Float[Array, "..."]) -> tuple[Real[Array, ""], str] | None:
+        n, core = self.dimension, point.shape[self._num_axes :]
+        if core == (n,):
+            return None
+        if len(core) == 2:
+            row = (0,) * n + (1,)
+            expected = f"a rotation, of determinant 1, before its last column and row {row}"
+            off = each(_defect, self._num_axes)(point)
+        else:
+            number = point[..., : self.number_size]
+            expected = f"{self.number} in its first {self.number_size} entries"
+            off = jnp.abs(jnp.sum(number * number, axis=-1) - 1)
+        return jnp.max(off, initial=0), expected
+
+    @property
+    def _num_axes(self) -> int:
+        return self.v.ndim - 1
+
+    def _each(self, fun: Any, point: Array) -> Array:
+        n, axes = self.dimension, self._num_axes
+        name, poses = type(self).__name__, [(n + 1, n + 1), (self.number_size + n,)]
+        if self.frame == "body" and point.shape[axes:] == (n,):
+            raise ValueError(
+                f'{name} with frame="body" moves poses, shapes {poses[0]} and {poses[1]}: a point '
+                f'has no frame of its own, got shape {point.shape}. Use frame="fixed".'
+            )
+        check_point(self, "v", axes, poses + [(n,)] * (self.frame == "fixed"), point)
+        if point.dtype != self.v.dtype:
+            raise TypeError(
+                f"{name} with v in {self.v.dtype} acts on points in {self.v.dtype}, got "
+                f"{point.dtype}."
+            )
+        return each(partial(fun, frame=self.frame), axes)(self.omega, self.v, point)
+
+    def _check_like(self, other: Any, what: str) -> None:
+        name = type(self).__name__
+        if type(other) is not type(self):
+            raise TypeError(
+                f"{name} can be {what} with another {name} only, got {type(other).__name__}."
+            )
+        if other.frame != self.frame:
+            raise ValueError(
+                f"Only motions in one frame can be {what}, got frame={self.frame!r} and "
+                f"frame={other.frame!r}."
+            )
+
+
+class RigidMotion(AbstractMotion):
+    """A rigid motion of space: an angular velocity `omega` and a velocity `v`.
+
+    It acts on what has one of these shapes:
+
+    - a pose as a homogeneous matrix, `(4, 4)`: rotation and position, and (0, 0, 0, 1) below;
+    - a pose as one vector, `(7,)`: a unit quaternion (w, x, y, z), then the position. It takes the
+      coordinates of the body to fixed ones. This is the layout of `jaxlie.SE3`, and the fastest;
+    - a point, `(3,)`, in the fixed frame only.
+
+    With `frame="fixed"`, `omega` and `v` have fixed coordinates, and `v` is the velocity of what is
+    at the origin: `T' = X T` for the matrix `X = [[omega x, v], [0, 0]]`, and `x' = omega x x + v`
+    for positions and points. With `frame="body"` they have the coordinates of the body, and `v` is
+    the velocity of its origin: `T' = T X`. There is no default. Only motions in one frame can be
+    added.
+
+    With leading axes, shape `(*batch, 3)`, each pose of shapes `(*batch, 4, 4)` and `(*batch, 7)`
+    moves on its own. An axis of 1 is broadcast.
+
+    The flow is the closed form of the exponential, 100 to 200 flops. It is exact to rounding for
+    every angle, and so are its derivatives of every order, also at zero. An angle beyond 2^45
+    (2^16 in float32) gives NaN.
+
+    **Arguments:**
+
+    - `omega`: shape `(*batch, 3)`, float32 or float64, in radians per unit of time.
+    - `v`: shape and dtype of `omega`, in lengths per unit of time.
+    - `frame`: `"body"` or `"fixed"`.
+
+    **Raises** `ValueError` for another shape or frame, or for points in the frame of the body;
+    `TypeError` for another dtype. A solve that starts off the manifold by more than the root of a
+    unit of rounding, in the square of the quaternion's length or in an entry of `R^T R`, is an
+    error.
+    """
+
+    _: KW_ONLY
+    omega: Float[Array, "*batch 3"] = eqx.field(converter=jnp.asarray)
+    v: Float[Array, "*batch 3"] = eqx.field(converter=jnp.asarray)
+    frame: Frame = eqx.field(static=True)
+
+    dimension: ClassVar[int] = 3
+    number: ClassVar[str] = "a unit quaternion"
+    number_size: ClassVar[int] = 4
+    numerics: ClassVar[Any] = rigid_motion
+
+
+class PlanarMotion(AbstractMotion):
+    """A rigid motion of the plane: an angular velocity `omega` and a velocity `v`.
+
+    It acts on what has one of these shapes:
+
+    - a pose as a homogeneous matrix, `(3, 3)`: rotation and position, and (0, 0, 1) below;
+    - a pose as one vector, `(4,)`: cosine and sine of its angle, then the position: the layout of
+      `jaxlie.SE2`;
+    - a point, `(2,)`, in the fixed frame only.
+
+    **Arguments:**
+
+    - `omega`: shape `(*batch,)`, float32 or float64, in radians per unit of time.
+    - `v`: shape `(*batch, 2)`, in lengths per unit of time.
+    - `frame`: `"body"` or `"fixed"`.
+
+    All else as for `cfjax.RigidMotion`.
+    """
+
+    _: KW_ONLY
+    omega: Float[Array, "*batch"] = eqx.field(converter=jnp.asarray)
+    v: Float[Array, "*batch 2"] = eqx.field(converter=jnp.asarray)
+    frame: Frame = eqx.field(static=True)
+
+    dimension: ClassVar[int] = 2
+    number: ClassVar[str] = "a unit complex number"
+    number_size: ClassVar[int] = 2
+    numerics: ClassVar[Any] = planar_motion
+
+
+def _defect(matrix: Float[Array, "n n"]) -> Float[Array, ""]:
+    rotation, last = matrix[:-1, :-1], matrix[-1]
+    eye = jnp.eye(len(matrix), dtype=matrix.dtype)
+    skewness = matmul(rotation.T, rotation) - eye[:-1, :-1]
+    parts = (skewness, jnp.linalg.det(rotation) - 1, last - eye[-1])
+    return jnp.max(jnp.asarray([jnp.max(jnp.abs(part)) for part in parts]))

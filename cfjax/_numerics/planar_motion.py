@@ -1,0 +1,86 @@
+"""Motion of points and poses in the plane.
+
+In complex numbers a point x moves with the velocity `i w x + v`, and the direction z of a pose with
+`i w z`. In unit time each moves by its velocity times `phi_1(i w) = c_1 + i w c_2`, with Stumpff
+functions c_n of w^2.
+"""
+
+import functools
+from collections.abc import Callable, Sequence
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+from jaxtyping import Array, Float
+
+from .._xla import pack
+from .stumpff import stumpff_1_2_apart
+
+# The two entries of a vector: numbers, or the rows or columns of a matrix.
+_Vector = Sequence[Any]
+
+
+@functools.partial(jax.jit, static_argnames="frame")
+def tangent(
+    w: Float[Array, ""], v: Float[Array, "2"], x: Float[Array, "..."], frame: str
+) -> Float[Array, "..."]:
+    """The velocity of `x`: a point, shape `(2,)`, or a pose, shape `(3, 3)` or `(4,)`."""
+    return _moved(lambda w, u: u, w, v, x, frame)
+
+
+@functools.partial(jax.jit, static_argnames="frame")
+def increment(
+    w: Float[Array, ""], v: Float[Array, "2"], x: Float[Array, "..."], frame: str
+) -> Float[Array, "..."]:
+    """What `x` moves by in unit time, with a rounding as small as it is."""
+    near, d1, d2 = stumpff_1_2_apart(w * w)
+
+    def way(w: Array, u: _Vector) -> _Vector:
+        # What c_1 and c_2 are at zero is apart for the reason that `rotate.increment` gives.
+        return [
+            near * (a + b / 2) + (d1 * a + d2 * b) for a, b in zip(u, _times_i(w, u), strict=True)
+        ]
+
+    return _moved(way, w, v, x, frame)
+
+
+@jax.jit
+def bracket(
+    w1: Float[Array, ""], v1: Float[Array, "2"], w2: Float[Array, ""], v2: Float[Array, "2"]
+) -> tuple[Float[Array, ""], Float[Array, "2"]]:
+    """`ab - ba` for the matrices a and b of two motions."""
+    v = _plus(_times_i(w1, [v2[0], v2[1]]), _times_i(-w2, [v1[0], v1[1]]))
+    return jnp.zeros_like(w1), pack(v, sums=True)
+
+
+def _moved(
+    way: Callable[[Array, _Vector], _Vector], w: Array, v: Array, x: Array, frame: str
+) -> Array:
+    """What `x` moves by, where `way` makes it of a velocity that turns with w."""
+    vs = [v[0], v[1]]
+    if x.ndim == 2 and frame == "body":
+        # A row of the matrix turns with -w.
+        r0, r1 = x[:, 0], x[:, 1]
+        v0, v1 = way(w, vs)
+        return pack([*way(-w, _times_i(-w, [r0, r1])), r0 * v0 + r1 * v1], axis=1, sums=True)
+    entries = [x[k] for k in range(len(x))]
+    if x.ndim == 2:
+        *rows, last = entries
+        u = _plus(_times_i(w, rows), [last * a for a in vs])
+        return pack([*way(w, u), jnp.zeros_like(last)], sums=True)
+    z, place = entries[:-2], entries[-2:]
+    if frame == "fixed":
+        u = _plus(_times_i(w, place), vs)
+    else:
+        u = _plus([z[0] * a for a in vs], _times_i(z[1], vs))
+    turned = way(w, _times_i(w, z)) if z else []
+    return pack([*turned, *way(w, u)], sums=True)
+
+
+def _times_i(w: Any, x: _Vector) -> _Vector:
+    """`i w x`."""
+    return [-(w * x[1]), w * x[0]]
+
+
+def _plus(a: _Vector, b: _Vector) -> _Vector:
+    return [a[0] + b[0], a[1] + b[1]]
