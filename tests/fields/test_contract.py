@@ -5,6 +5,7 @@ Frozen, every field here is affine: `x' = A x + b` for the entries of its point.
 """
 
 from collections.abc import Callable
+from functools import partial
 from typing import Any, NamedTuple
 
 import jax
@@ -56,6 +57,21 @@ def normal(*shape, is_complex=False):
     return x + 1j * RNG.normal(size=shape) if is_complex else x
 
 
+def quaternions(a, w):
+    """What multiplies a quaternion wxyz: a on its vector, and what mixes this with the scalar."""
+    return np.block([[np.zeros((1, 1), w.dtype), -w[None]], [w[:, None], a]])
+
+
+def screw(a, v):
+    m = np.zeros((len(v) + 1, len(v) + 1), v.dtype)
+    m[:-1, :-1], m[:-1, -1] = a, v
+    return m
+
+
+def block_diagonal(a, b):
+    return np.block([[a, np.zeros((len(a), len(b)))], [np.zeros((len(b), len(a))), b]])
+
+
 def unit(**arrays):
     norm = np.sqrt(sum(np.sum(np.abs(x) ** 2) for x in arrays.values()))
     return {name: x / norm for name, x in arrays.items()}
@@ -74,6 +90,7 @@ def border(gamma):
     return columns(gamma @ e.T - e @ gamma.T, gamma.shape[1])
 
 
+TURN = np.array([[0, -1], [1, 0]])
 SPECTRUM = -np.array([0.0, 1.0, 1.0, 2.5])
 CASES = {
     "Rotation": Case(
@@ -87,6 +104,60 @@ CASES = {
         lambda: unit(omega=normal(3)),
         normal(3, 2),
         lambda x, omega: (columns(hat(omega), 2), 0),
+    ),
+    "QuaternionRotation, body": Case(
+        partial(cfjax.QuaternionRotation, frame="body", order="wxyz"),
+        lambda: unit(omega=normal(3)),
+        unit(q=normal(4))["q"],
+        lambda x, omega: (quaternions(-hat(omega), omega) / 2, 0),
+    ),
+    "QuaternionRotation, fixed": Case(
+        partial(cfjax.QuaternionRotation, frame="fixed", order="xyzw"),
+        lambda: unit(omega=normal(3)),
+        unit(q=normal(4))["q"],
+        lambda x, omega: (np.roll(quaternions(hat(omega), omega), -1, (0, 1)) / 2, 0),
+    ),
+    "RigidMotion of matrices, body": Case(
+        partial(cfjax.RigidMotion, frame="body"),
+        lambda: unit(omega=normal(3), v=normal(3)),
+        normal(4, 4),
+        lambda x, omega, v: (rows(screw(hat(omega), v), 4), 0),
+    ),
+    "RigidMotion of matrices, fixed": Case(
+        partial(cfjax.RigidMotion, frame="fixed"),
+        lambda: unit(omega=normal(3), v=normal(3)),
+        normal(4, 4),
+        lambda x, omega, v: (columns(screw(hat(omega), v), 4), 0),
+    ),
+    "RigidMotion of a quaternion and a position": Case(
+        partial(cfjax.RigidMotion, frame="fixed"),
+        lambda: unit(omega=normal(3), v=normal(3)),
+        normal(7),
+        lambda x, omega, v: (
+            block_diagonal(quaternions(hat(omega), omega) / 2, hat(omega)),
+            np.concatenate([0 * x[:4], v]),
+        ),
+    ),
+    "RigidMotion of a point": Case(
+        partial(cfjax.RigidMotion, frame="fixed"),
+        lambda: unit(omega=normal(3), v=normal(3)),
+        normal(3),
+        lambda x, omega, v: (hat(omega), v),
+    ),
+    "PlanarMotion of matrices, body": Case(
+        partial(cfjax.PlanarMotion, frame="body"),
+        lambda: unit(omega=normal(), v=normal(2)),
+        normal(3, 3),
+        lambda x, omega, v: (rows(screw(omega * TURN, v), 3), 0),
+    ),
+    "PlanarMotion of a complex number and a position": Case(
+        partial(cfjax.PlanarMotion, frame="fixed"),
+        lambda: unit(omega=normal(), v=normal(2)),
+        normal(4),
+        lambda x, omega, v: (
+            block_diagonal(omega * TURN, omega * TURN),
+            np.concatenate([0 * x[:2], v]),
+        ),
     ),
     "LeftMatrix": Case(
         cfjax.LeftMatrix,
