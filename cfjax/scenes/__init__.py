@@ -2,6 +2,7 @@
 
 from . import heat as heat
 from . import rigid_body as rigid_body
+from . import spacecraft as spacecraft
 from . import spins as spins
 from . import stiefel as stiefel
 from . import wilson_flow as wilson_flow

@@ -44,12 +44,15 @@ def energy(
 
 def reference(
     t: float | Float[Array | np.ndarray, "*times"],
+    y0: Float[np.ndarray, "3"] = y0,
+    inertia: Float[np.ndarray, "3"] = inertia,
 ) -> Float[np.ndarray, "*times 3"]:
-    """The exact solution for `inertia` and `y0` at times `t`, in NumPy's float64.
+    """The exact solution at times `t`, in NumPy's float64.
 
-    Jacobi elliptic functions: the body turns about the axis of largest inertia, where y_1 keeps
-    its sign. The error is below 1e-14 for `|t| <= 100`. Source: Landau & Lifshitz, Mechanics,
-    Section 37.
+    Jacobi elliptic functions: the body turns about the axis of largest inertia, the first one,
+    where y_1 > 0 keeps its sign. So `inertia` must fall, and `y0` be on that side of the middle
+    axis: `y0 @ y0 >= inertia[1] * (y0 / inertia) @ y0`. The error is below 1e-14 for `|t| <= 100`
+    and the default start. Source: Landau & Lifshitz, Mechanics, Section 37.
     """
     # Not at import: few who import the package need it.
     from scipy.special import ellipj, ellipkinc

@@ -1,0 +1,120 @@
+"""The spacecraft: its exact motion, what it keeps, and thrusters that switch."""
+
+import diffrax
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from scipy.integrate import solve_ivp
+
+import cfjax
+from cfjax.scenes import spacecraft
+
+TERM = cfjax.LieTerm(spacecraft.field)
+FREE = spacecraft.Craft()
+FIRED = spacecraft.Craft(torque=(0.1, -0.2, 0.3), on=0.7, off=1.9)
+
+
+def rate(t, y, torque):
+    """The equations once more, in NumPy."""
+    q, m = y[:4], y[4:]
+    w = m / spacecraft.inertia
+    q_rate = np.concatenate([[-q[1:] @ w], q[0] * w + np.cross(q[1:], w)]) / 2
+    return np.concatenate([q_rate, np.cross(m, w) + torque])
+
+
+def by_dop853(*pieces):
+    """From one end of a piece to the next, each with its torque."""
+    y = np.concatenate([spacecraft.y0()["q"], spacecraft.y0()["m"]])
+    for start, end, torque in pieces:
+        options = dict(method="DOP853", rtol=1e-13, atol=1e-14)
+        y = solve_ivp(rate, (start, end), y, args=(np.array(torque),), **options).y[:, -1]
+    return {"q": y[:4], "m": y[4:]}
+
+
+def end(solver, t, num_steps):
+    ys = cfjax.integrate(TERM, solver, 0.0, t, spacecraft.y0(), FREE, num_steps=num_steps).ys
+    return jax.tree.map(lambda y: y[-1], ys)
+
+
+def test_the_reference_against_dop853():
+    # Two steps of growth by e^(0.29 t) off the middle axis, of a tolerance of 1e-13.
+    want = by_dop853((0.0, 8.0, np.zeros(3)))
+    assert spacecraft.error(want, spacecraft.reference(8.0)) < 1e-11
+
+
+def test_the_reference_at_many_times_is_that_at_each():
+    times = np.array([0.0, 3.0, 17.5])
+    together = spacecraft.reference(times)
+    for k, t in enumerate(times):
+        one = {name: x[k] for name, x in together.items()}
+        # The panels of the integral are others, which are exact to rounding.
+        assert spacecraft.error(one, spacecraft.reference(t)) < 1e-13
+    assert spacecraft.error(spacecraft.y0(), spacecraft.reference(0.0)) < 1e-15
+
+
+@pytest.mark.parametrize(("solver", "order"), [(cfjax.CF4(), 4), (cfjax.CF54(), 5)])
+def test_order(solver, order):
+    exact = spacecraft.reference(10.0)
+    errors = [spacecraft.error(end(solver, 10.0, n), exact) for n in (40, 80)]
+    assert 0.7 * 2**order < errors[0] / errors[1] < 1.5 * 2**order
+
+
+def test_what_is_kept():
+    ys = cfjax.integrate(
+        TERM, cfjax.CF4(), 0, 40, spacecraft.y0(), FREE, num_steps=4000, save_every=40
+    ).ys
+    # To rounding: the lengths, whatever the steps.
+    for part, length in (("q", 1.0), ("m", np.hypot(0.05, 1.0))):
+        np.testing.assert_allclose(np.linalg.norm(ys[part], axis=-1), length, rtol=1e-15 * 4)
+    # To the method's error: energy, and the momentum in the fixed frame.
+    energies = spacecraft.energy(ys, FREE)
+    np.testing.assert_allclose(energies, spacecraft.energy(spacecraft.y0(), FREE), rtol=1e-8)
+    momenta = spacecraft.fixed_momentum(ys)
+    start = np.broadcast_to(spacecraft.y0()["m"], momenta.shape)
+    np.testing.assert_allclose(momenta, start, rtol=0, atol=1e-8)
+    # It tumbles.
+    assert ys["m"][:, 1].min() < -0.99 and ys["m"][:, 1].max() > 0.99
+
+
+@pytest.mark.parametrize("jumps", [True, pytest.param(False, marks=pytest.mark.slow)])
+def test_thrusters_that_switch(jumps):
+    torque = FIRED.torque
+    want = by_dop853((0.0, 0.7, np.zeros(3)), (0.7, 1.9, torque), (1.9, 3.0, np.zeros(3)))
+    controller = diffrax.PIDController(rtol=0.0, atol=1e-9, dtmax=0.5)
+    if jumps:
+        times = jnp.array([FIRED.on, FIRED.off])
+        controller = diffrax.ClipStepSizeController(controller, jump_ts=times)
+    sol = diffrax.diffeqsolve(
+        TERM,
+        cfjax.CF43(),
+        0.0,
+        3.0,
+        0.1,
+        spacecraft.y0(),
+        FIRED,
+        stepsize_controller=controller,
+    )
+    error = spacecraft.error(jax.tree.map(lambda y: y[-1], sol.ys), want)
+    # Some 30 steps of a tolerance of 1e-9. Without the jumps, steps across them are rejected until
+    # they are so short that what they overlook is below it.
+    assert error < 1e-7
+    rejected = sol.stats["num_rejected_steps"]
+    assert rejected <= 8 if jumps else rejected > 8
+
+
+def test_the_velocity_is_that_of_the_field():
+    y = {"q": jnp.array([0.1, 0.5, -0.5, 0.7]), "m": jnp.array([0.3, -1.0, 0.7])}
+    for t in (0.0, 1.0):
+        want = cfjax.tangent(spacecraft.field(t, y, FIRED), y)
+        found = spacecraft.velocity(t, y, FIRED)
+        jax.tree.map(lambda a, b: np.testing.assert_allclose(a, b, 0, 1e-15), found, want)
+
+
+def test_an_attitude_has_two_quaternions():
+    y = spacecraft.reference(3.0)
+    assert spacecraft.error({"q": -y["q"], "m": y["m"]}, y) == 0.0
+
+
+def test_the_picture():
+    assert len(spacecraft.picture().axes) == 2
