@@ -88,8 +88,14 @@ class AbstractFrozenField(eqx.Module):
     def combine(cls, weights: Sequence[Weight], fields: Sequence[Any]) -> Any:
         """The field `sum_i weights[i] * fields[i]`. Weights are real scalars.
 
-        **Raises** `TypeError` if a leaf of the class is not a floating or complex array.
+        **Raises** `TypeError` if a leaf of the class is not a floating or complex array, and
+        `ValueError` if the fields differ in what is static.
         """
+        if len({jtu.tree_structure(field) for field in fields}) > 1:
+            different = " and ".join(dict.fromkeys(map(describe, fields)))
+            raise ValueError(
+                f"Only fields that agree in what is static can be added, got {different}."
+            )
         for path, leaf in jtu.tree_leaves_with_path(fields[0]):
             _check_coordinates(f"{cls.__name__}{jtu.keystr(path)}", leaf)
         return jtu.tree_map(lambda *leaves: _linear_combination(weights, leaves), *fields)
