@@ -131,8 +131,8 @@ class RigidMotion(AbstractMotion):
     moves on its own. An axis of 1 is broadcast.
 
     The flow is the closed form of the exponential, 100 to 200 flops. It is exact to rounding for
-    every angle, and so are its derivatives of every order, also at zero. An angle beyond 2^45
-    (2^16 in float32) gives NaN.
+    every angle, and so are its derivatives, also at zero. (The rounding of second derivatives
+    grows with the square of the angle.) An angle beyond 2^45 (2^16 in float32) gives NaN.
 
     **Arguments:**
 
