@@ -1,6 +1,5 @@
 """Rigid motions of space and of the plane: the Lie algebras se(3) and se(2)."""
 
-from collections.abc import Sequence
 from dataclasses import KW_ONLY
 from functools import partial
 from typing import Any, ClassVar, Literal
@@ -9,7 +8,7 @@ import equinox as eqx
 import jax.numpy as jnp
 from jaxtyping import Array, Float, Real
 
-from .._field import AbstractAlgebraElement, Weight
+from .._field import AbstractAlgebraElement
 from .._numerics import planar_motion, rigid_motion
 from .._numerics.matmul import matmul
 from .elementwise import check_point, each
@@ -60,14 +59,17 @@ class AbstractMotion(AbstractAlgebraElement):
     def tangent(self, point: Float[Array, "..."]) -> Float[Array, "..."]:
         return self._each(self.numerics.tangent, point)
 
-    @classmethod
-    def combine(cls, weights: Sequence[Weight], fields: Sequence[Any]) -> Any:
-        for field in fields[1:]:
-            fields[0]._check_like(field, "added")
-        return super().combine(weights, fields)
-
     def bracket(self, other: Any) -> "AbstractMotion":
-        self._check_like(other, "put in a bracket")
+        name = type(self).__name__
+        if type(other) is not type(self):
+            raise TypeError(
+                f"{name} has a bracket with another {name} only, got {type(other).__name__}."
+            )
+        if other.frame != self.frame:
+            raise ValueError(
+                f"{name} has a bracket with a motion in the same frame only, got "
+                f"frame={self.frame!r} and frame={other.frame!r}."
+            )
         # In the frame of the body flows compose the other way round, and so does the bracket.
         a, b = (self, other) if self.frame == "fixed" else (other, self)
         bracket = each(self.numerics.bracket, self._num_axes)
@@ -108,18 +110,6 @@ class AbstractMotion(AbstractAlgebraElement):
             )
         return each(partial(fun, frame=self.frame), axes)(self.omega, self.v, point)
 
-    def _check_like(self, other: Any, what: str) -> None:
-        name = type(self).__name__
-        if type(other) is not type(self):
-            raise TypeError(
-                f"{name} can be {what} with another {name} only, got {type(other).__name__}."
-            )
-        if other.frame != self.frame:
-            raise ValueError(
-                f"Only motions in one frame can be {what}, got frame={self.frame!r} and "
-                f"frame={other.frame!r}."
-            )
-
 
 class RigidMotion(AbstractMotion):
     """A rigid motion of space: an angular velocity `omega` and a velocity `v`.
@@ -141,8 +131,8 @@ class RigidMotion(AbstractMotion):
     moves on its own. An axis of 1 is broadcast.
 
     The flow is the closed form of the exponential, 100 to 200 flops. It is exact to rounding for
-    every angle, and so are its derivatives of every order, also at zero. An angle beyond 2^45
-    (2^16 in float32) gives NaN.
+    every angle, and so are its derivatives, also at zero. (The rounding of second derivatives
+    grows with the square of the angle.) An angle beyond 2^45 (2^16 in float32) gives NaN.
 
     **Arguments:**
 

@@ -11,7 +11,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-# Of vectors that are taken apart.
+# Of vectors that are taken apart. A pose is a quaternion and a position.
 _MAX_LENGTH = 7
 
 # JAX compiles anew where it changes.

@@ -398,23 +398,24 @@ def planar(frame="body", w=(), v=(2,)):
         ),
         (
             lambda: cfjax.combine((1.0, 1.0), [rigid("body"), rigid("fixed")]),
-            ValueError,
-            "Only motions in one frame can be added, got frame='body' and frame='fixed'",
+            TypeError,
+            r"must agree in all but arrays, got RigidMotion\(omega=f64\[3\], v=f64\[3\], "
+            r"frame='body'\) and RigidMotion\(.*frame='fixed'\)",
         ),
         (
             lambda: cfjax.combine((1.0, 1.0), [rigid(), planar()]),
             TypeError,
-            "RigidMotion can be added with another RigidMotion only, got PlanarMotion",
+            "Only fields of one kind can be added, got RigidMotion and PlanarMotion",
         ),
         (
             lambda: cfjax.bracket(rigid("body"), rigid("fixed")),
             ValueError,
-            "Only motions in one frame can be put in a bracket, got frame='body'",
+            "with a motion in the same frame only, got frame='body' and frame='fixed'",
         ),
         (
             lambda: planar().bracket(cfjax.Rotation(np.ones(3))),
             TypeError,
-            "PlanarMotion can be put in a bracket with another PlanarMotion only, got Rotation",
+            "PlanarMotion has a bracket with another PlanarMotion only, got Rotation",
         ),
     ],
 )
