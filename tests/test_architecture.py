@@ -44,6 +44,7 @@ AGAINST_THE_DIRECTION = {
 # Beyond the public names.
 PRIVATE = {
     ("scenes.rigid_body", "_numerics.matmul"): "a rotation of a start, in full precision",
+    ("scenes.wilson_flow", "_numerics.matmul"): "products of links, in full precision",
     ("_paper", "_measure"): "reports, charts and flops are what it shows",
     ("_paper", "scenes"): "its problems",
     ("_paper", "_integrate.integrate"): "counts a step without what estimates its error",
