@@ -23,6 +23,7 @@ from ._fields.low_rank import LowRankSkew as LowRankSkew
 from ._fields.matrix import LeftMatrix as LeftMatrix
 from ._fields.matrix import RightMatrix as RightMatrix
 from ._fields.rotation import Rotation as Rotation
+from ._fields.sphere import SphereRotation as SphereRotation
 from ._integrate.batch import BatchResult as BatchResult
 from ._integrate.batch import map_batch as map_batch
 from ._integrate.integrate import integrate as integrate

@@ -17,6 +17,7 @@ PROMISED = [
     "RightMatrix",
     "LowRankSkew",
     "BorderedSkew",
+    "SphereRotation",
     "Tableau",
     "CommutatorFree",
     "LieEuler",
