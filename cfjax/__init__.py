@@ -26,6 +26,7 @@ from ._fields.quaternion import QuaternionRotation as QuaternionRotation
 from ._fields.rigid_motion import PlanarMotion as PlanarMotion
 from ._fields.rigid_motion import RigidMotion as RigidMotion
 from ._fields.rotation import Rotation as Rotation
+from ._fields.sphere import SphereRotation as SphereRotation
 from ._integrate.batch import BatchResult as BatchResult
 from ._integrate.batch import map_batch as map_batch
 from ._integrate.integrate import integrate as integrate

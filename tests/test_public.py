@@ -23,6 +23,7 @@ PROMISED = [
     "RightMatrix",
     "LowRankSkew",
     "BorderedSkew",
+    "SphereRotation",
     "Tableau",
     "CommutatorFree",
     "LieEuler",

@@ -56,6 +56,7 @@ FIELDS = {
     "LeftMatrix": (lambda t, y, args: cfjax.LeftMatrix(jnp.outer(args, y)), ON_SPHERE),
     "RightMatrix": (lambda t, y, args: cfjax.RightMatrix(jnp.outer(y, args)), ON_SPHERE),
     "LowRankSkew": (unit, FRAME),
+    "SphereRotation": (lambda t, y, args: cfjax.SphereRotation(args * y + t), ON_SPHERE),
     "BorderedSkew": (
         lambda t, y, args: cfjax.BorderedSkew(
             jnp.concatenate([jnp.array([[0.0, 0.3], [-0.3, 0.0]]), args[None, :2] * y[2:]])

@@ -71,13 +71,7 @@ class LowRankSkew(AbstractSkew):
             _check_point(self, "g", point)
         if self.g.ndim > 2:
             return elementwise(self, self.g.ndim - 2).enter(point, earlier)
-        if earlier:
-            span, frozen_at = earlier[-1].span, point.z
-        else:
-            span = _Span((point,), _square(point))
-            frozen_at = jnp.eye(point.shape[1], dtype=point.dtype)
-            point = SpanPoint(frozen_at + _correction(span.gram), span.blocks)
-        return SpanSkew.of(self.g, frozen_at, span), point
+        return SpanSkew.entered(self.g, point, earlier)
 
 
 class AbstractSkewElement(AbstractSkew, AbstractAlgebraElement):
@@ -90,7 +84,7 @@ class AbstractSkewElement(AbstractSkew, AbstractAlgebraElement):
             return BorderedSkew(combine(weights, gammas))
         fields = _on_one_span(fields)
         k, a = combine(weights, [(f.k, f.a) for f in fields])
-        return SpanSkew(k, a, fields[0].span)
+        return type(fields[0])(k, a, fields[0].span)
 
 
 class BorderedSkew(AbstractSkewElement):
@@ -231,6 +225,19 @@ class SpanSkew(AbstractSkewElement):
     span: _Span
 
     @classmethod
+    def entered(
+        cls, g: Float[Array, "n p"], point: Any, earlier: Sequence["SpanSkew"]
+    ) -> tuple["SpanSkew", SpanPoint]:
+        """The field `g y^T - y g^T` frozen at the point y, and y, in the coordinates of a step."""
+        if earlier:
+            span, frozen_at = earlier[-1].span, point.z
+        else:
+            span = _Span((point,), _square(point))
+            frozen_at = jnp.eye(point.shape[1], dtype=point.dtype)
+            point = SpanPoint(frozen_at + _correction(span.gram), span.blocks)
+        return cls.of(g, frozen_at, span), point
+
+    @classmethod
     def of(cls, g: Float[Array, "n p"], z: Float[Array, "k p"], span: _Span) -> "SpanSkew":
         """The field `g y^T - y g^T` with `y = W z`, on the span of W and g."""
         p, length = g.shape[1], len(z)
@@ -289,12 +296,12 @@ class SpanSkew(AbstractSkewElement):
         if places == list(range(len(places))):
             k = jnp.pad(self.k, (0, rest))
             new = matmul(self.k, span.gram[: m - rest, m - rest :])
-            return SpanSkew(
+            return type(self)(
                 k, jnp.pad(jnp.concatenate([self.a, new], 1), ((0, rest), (0, 0))), span
             )
         index = np.concatenate([np.arange(p) + p * place for place in places])
         k = jnp.zeros((m, m), self.k.dtype).at[np.ix_(index, index)].set(self.k)
-        return SpanSkew(k, matmul(k, span.gram), span)
+        return type(self)(k, matmul(k, span.gram), span)
 
 
 def _spanned(field: Any) -> SpanSkew:
@@ -319,7 +326,11 @@ def _on_one_span(fields: Sequence[Any]) -> list[SpanSkew]:
 
 
 def _columns(blocks: _Blocks) -> Float[Array, "n m"]:
-    return jnp.concatenate([x for x in blocks if not isinstance(x, _Corner)], axis=1)
+    columns = [x for x in blocks if not isinstance(x, _Corner)]
+    if columns[0].shape[1] == 1:
+        # As rows they are copied as they lie in memory: twice as fast where they are long.
+        return jnp.concatenate([x.T for x in columns]).T
+    return jnp.concatenate(columns, axis=1)
 
 
 def _inner(blocks: _Blocks, x: Float[Array, "n p"]) -> Float[Array, "m p"]:
@@ -372,8 +383,16 @@ def _check_factor(name: str, factor: Array) -> None:
 
 
 def _check_point(field: AbstractFrozenField, name: str, point: Array) -> None:
+    check_like(field, name, 2, point)
+
+
+def check_like(field: AbstractFrozenField, name: str, num_axes: int, point: Array) -> None:
+    """Raises `ValueError` unless the point is of the shape and dtype of an array of the field.
+
+    `num_axes` is how many axes both have without leading ones.
+    """
     factor = getattr(field, name)
-    check_point(field, name, factor.ndim - 2, [factor.shape[-2:]], point)
+    check_point(field, name, factor.ndim - num_axes, [factor.shape[-num_axes:]], point)
     if point.dtype != factor.dtype:
         raise ValueError(
             f"{type(field).__name__} of type {factor.dtype} acts on points of the same, got "

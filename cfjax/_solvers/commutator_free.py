@@ -107,8 +107,14 @@ class AbstractCommutatorFree(AbstractLieSolver):
         is_usual = type(self).element is AbstractCommutatorFree.element
         # Two stages at one point would be one flow with two times.
         if is_usual and len({*stages[:-1]}) == len(times) and can_loop(fields[0]):
+            first = fields[0]
+
+            def entered(c, here: PyTree) -> PyTree:
+                # What has entered as a field of another class does so at every stage.
+                return enter(field(c, leave(first, here)), here, [first])[0]
+
             with contextlib.suppress(FieldVaries):
-                made, fields[:] = run(flows, len(times), fields[0], points[()], field)
+                made, fields[:] = run(flows, len(times), first, points[()], entered)
                 points |= zip(_products(stages), made, strict=True)
                 is_looped = True
         if not is_looped:

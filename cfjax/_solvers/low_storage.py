@@ -17,6 +17,7 @@ from .._methods.tableau import Product, Row, Tableau
 from .base import Move
 from .commutator_free import AbstractCommutatorFree, minus, trimmed
 from .dense import Path
+from .stages import is_plain
 
 # Unrolled stages cost compile time quadratically. And XLA keeps the fields of several of them, to
 # add them up at once: as many as fit in a cache may be.
@@ -53,8 +54,12 @@ class AbstractLowStorage(AbstractCommutatorFree):
         if other or (len(self.b) <= _MAX_UNROLLED and size <= _LARGE):
             return super().move(field, y0)
         value = field(0.0, y0)
-        total, point = enter(value, y0, ())
-        if jtu.tree_structure((total, point)) != jtu.tree_structure((value, y0)):
+        first, point = enter(value, y0, ())
+        is_same = [
+            jtu.tree_structure(x) == jtu.tree_structure(y) for x, y in ((point, y0), (first, value))
+        ]
+        # Else the arrays of a step's own coordinates grow from stage to stage.
+        if not is_same[0] or not (is_same[1] or is_plain(first)):
             # The first stage is known.
             known = [value]
             return super().move(lambda c, y: known.pop() if known else field(c, y), y0)
@@ -62,18 +67,18 @@ class AbstractLowStorage(AbstractCommutatorFree):
         def stage(carry, coefficients):
             a, b, c = coefficients
             total, point, _ = carry
-            here = field(c, point)
+            here, _ = enter(field(c, point), point, (total,))
             total = combine((a, 1.0), (total, here))
             return (total, flow(combine((b,), (total,)), point), point), here
 
-        after = flow(combine((float(self.b[0]),), (total,)), point)
+        after = flow(combine((float(self.b[0]),), (first,)), point)
         coefficients = tuple(
             jnp.asarray([float(x) for x in row[1:]]) for row in (self.a, self.b, self.tableau.c)
         )
-        (_, end, before), later = lax.scan(stage, (total, after, point), coefficients)
+        (_, end, before), later = lax.scan(stage, (first, after, point), coefficients)
         # Not kept where nobody asks for output within the step.
         fields = [jtu.tree_map(itemgetter(i), later) for i in range(len(self.b) - 1)]
-        path = Path.of(continuous_extension(self.tableau), value_of(y0), [value, *fields])
+        path = Path.of(continuous_extension(self.tableau), value_of(point), [first, *fields])
         return Move(end, path, minus(end, before) if penultimate else None)
 
 

@@ -1,6 +1,6 @@
 """Runge-Kutta methods on the tangent space, by a retraction: for the Stiefel manifold."""
 
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import jax.numpy as jnp
 import jax.tree_util as jtu
@@ -9,6 +9,7 @@ from jaxtyping import Array, Float, PyTree
 from .._field import combine, is_field, tangent
 from .._fields.elementwise import each
 from .._fields.low_rank import BorderedSkew, LowRankSkew
+from .._fields.sphere import SphereRotation
 from .._methods.continuous_extension import runge_kutta_extension
 from .._numerics.matmul import matmul
 from .base import AbstractLieSolver, Move
@@ -29,9 +30,9 @@ class CayleyRK4(AbstractLieSolver):
 
     **Cost:** solves of sizes 2p and p, and products of size `n p^2`. Nothing of size n x n.
 
-    **Raises** `TypeError` for frozen fields other than `cfjax.LowRankSkew` and
-    `cfjax.BorderedSkew`, whose points have orthonormal columns. A step so long that an eigenvalue
-    of `Q^T Y` is -1 has no coordinates, and ends in large or non-finite numbers.
+    **Raises** `TypeError` for frozen fields other than `cfjax.LowRankSkew`, `cfjax.BorderedSkew`
+    and `cfjax.SphereRotation`, whose points have orthonormal columns. A step so long that an
+    eigenvalue of `Q^T Y` is -1 has no coordinates, and ends in large or non-finite numbers.
 
     Source: Celledoni & Owren, On the implementation of Lie group methods on the Stiefel manifold,
     Numer. Algorithms 32 (2003); RKR-C in Celledoni, Marthinsen & Owren, FGCS 19 (2003).
@@ -42,16 +43,15 @@ class CayleyRK4(AbstractLieSolver):
 
     def move(self, field, y0):
         first = field(0.0, y0)
-        _check(first)
-        curved = jtu.tree_map(is_field, first, is_leaf=is_field)
+        num_axes = jtu.tree_map(_num_axes, first, is_leaf=is_field)
 
-        end = _End(tuple(jtu.tree_leaves(curved)))
+        end = _End(tuple(jtu.tree_leaves(num_axes)))
 
         def rate(c: float, v: PyTree) -> PyTree:
             y = end(v, y0)
             return jtu.tree_map(
-                lambda c, q, v, f: each(_rate, q.ndim - 2)(q, v, f) if c else f,
-                curved,
+                lambda n, q, v, f: each(_rate, q.ndim - n)(q, v, f) if n else f,
+                num_axes,
                 y0,
                 v,
                 tangent(field(c, y), y),
@@ -69,31 +69,41 @@ class CayleyRK4(AbstractLieSolver):
 class _End(NamedTuple):
     """The point with tangent vector v at q as its coordinates. Equal to itself and hashable."""
 
-    curved: tuple[bool, ...]
+    num_axes: tuple[int, ...]
 
     def __call__(self, v: PyTree, q: PyTree) -> PyTree:
-        curved = jtu.tree_unflatten(jtu.tree_structure(q), self.curved)
+        num_axes = jtu.tree_unflatten(jtu.tree_structure(q), self.num_axes)
         return jtu.tree_map(
-            lambda c, q, v: each(_end, q.ndim - 2)(q, v) if c else q + v, curved, q, v
+            lambda n, q, v: each(_end, q.ndim - n)(q, v) if n else q + v, num_axes, q, v
         )
 
 
-def _check(field: PyTree) -> None:
-    for part in jtu.tree_leaves(field, is_leaf=is_field):
-        if is_field(part) and not isinstance(part, LowRankSkew | BorderedSkew):
-            raise TypeError(
-                "CayleyRK4 works on points with orthonormal columns: the frozen fields must be "
-                f"cfjax.LowRankSkew or cfjax.BorderedSkew, got {type(part).__name__}. Use a "
-                "commutator-free method, for example cfjax.CF4()."
-            )
+def _num_axes(field: Any) -> int:
+    """How many axes a point has without leading ones; 0 for a linear space."""
+    if not is_field(field):
+        return 0
+    if isinstance(field, SphereRotation):
+        return 1
+    if isinstance(field, LowRankSkew | BorderedSkew):
+        return 2
+    raise TypeError(
+        "CayleyRK4 works on points with orthonormal columns: the frozen fields must be "
+        "cfjax.LowRankSkew, cfjax.BorderedSkew or cfjax.SphereRotation, got "
+        f"{type(field).__name__}. Use a commutator-free method, for example cfjax.CF4()."
+    )
 
 
 def _end(q: Array, v: Array) -> Array:
-    return _Cayley(q, v).end()
+    return _Cayley(*map(_columns, (q, v))).end().reshape(q.shape)
 
 
 def _rate(q: Array, v: Array, velocity: Array) -> Array:
-    return _Cayley(q, v).rate(velocity)
+    return _Cayley(*map(_columns, (q, v))).rate(_columns(velocity)).reshape(q.shape)
+
+
+def _columns(x: Array) -> Float[Array, "n p"]:
+    """A unit vector as one column."""
+    return x.reshape(len(x), -1)
 
 
 class _Cayley:

@@ -49,13 +49,19 @@ def can_loop(field: PyTree) -> bool:
     A step that is rewritten for XLA is faster written out. So are fields that combine in a way of
     their own or work in coordinates of the step, whose arrays grow from stage to stage.
     """
-    parts = [part for part in jtu.tree_leaves(field, is_leaf=is_field) if is_field(part)]
+    parts = jtu.tree_leaves(field, is_leaf=is_field)
     return (
         not is_rewritten()
         and not _is_written_out.get()
-        and bool(parts)
-        and all(map(_is_plain, parts))
+        and any(map(is_field, parts))
+        and is_plain(field)
     )
+
+
+def is_plain(field: PyTree) -> bool:
+    """Whether its parts combine in the usual way and have no coordinates of a step."""
+    parts = jtu.tree_leaves(field, is_leaf=is_field)
+    return all(_is_plain(part) for part in parts if is_field(part))
 
 
 def _is_plain(field: AbstractFrozenField) -> bool:
