@@ -221,6 +221,24 @@ CASES = {
         lambda x, gamma: (border(gamma), 0),
         is_free=False,
     ),
+    "SphereRotation": Case(
+        cfjax.SphereRotation,
+        lambda: unit(g=normal(5)),
+        unit(y=normal(5))["y"],
+        lambda x, g: (np.outer(g, x) - np.outer(x, g), 0),
+        is_free=False,
+        is_group=False,
+        has_bracket=False,
+    ),
+    "SphereRotation in space": Case(
+        cfjax.SphereRotation,
+        lambda: unit(g=normal(3)),
+        unit(y=normal(3))["y"],
+        lambda x, g: (np.outer(g, x) - np.outer(x, g), 0),
+        is_free=False,
+        is_group=False,
+        has_bracket=False,
+    ),
     "Affine": Case(
         lambda alpha, b: cfjax.Affine(alpha, b, SPECTRUM.astype(b.dtype)),
         lambda: unit(alpha=np.abs(normal()), b=normal(4)),
@@ -413,7 +431,7 @@ def test_sums_brackets_and_the_group(name):
 def test_zero_is_the_identity_exactly(name):
     case = CASES[name]
     zero = case.make(**{k: jnp.zeros_like(x) for k, x in case.draw().items()})
-    if name in ("LowRankSkew", "BorderedSkew"):
+    if name.partition(" ")[0] in ("LowRankSkew", "BorderedSkew", "SphereRotation"):
         # The start of a step is moved to the manifold first, by some roundings.
         np.testing.assert_allclose(zero.flow(jnp.asarray(case.point)), case.point, 0, 2e-15)
     else:

@@ -63,6 +63,10 @@ FIELDS = {
     ),
     "LowRankSkew": (lambda t, x: cfjax.LowRankSkew(jnp.cos(t) * A6 @ x), FRAMES),
     "BorderedSkew": (lambda t, x: cfjax.BorderedSkew(jnp.cos(t) * A6 @ x), FRAMES),
+    "SphereRotation": (
+        lambda t, x: cfjax.SphereRotation(jnp.cos(t) * A6 @ x),
+        jnp.asarray(FRAMES[..., 0]),
+    ),
     "elementwise": (lambda t, x: Written(jnp.sin(A3 @ x + t)), normal(5, 3)),
     "elementwise of a pair": (lambda t, x: Pair(jnp.sin(A3 @ x["q"] + t)), None),
 }
