@@ -113,12 +113,7 @@ class AbstractLieSolver(diffrax.AbstractSolver):
                 lambda lost, y: y if lost is None else _at_rest(y), lost, y0, is_leaf=_is_leaf
             )
             made = self.move(field, start)
-            end = jtu.tree_map(
-                lambda lost, end: _shared(lost, end),
-                lost,
-                made.end,
-                is_leaf=_is_leaf,
-            )
+            end = _shared(lost, made.end)
             return (end, None if first is None else values[-1]), (made.error, made.path)
 
         (end, last), (error, path) = by_components(move, y0)
@@ -233,11 +228,17 @@ class _Sum(eqx.Module):
         return total, _Sum(lax.stop_gradient(b - (total - a)))
 
 
-def _shared(lost: Any, end: Any) -> Any:
-    """The end of a step. A compensated sum uses the increment several times."""
-    if not isinstance(lost, _Sum):
-        return end
-    return Incremented(end.start, once_for_sums(end.increment))
+def _shared(lost: PyTree, end: PyTree) -> PyTree:
+    """The end of a step. A compensated sum uses each increment several times."""
+    leaves, structure = jtu.tree_flatten(lost, is_leaf=_is_leaf)
+    ends = structure.flatten_up_to(end)
+    increments = once_for_sums(
+        [p.increment if isinstance(x, _Sum) else None for x, p in zip(leaves, ends, strict=True)]
+    )
+    return structure.unflatten(
+        p if increment is None else Incremented(p.start, increment)
+        for p, increment in zip(ends, increments, strict=True)
+    )
 
 
 def _is_leaf(x: Any) -> bool:

@@ -46,7 +46,7 @@ _ELEMENTWISE = frozenset(
     "abs acos acosh add add_any and asin asinh atan atan2 atanh cbrt ceil clamp complex conj "
     "convert_element_type copy cos cosh div eq erf exp exp2 expm1 floor ge gt imag integer_pow "
     "is_finite le log log1p logistic lt max min mul ne neg not or pow real rem round rsqrt "
-    "select_n sign sin sinh sqrt square sub tan tanh xor".split()
+    "select_n sign sin sinh sqrt square stop_gradient sub tan tanh xor".split()
 )
 _REDUCTIONS: dict[str, Callable[[Any, Any], Any]] = {
     "reduce_and": operator.and_,

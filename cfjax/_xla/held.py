@@ -7,6 +7,7 @@ from typing import Any
 import jax
 import jax.numpy as jnp
 import jax.tree_util as jtu
+import numpy as np
 from jax.experimental.xla_metadata import set_xla_metadata
 from jax.extend.core import Primitive
 from jax.interpreters import ad, batching, mlir
@@ -14,6 +15,9 @@ from jaxtyping import Array, PyTree
 
 from .pack import pack, unpack
 from .scope import is_short, where
+
+# In a batch, what makes more entries at once is not vectorised any more.
+_MAX_TOGETHER = 12
 
 
 def held(
@@ -30,20 +34,39 @@ def held(
 
 def once(tree: PyTree) -> PyTree:
     """The same; the entries of short vectors are computed once for all that uses them."""
+    # One by one: what nobody uses is not computed.
     return jtu.tree_map(_once, tree)
 
 
-def once_for_sums(x: Array) -> Array:
-    """The same array, which is used several times in what follows.
+def once_for_sums(tree: PyTree) -> PyTree:
+    """The same arrays, all of which are used several times in what follows.
 
     Else each use would compute the step of a batch anew. Alone it is fast in our own loop, but
-    makes diffrax's too large to be one function.
+    makes diffrax's too large to be one function. They go together, as what one is made of others
+    may be made of too.
     """
-    return _once(x, in_batches=True, alone=where() == "loop")
+    leaves, structure = jtu.tree_flatten(tree)
+    groups: list[list[Array]] = [[]]
+    for x in leaves:
+        if sum(map(np.size, (*groups[-1], x))) > _MAX_TOGETHER:
+            groups.append([])
+        groups[-1].append(x)
+    alone = where() == "loop"
+    return structure.unflatten(
+        x for group in groups for x in _once(group, in_batches=True, alone=alone)
+    )
 
 
-def _once(x: Array, **options: bool) -> Array:
-    return pack(held(unpack(x), **options)) if where() and is_short(x) else x
+def _once(tree: PyTree, **options: bool) -> PyTree:
+    if not where():
+        return tree
+    leaves, structure = jtu.tree_flatten(tree)
+    pieces = [unpack(x) if is_short(x) else [] for x in leaves]
+    new = iter(held([entry for entries in pieces for entry in entries], **options))
+    return structure.unflatten(
+        pack([next(new) for _ in entries]) if entries else x
+        for x, entries in zip(leaves, pieces, strict=True)
+    )
 
 
 held_p = Primitive("cfjax_held")

@@ -56,17 +56,18 @@ def _loop(step: Callable[[PyTree], PyTree], carry: PyTree, num_steps: Any) -> Py
 def _repeat(
     leaves: list[Array], parameters: list[Array], *, run: Callable, num_steps: int | Array
 ) -> list[Array]:
-    return _scan(run, num_steps, leaves, parameters, [False] * len(parameters))
+    moves = [True] * len(leaves), [False] * len(parameters)
+    return _scan(run, num_steps, leaves, parameters, *moves)
 
 
 @_repeat.def_jvp
 def _(primals, tangents, *, run, num_steps):
-    moves = [tangent is not None for tangent in tangents[1]]
+    moves = [[tangent is not None for tangent in group] for group in tangents]
     sizes = [len(jtu.tree_leaves(split(x))) for x in primals[1]]
-    if sum(n for n, is_one in zip(sizes, moves, strict=True) if is_one) > _MAX_TRAVELLERS:
-        moves = [False] * len(moves)
+    if sum(n for n, is_one in zip(sizes, moves[1], strict=True) if is_one) > _MAX_TRAVELLERS:
+        moves[1] = [False] * len(sizes)
     return eqx.filter_jvp(
-        lambda leaves, parameters: _scan(run, num_steps, leaves, parameters, moves),
+        lambda leaves, parameters: _scan(run, num_steps, leaves, parameters, *moves),
         primals,
         tangents,
     )
@@ -77,22 +78,44 @@ def _scan(
     num_steps: int | Int[Array, ""],
     leaves: list[Array],
     parameters: list[Array],
-    moves: Sequence[bool],
+    leaves_move: Sequence[bool],
+    parameters_move: Sequence[bool],
 ) -> list[Array]:
-    """The loop, where those parameters travel that are in components, if they move."""
+    """The loop, where those parameters travel that are in components, if they move.
+
+    Numbers of the carry that do not move, such as what sums have lost, are a vector of their own:
+    a derivative does not carry it.
+    """
+    moves = [
+        is_one
+        for x, is_one in zip(leaves, leaves_move, strict=True)
+        for _ in jtu.tree_leaves(split(x))
+    ]
     leaves, structure = jtu.tree_flatten(split(leaves))
     packed = _packed(leaves)
+    moves, _ = _partition(moves, packed)
     numbers, rest = _partition(leaves, packed)
     travels = [
         is_one and bool(numbers) and _is_number(piece, numbers[0].dtype)
-        for x, is_one in zip(parameters, moves, strict=True)
+        for x, is_one in zip(parameters, parameters_move, strict=True)
         for piece in jtu.tree_leaves(split(x))
     ]
     pieces, parameter_structure = jtu.tree_flatten(split(parameters))
     known, others = _partition(pieces, travels)
 
-    def step(entries: list[Array], rest: list[Array], known: Any, others: Any) -> Any:
-        numbers, travellers = entries[: sum(packed)], entries[sum(packed) :]
+    def vectors(numbers: list[Array], travellers: list[Array]) -> list[Array]:
+        moving, still = _partition(numbers, moves)
+        return [pack(group) for group in ([*moving, *travellers], still) if group]
+
+    def entries(vectors: list[Array]) -> tuple[list[Array], list[Array]]:
+        found = [entry for vector in vectors for entry in unpack(vector)]
+        end = len(found) - moves.count(False)
+        moving, travellers = found[: sum(moves)], found[sum(moves) : end]
+        return _merge(moving, found[end:], moves), travellers
+
+    def step(
+        numbers: list[Array], travellers: list[Array], rest: list[Array], known: Any, others: Any
+    ) -> Any:
         pieces = _merge(
             [_borrow(*pair) for pair in zip(known, travellers, strict=True)], others, travels
         )
@@ -101,16 +124,13 @@ def _scan(
             jtu.tree_unflatten(parameter_structure, pieces),
         )
         numbers, rest = _partition(jtu.tree_leaves(leaves), packed)
-        return pack([*numbers, *travellers]) if numbers else None, rest
+        return vectors(numbers, travellers), rest
 
-    def body(carry: tuple[Array | None, list[Array]]) -> tuple[Array | None, list[Array]]:
-        vector, rest = carry
-        entries = [] if vector is None else unpack(vector)
-        return operation(step, entries, rest, known, others, place="loop")
+    def body(carry: tuple[list[Array], list[Array]]) -> tuple[list[Array], list[Array]]:
+        return operation(step, *entries(carry[0]), carry[1], known, others, place="loop")
 
-    vector = pack([*numbers, *known]) if numbers else None
-    vector, rest = _loop(body, (vector, rest), num_steps)
-    numbers = [] if vector is None else unpack(vector)[: sum(packed)]
+    carried, rest = _loop(body, (vectors(numbers, known), rest), num_steps)
+    numbers, _ = entries(carried)
     return join(jtu.tree_unflatten(structure, _merge(numbers, rest, packed)))
 
 

@@ -38,11 +38,15 @@ unpack_p.multiple_results = True
 def _pack_impl(*entries, axis, sums=False):
     shape = (*entries[0].shape[:axis], len(entries), *entries[0].shape[axis:])
     rest = [n for n in range(len(shape)) if n != axis]
-    *first, whole = (lax.broadcast_in_dim(entry, shape, rest) for entry in entries)
-    place = lax.broadcasted_iota(np.int32, shape, axis)
-    for n, entry in enumerate(first):
-        whole = lax.select(place == n, entry, whole)
-    return whole
+    parts = [lax.broadcast_in_dim(entry, shape, rest) for entry in entries]
+    # By the bits of the place: XLA keeps each comparison of places as an array, outside of a loop,
+    # and a loop that reads too many is not one function.
+    place, bit = lax.broadcasted_iota(np.int32, shape, axis), 1
+    while len(parts) > 1:
+        is_odd = place & bit != 0
+        pairs = [lax.select(is_odd, b, a) for a, b in zip(parts[::2], parts[1::2], strict=False)]
+        parts, bit = pairs + parts[2 * len(pairs) :], 2 * bit
+    return parts[0]
 
 
 @unpack_p.def_impl

@@ -578,8 +578,9 @@ def test_errors_of_the_function_come_through():
         lambda y: jnp.kron(M[:2, :2], jnp.outer(y, y)[1:, 1:])[0] + jnp.tril(jnp.outer(y, y))[2, 0],
         lambda y: jnp.vstack([y, y * 2]).T.reshape(6)[::2] + jnp.prod(y) + jnp.max(y),
         lambda y: jnp.split(jnp.pad(y, 1), [2, 4])[1] * jnp.outer(y, y)[0, :2],
+        lambda y: y * lax.stop_gradient(y * y),
     ],
-    ids="cross matrix einsum concatenate at take kron vstack split".split(),
+    ids="cross matrix einsum concatenate at take kron vstack split stop".split(),
 )
 def test_no_small_array_is_built_inside(fun):
     """The reason for the file: however it is written, arithmetic is on numbers alone."""

@@ -5,6 +5,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
+import cfjax
 from cfjax._xla.held import held
 from cfjax._xla.pack import pack, unpack
 
@@ -15,7 +16,7 @@ def test_what_is_held_is_computed_once():
     def program(keep):
         def fun(x):
             entries = unpack(x)
-            for _ in range(4):
+            for _ in range(8):
                 a, b, c = entries
                 entries = [a * b + c, b * c - a, a + b * b]
             entries = keep(entries)
@@ -24,6 +25,23 @@ def test_what_is_held_is_computed_once():
         return jax.jit(fun).lower(jnp.ones(3)).compile().cost_analysis()["flops"]
 
     assert program(held) < program(list)
+
+
+def test_increments_of_a_step_are_computed_together(rewritten):
+    """The angular momentum moves the attitude too, and is computed once for both."""
+
+    def field(t, y, args):
+        rotation = cfjax.QuaternionRotation(y["m"] / args, frame="body", order="wxyz")
+        return {"q": rotation, "m": cfjax.Rotation(-y["m"] / args)}
+
+    def solve(y0, args):
+        term = cfjax.LieTerm(field)
+        return cfjax.integrate(term, cfjax.CF4(), 0.0, 1.0, y0, args, num_steps=2).ys
+
+    y0 = {"q": jnp.array([1.0, 0.0, 0.0, 0.0]), "m": jnp.ones(3)}
+    text = str(jax.make_jaxpr(solve)(y0, jnp.array([0.9, 0.6, 0.3])))
+    groups = [line.split("=")[0] for line in text.splitlines() if "= cfjax_held[" in line]
+    assert 7 in [len(group.split()) for group in groups]
 
 
 @pytest.mark.parametrize("in_batches", [False, True])

@@ -14,7 +14,7 @@ RNG = np.random.default_rng(0)
 @pytest.mark.representatives(10)
 @pytest.mark.parametrize("axis", [0, 1])
 @pytest.mark.parametrize("dtype", [np.float32, np.float64, np.complex128, np.int32, np.bool_])
-@pytest.mark.parametrize("count", [1, 4])
+@pytest.mark.parametrize("count", [1, 4, 11])
 def test_pack_is_stack_and_unpack_its_inverse(axis, dtype, count):
     entries = [jnp.asarray(RNG.normal(size=(2, 5)) * 3, dtype) for _ in range(count)]
     for run in (pack, jax.jit(pack, static_argnums=1)):
