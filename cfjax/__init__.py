@@ -17,7 +17,10 @@ from ._field import flow as flow
 from ._field import tangent as tangent
 from ._fields.affine import Affine as Affine
 from ._fields.check import check_field as check_field
+from ._fields.conjugation import Congruence as Congruence
+from ._fields.conjugation import Conjugation as Conjugation
 from ._fields.elementwise import elementwise as elementwise
+from ._fields.linear_affine import LinearAffine as LinearAffine
 from ._fields.low_rank import BorderedSkew as BorderedSkew
 from ._fields.low_rank import LowRankSkew as LowRankSkew
 from ._fields.matrix import LeftMatrix as LeftMatrix

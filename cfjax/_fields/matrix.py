@@ -5,27 +5,19 @@ from typing import Any, ClassVar
 
 import equinox as eqx
 import jax.numpy as jnp
-import numpy as np
 from jaxtyping import Array, Inexact
 
 from .._field import AbstractAlgebraElement
 from .._numerics.expm import expm_parts, one_norm
 from .._numerics.expm_times import expm_minus_one_times
-from .._numerics.matmul import matmul
+from .._numerics.matmul import matmul, promoted
 from .elementwise import check_point, each
 
 
 class AbstractMatrix(AbstractAlgebraElement):
     """An element of a matrix Lie algebra. A subclass is one of its actions on points."""
 
-    a: Inexact[Array, "*batch n n"] = eqx.field(converter=jnp.asarray)
-    # Which axis of a matrix it multiplies.
-    axis: ClassVar[int]
-
-    @staticmethod
-    @abc.abstractmethod
-    def act(a: Array, x: Array) -> Array:
-        """The product of a matrix with a point, from the side that this class acts from."""
+    a: Inexact[Array, "*#batch n n"] = eqx.field(converter=jnp.asarray)
 
     def __check_init__(self):
         if self.a.ndim < 2 or self.a.shape[-2] != self.a.shape[-1]:
@@ -34,6 +26,51 @@ class AbstractMatrix(AbstractAlgebraElement):
             raise TypeError(
                 f"a must be float32, float64, complex64 or complex128, got {self.a.dtype}."
             )
+
+    @property
+    def _num_axes(self) -> int:
+        return self.a.ndim - 2
+
+    def _check_other(self, other: Any) -> None:
+        if not isinstance(other, type(self)):
+            name = type(self).__name__
+            raise TypeError(
+                f"{name} has a bracket with another {name} only, got {type(other).__name__}."
+            )
+
+
+def check_companion(
+    name: str, array: Array, a: Inexact[Array, "*batch n n"], core: tuple[int, ...]
+) -> None:
+    """Raises `ValueError` or `TypeError` unless an array fits a matrix that it comes with."""
+    num_axes = a.ndim - 2
+    leading = array.shape[: array.ndim - len(core)]
+    agrees = array.shape[array.ndim - len(core) :] == core and len(leading) == num_axes
+    if not agrees or any(
+        m != n and 1 not in (m, n) for m, n in zip(leading, a.shape, strict=False)
+    ):
+        expected = ", ".join(map(str, (*a.shape[:num_axes], *core)))
+        raise ValueError(
+            f"{name} must have shape ({expected}{',' if a.ndim + len(core) == 3 else ''}) with a "
+            f"of shape {a.shape}, up to leading axes of 1, got {array.shape}."
+        )
+    precision = jnp.finfo(a.dtype).dtype
+    if not jnp.issubdtype(array.dtype, jnp.inexact) or jnp.finfo(array.dtype).dtype != precision:
+        raise TypeError(
+            f"{name} must be real or complex of the precision of a, {precision}, got {array.dtype}."
+        )
+
+
+class AbstractOneSided(AbstractMatrix):
+    """One that multiplies points from one side."""
+
+    # Which axis of a matrix it multiplies.
+    axis: ClassVar[int]
+
+    @staticmethod
+    @abc.abstractmethod
+    def act(a: Array, x: Array) -> Array:
+        """The product of a matrix with a point, from the side that this class acts from."""
 
     def flow(self, point: Inexact[Array, "..."]) -> Inexact[Array, "..."]:
         self._check_point(point)
@@ -47,19 +84,11 @@ class AbstractMatrix(AbstractAlgebraElement):
         self._check_point(point)
         return each(self.act, self._num_axes)(self.a, point)
 
-    def bracket(self, other: Any) -> "AbstractMatrix":
-        if not isinstance(other, type(self)):
-            name = type(self).__name__
-            raise TypeError(
-                f"{name} has a bracket with another {name} only, got {type(other).__name__}."
-            )
+    def bracket(self, other: Any) -> "AbstractOneSided":
+        self._check_other(other)
         # Flows from the right compose the other way round, and so do these products.
         act = each(self.act, self._num_axes)
         return type(self)(act(self.a, other.a) - act(other.a, self.a))
-
-    @property
-    def _num_axes(self) -> int:
-        return self.a.ndim - 2
 
     def _check_point(self, point: Array) -> None:
         n = self.a.shape[-1]
@@ -92,7 +121,7 @@ class AbstractMatrix(AbstractAlgebraElement):
         return weight, weight * cls.act(a, point) + cls.act(rest, point)
 
 
-class LeftMatrix(AbstractMatrix):
+class LeftMatrix(AbstractOneSided):
     """The linear field `x' = a x`, whose flow is `x -> exp(a) x`.
 
     It acts on a vector, shape `(n,)`, or a matrix, shape `(n, k)`. Any matrix Lie algebra, real
@@ -117,10 +146,10 @@ class LeftMatrix(AbstractMatrix):
 
     @staticmethod
     def act(a: Inexact[Array, "n n"], x: Inexact[Array, "n *k"]) -> Inexact[Array, "n *k"]:
-        return _product(a, x)
+        return matmul(*promoted(a, x))
 
 
-class RightMatrix(AbstractMatrix):
+class RightMatrix(AbstractOneSided):
     """The linear field `x' = x a`, whose flow is `x -> x exp(a)`.
 
     It acts on a row, shape `(*batch, n)`, or a matrix, shape `(*batch, k, n)`. For an attitude
@@ -131,17 +160,9 @@ class RightMatrix(AbstractMatrix):
 
     @staticmethod
     def act(a: Inexact[Array, "n n"], x: Inexact[Array, "*k n"]) -> Inexact[Array, "*k n"]:
-        return _product(x, a)
+        return matmul(*promoted(x, a))
 
 
 def _is_thin(a: Array, point: Array) -> bool:
     """Whether some 15 products with the point are cheaper than 5 of size n, as measured."""
     return (16 if jnp.iscomplexobj(point) else 8) * point.size <= a.size
-
-
-def _product(a: Array, b: Array) -> Array:
-    # A real matrix may meet a complex one of its own precision.
-    if jnp.finfo(a.dtype).dtype == jnp.finfo(b.dtype).dtype:
-        dtype = np.promote_types(a.dtype, b.dtype)
-        a, b = a.astype(dtype), b.astype(dtype)
-    return matmul(a, b)

@@ -1,19 +1,22 @@
 """The exponential of a small dense matrix, as a Taylor polynomial with scaling and squaring."""
 
-from collections.abc import Sequence
-from typing import NamedTuple
+from collections.abc import Callable, Sequence
+from typing import Any, NamedTuple, TypeVar
 
 import jax
 import jax.numpy as jnp
+import jax.tree_util as jtu
 import numpy as np
 from jax import lax
 from jax.custom_batching import custom_vmap
-from jaxtyping import Array, Inexact
+from jaxtyping import Array, Inexact, PyTree
 
 from .matmul import matmul
 
+T = TypeVar("T", bound=PyTree)
 
-class _Scheme(NamedTuple):
+
+class Scheme(NamedTuple):
     """A Taylor polynomial and the largest scaled norm it may be used for.
 
     `rows` are weights over the growing list A, .., Aᵐ, Y₀, Y₁ of what is known when a row is read:
@@ -31,7 +34,7 @@ class _Scheme(NamedTuple):
 # out within 1e-17: an error of 1/2! is one of exp(a)ᵀ exp(a), the same in every step. theta is
 # where the backward error of the rest of the series reaches half a unit in the last place.
 # tests/numerics/test_expm.py derives both again.
-_DEGREE_15 = _Scheme(
+_DEGREE_15 = Scheme(
     powers=2,
     theta=2.346,
     rows=(
@@ -44,7 +47,7 @@ _DEGREE_15 = _Scheme(
         (0.0, 0.34846658633645744, 63.3171245588337, 10.408017352313543),
     ),
 )
-_DEGREE_21 = _Scheme(
+_DEGREE_21 = Scheme(
     powers=3,
     theta=1.687,
     rows=(
@@ -60,7 +63,7 @@ _DEGREE_21 = _Scheme(
 # A unit in the last place of double precision allows a smaller norm, and saves a product there.
 _DEGREE_15_DOUBLE = _DEGREE_15._replace(theta=0.6764)
 # From the cheapest to the one that may be scaled and squared.
-_SCHEMES = {
+TAYLOR_SCHEMES = {
     "float32": (_DEGREE_15,),
     "complex64": (_DEGREE_15,),
     "float64": (_DEGREE_15_DOUBLE, _DEGREE_21),
@@ -71,7 +74,8 @@ _SCHEMES = {
 _WRITTEN_OUT = 4
 
 
-def _product(x: Array, y: Array) -> Array:
+def small_product(x: Array, y: Array) -> Array:
+    """`x @ y` for square matrices of one dtype that may be small."""
     # XLA:CPU writes a real dot up to n = 3 into the code around it. The next ones are calls, two
     # to four times slower than a sum, which fuses.
     if x.shape[0] == 4 or (x.shape[0] < 4 and jnp.iscomplexobj(x)):
@@ -79,22 +83,29 @@ def _product(x: Array, y: Array) -> Array:
     return matmul(x, y)
 
 
-def _combine(weights: Sequence[float], matrices: Sequence[Array]) -> Array:
-    terms = [w * m for w, m in zip(weights, matrices, strict=True) if w != 0]
-    return sum(terms[1:], start=terms[0])
+def weighted_sum(weights: Sequence[float], terms: Sequence[T]) -> T:
+    used = [(w, term) for w, term in zip(weights, terms, strict=True) if w != 0]
+    return _plus(*(jtu.tree_map(lambda x: w * x, term) for w, term in used))  # noqa: B023
 
 
-def _taylor_from_second(scheme: _Scheme, a: Array, a2: Array) -> Array:
-    """`exp(a) - I - a`."""
+def _plus(*terms: T) -> T:
+    return jtu.tree_map(lambda *xs: sum(xs[1:], start=xs[0]), *terms)
+
+
+def taylor_from_second(
+    scheme: Scheme, a: T, a2: T, product: Callable[[T, T], T] = small_product
+) -> T:
+    """`exp(a) - I - a`, for a matrix or what else has a product."""
     known = [a, a2]
     if scheme.powers == 3:
-        known.append(_product(a2, a))
+        known.append(product(a2, a))
 
     row = scheme.rows
-    known.append(_product(known[-1], _combine(row[0], known)))
-    y1 = _product(_combine(row[1], known), _combine(row[2], known)) + _combine(row[3], known)
-    known.append(y1)
-    return _product(_combine(row[4], known), _combine(row[5], known)) + _combine(row[6], known)
+    known.append(product(known[-1], weighted_sum(row[0], known)))
+    y1 = product(weighted_sum(row[1], known), weighted_sum(row[2], known))
+    known.append(_plus(y1, weighted_sum(row[3], known)))
+    y2 = product(weighted_sum(row[4], known), weighted_sum(row[5], known))
+    return _plus(y2, weighted_sum(row[6], known))
 
 
 def one_norm(a: Array) -> Array:
@@ -103,9 +114,9 @@ def one_norm(a: Array) -> Array:
     return jnp.max(jnp.sum(magnitude, axis=0))
 
 
-def _scaling(scheme: _Scheme, size: Array) -> tuple[Array, Array]:
+def _scaling(theta: float, size: Array) -> tuple[Array, Array]:
     """The number of squarings s for ‖a²‖ = `size`, and 2⁻ˢ (NaN where no s will do)."""
-    square = size / scheme.theta**2
+    square = size / theta**2
     info = jnp.finfo(square.dtype)
     # The exponent field is exact where a rounded log2 is not, and puts inf and NaN on top.
     integer = jnp.dtype(f"int{info.bits}")
@@ -131,25 +142,26 @@ def _(axis_size: int, in_batched: list[bool], s: Array) -> tuple[Array, bool]:
     return max_over_batch(jnp.max(s)), False
 
 
-def _square(x: Array, s: Array) -> Array:
-    """x squared s times. A loop of branches, since a loop of unknown length has no reverse mode."""
+def repeat(step: Callable[[T], T], x: T, s: Array) -> T:
+    """`step` s times. A loop of branches, since one of unknown length has no reverse mode."""
     most = max_over_batch(s)
 
     # Without checkpoints the branch not taken must still hand out room for what the other saves.
     @jax.checkpoint
-    def once(x: Array, k: int | Array) -> Array:
-        return jnp.where(k < s, _product(x, x), x)
+    def once(x: T, k: int | Array) -> T:
+        return jtu.tree_map(lambda new, old: jnp.where(k < s, new, old), step(x), x)
 
-    def step(x: Array, k: int | Array) -> tuple[Array, None]:
+    def step_if(x: T, k: int | Array) -> tuple[T, None]:
         return lax.cond(k < most, once, lambda x, k: x, x, k), None
 
     @jax.checkpoint
-    def many(x: Array) -> Array:
-        ks = jnp.arange(_WRITTEN_OUT, jnp.finfo(x.dtype).nmant, dtype=s.dtype)
-        return lax.scan(step, x, ks)[0]
+    def many(x: T) -> T:
+        digits = jnp.finfo(jtu.tree_leaves(x)[0].dtype).nmant
+        ks = jnp.arange(_WRITTEN_OUT, digits, dtype=s.dtype)
+        return lax.scan(step_if, x, ks)[0]
 
     for k in range(_WRITTEN_OUT):
-        x, _ = step(x, k)
+        x, _ = step_if(x, k)
     return lax.cond(most > _WRITTEN_OUT, many, lambda x: x, x)
 
 
@@ -194,41 +206,80 @@ def expm_parts(
     """
     if a.ndim != 2 or a.shape[0] != a.shape[1]:
         raise ValueError(f"expm: `a` must be a square matrix, shape (n, n), got shape {a.shape}.")
-    if a.dtype.name not in _SCHEMES:
-        raise TypeError(f"expm: `a` must have dtype {', '.join(_SCHEMES)}, got {a.dtype.name}.")
-    n = a.shape[0]
-    if n <= 1:
+    if a.dtype.name not in TAYLOR_SCHEMES:
+        raise TypeError(
+            f"expm: `a` must have dtype {', '.join(TAYLOR_SCHEMES)}, got {a.dtype.name}."
+        )
+    if a.shape[0] <= 1:
         return jnp.zeros((), a.dtype), jnp.where(jnp.isfinite(a), jnp.exp(a), jnp.nan)
-    if 4 < n < 8 and not jnp.iscomplexobj(a):
-        # A full vector register: two to three times faster in a batch than the product of size n.
-        weight, rest = _expm_parts(jnp.pad(a, (0, 8 - n)))
-        return weight, rest[:n, :n]
-    return _expm_parts(a)
 
+    schemes = TAYLOR_SCHEMES[a.dtype.name]
 
-def _expm_parts(a: Array) -> tuple[Array, Array]:
-    *cheaper, scheme = _SCHEMES[a.dtype.name]
-    a2 = _product(a, a)
-    # ‖a²‖ bounds every even power, and an odd one up to a factor ‖a‖, which is what a backward
-    # error relative to ‖a‖ asks. It is at most ‖a‖² and often far below: fewer squarings.
-    size = one_norm(lax.stop_gradient(a2))
-
-    def scaled(a: Array, a2: Array) -> tuple[Array, Array]:
-        # The power of two is locally constant, so its derivative is zero.
-        s, scale = _scaling(scheme, size)
-        scale = scale.astype(a.dtype)
-        small = a * scale
-        rest = _taylor_from_second(scheme, small, a2 * (scale * scale))
-        squared = _square(rest + small + jnp.eye(a.shape[0], dtype=a.dtype), s)
+    def parts(k: int, a: Array, a2: Array, s: Array | None) -> tuple[Array, Array]:
+        rest = taylor_from_second(schemes[k], a, a2)
+        if s is None:
+            return jnp.ones((), a.dtype), rest
+        squared = repeat(lambda x: small_product(x, x), plus_identity(rest + a), s)
         return (s == 0).astype(a.dtype), jnp.where(s == 0, rest, squared)
 
-    # Up to size 4 products fuse with what is around them, and a branch costs more than one saves.
-    if not cheaper or a.shape[0] <= 4:
-        return scaled(a, a2)
+    n = a.shape[0]
+    a = in_full_register(a)
+    thetas = [scheme.theta for scheme in schemes]
+    weight, rest = by_norm(thetas, a, small_product(a, a), parts)
+    return weight, rest[:n, :n]
 
-    def unscaled(a: Array, a2: Array) -> tuple[Array, Array]:
-        return jnp.ones((), a.dtype), _taylor_from_second(cheaper[0], a, a2)
+
+def plus_identity(a: Array) -> Array:
+    return a + jnp.eye(a.shape[0], dtype=a.dtype)
+
+
+def in_full_register(a: Array) -> Array:
+    """With zeros up to the size of a vector register, for real matrices a little smaller.
+
+    Two to three times faster in a batch than the product of size n.
+    """
+    n = a.shape[0]
+    return jnp.pad(a, (0, 8 - n)) if 4 < n < 8 and not jnp.iscomplexobj(a) else a
+
+
+def by_norm(
+    thetas: Sequence[float],
+    first: PyTree,
+    second: PyTree,
+    approximate: Callable[[int, PyTree, PyTree, Any], T],
+) -> T:
+    """`approximate(k, first / 2^s, second / 4^s, s)` with what suits the norm of a.
+
+    **Arguments:**
+
+    - `thetas`: for each k the largest norm it may be used for. With the last one s is the number
+      of squarings that are left to do, with one before it None.
+    - `first`, `second`: a and a^2, or pytrees whose first leaf they are.
+    """
+    *cheaper, theta = thetas
+    # ‖a²‖ bounds every even power, and an odd one up to a factor ‖a‖, which is what a backward
+    # error relative to ‖a‖ asks. It is at most ‖a‖² and often far below: fewer squarings.
+    a2 = jtu.tree_leaves(second)[0]
+    size = one_norm(lax.stop_gradient(a2))
+
+    def scaled(first: PyTree, second: PyTree) -> T:
+        # The power of two is locally constant, so its derivative is zero.
+        s, scale = _scaling(theta, size)
+        small, small2 = (
+            jtu.tree_map(lambda x: x * factor.astype(x.dtype), blocks)  # noqa: B023
+            for blocks, factor in [(first, scale), (second, scale * scale)]
+        )
+        return approximate(len(cheaper), small, small2, s)
+
+    # Up to size 4 products fuse with what is around them, and a branch costs more than one saves.
+    if not cheaper or a2.shape[0] <= 4:
+        return scaled(first, second)
 
     # A size of NaN is scaled, and stays NaN.
-    is_small = max_over_batch(size) <= cheaper[0].theta ** 2
-    return lax.cond(is_small, unscaled, jax.checkpoint(scaled), a, a2)
+    return lax.cond(
+        max_over_batch(size) <= cheaper[0] ** 2,
+        lambda first, second: approximate(0, first, second, None),
+        jax.checkpoint(scaled),
+        first,
+        second,
+    )

@@ -11,7 +11,7 @@ import numpy as np
 import pytest
 import scipy.linalg
 
-from cfjax._numerics.expm import _DEGREE_15, _DEGREE_15_DOUBLE, _DEGREE_21, _SCHEMES, expm
+from cfjax._numerics.expm import _DEGREE_15, _DEGREE_15_DOUBLE, _DEGREE_21, TAYLOR_SCHEMES, expm
 
 # One compilation for each size and dtype keeps this file fast.
 compiled = jax.jit(expm)
@@ -264,7 +264,7 @@ def test_overflow_and_too_large_are_never_a_plausible_number(dtype):
     assert not np.isfinite(np.diag(compiled(jnp.asarray(2000, dtype) * eye))).any()
     rotation = jnp.asarray([[0, 1], [-1, 0]], dtype)
     digits = 2.0 ** np.finfo(dtype).nmant
-    theta = _SCHEMES[np.dtype(dtype).name][-1].theta
+    theta = TAYLOR_SCHEMES[np.dtype(dtype).name][-1].theta
     assert np.isfinite(compiled(jnp.asarray(0.99 * theta * digits, dtype) * rotation)).all()
     assert np.isnan(compiled(jnp.asarray(1.01 * theta * digits, dtype) * rotation)).all()
     largest = jnp.asarray(np.finfo(dtype).max / 8, dtype)

@@ -1,0 +1,66 @@
+"""The exponentials of a small dense matrix and of its negative, at the cost of one and a half."""
+
+import math
+
+import jax.numpy as jnp
+from jaxtyping import Array, Inexact
+
+from .expm import by_norm, in_full_register, plus_identity, repeat, small_product, weighted_sum
+
+# `Z^4 + 120 Z^3`, which both polynomials contain, as Z² times these weights of Z and Z².
+_SHARED = (120.0, 1.0)
+
+
+# Polynomials for `cosh(a) - I` and for `sinh(a)/a - I` in Z = a², (row 0)·(row 1) + (row 2), with
+# weights over Z, Z² and what is shared. For k = 1..7 they solve "the sum has the coefficient
+# 1/(2k)!" and "1/(2k + 1)!", without rounding up to the divisions. All are positive, so nothing
+# cancels. The 120 above makes the coefficient of Z⁸ 1/16! in the one, and 1.13/17! in the other.
+_EVEN = (
+    (122880.0, 8000.0, 1.0),
+    tuple(w / math.factorial(16) for w in (2129280, 21280, 1)),
+    (1 / 2, 662041 / 22702680, 12253 / 3269185920),
+)
+_ODD = (
+    (263808.0, 0.0, 1.0),
+    tuple(w / (240 * math.factorial(15)) for w in (3278592, 36000, 1)),
+    (1 / 6, 5275939 / 945945000, 509 / 363242880),
+)
+# Where the backward error reaches half a unit in the last place. tests/numerics/test_expm_both.py
+# derives the weights and these.
+_THETA = {"float32": 2.645, "float64": 0.862}
+
+
+def expm_both_parts(
+    a: Inexact[Array, "n n"],
+) -> tuple[Inexact[Array, ""], Inexact[Array, "n n"], Inexact[Array, "n n"]]:
+    """`w, p, m` with `exp(a) = w (I + a) + p` and `exp(-a) = w (I - a) + m`.
+
+    The weight w is 1 if no squaring is needed, else 0, as in `expm_parts`.
+
+    **Cost:** 6 matrix products and 2 s more, with s = ⌈log₂(‖a²‖^½ / θ)⌉ ≥ 0 in the 1-norm and
+    θ = 0.862 (2.645 in single precision). All else as for `expm`.
+
+    The even and the odd part of exp are polynomials in a², evaluated in the form of Sastre, Linear
+    Algebra Appl. 539 (2018), doi:10.1016/j.laa.2017.11.010.
+    """
+
+    def parts(k: int, a: Array, z: Array, s: Array) -> tuple[Array, Array, Array]:
+        z2 = small_product(z, z)
+        known = [z, z2, small_product(z2, weighted_sum(_SHARED, [z, z2]))]
+        even, odd = _evaluated(_EVEN, known), small_product(a, _evaluated(_ODD, known))
+        both = even + odd, even - odd
+        squared = tuple(plus_identity(rest + x) for rest, x in zip(both, (a, -a), strict=True))
+        squared = repeat(lambda x: tuple(small_product(y, y) for y in x), squared, s)
+        p, m = (jnp.where(s == 0, *pair) for pair in zip(both, squared, strict=True))
+        return (s == 0).astype(a.dtype), p, m
+
+    n = a.shape[0]
+    a = in_full_register(a)
+    theta = _THETA[jnp.finfo(a.dtype).dtype.name]
+    weight, p, m = by_norm([theta], a, small_product(a, a), parts)
+    return weight, p[:n, :n], m[:n, :n]
+
+
+def _evaluated(rows: tuple[tuple[float, ...], ...], known: list[Array]) -> Array:
+    left, right, rest = (weighted_sum(row, known) for row in rows)
+    return small_product(left, right) + rest
