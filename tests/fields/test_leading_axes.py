@@ -61,6 +61,18 @@ FIELDS = {
         lambda t, x: cfjax.LeftMatrix(0.1 * jnp.outer(x, jnp.cos(x + t))),
         normal(2, 12),
     ),
+    "Conjugation": (
+        lambda t, x: of_matrices(cfjax.Conjugation, x, t),
+        normal(4, 3, 3),
+    ),
+    "Congruence": (
+        lambda t, x: cfjax.Congruence(0.3 * jnp.cos(A3 @ x + t), jnp.sin(x)),
+        normal(4, 3, 3),
+    ),
+    "LinearAffine": (
+        lambda t, x: cfjax.LinearAffine(0.3 * jnp.outer(x, jnp.cos(x + t)), jnp.sin(x)),
+        normal(4, 3),
+    ),
     "LowRankSkew": (lambda t, x: cfjax.LowRankSkew(jnp.cos(t) * A6 @ x), FRAMES),
     "BorderedSkew": (lambda t, x: cfjax.BorderedSkew(jnp.cos(t) * A6 @ x), FRAMES),
     "SphereRotation": (
