@@ -237,8 +237,8 @@ DEFECTS = [
     ),
     Defect(
         "_fields/matrix.py",
-        "return _product(x, a)",
-        "return _product(a, x)",
+        "return matmul(*promoted(x, a))",
+        "return matmul(*promoted(a, x))",
         "a matrix on the wrong side",
         "fields/test_matrix.py -k flow",
     ),
