@@ -281,6 +281,18 @@ CASES = {
         SIZES,
     ),
 }
+# One of each kind; the others compile for minutes.
+QUICK = {
+    "Rotation",
+    "QuaternionRotation, body",
+    "RigidMotion of a quaternion and a position",
+    "LeftMatrix, eigenvalues that meet",
+    "Conjugation, skew-Hermitian",
+    "LinearAffine",
+}
+SOME_SLOW = [
+    name if name in QUICK else pytest.param(name, marks=pytest.mark.slow) for name in CASES
+]
 WITH_AXES = [name for name in CASES if name != "Affine"]
 
 
@@ -350,7 +362,7 @@ def element(tree, k):
     return jtu.tree_map(lambda x: x[k], tree)
 
 
-@pytest.mark.parametrize("name", CASES)
+@pytest.mark.parametrize("name", SOME_SLOW)
 def test_flow_and_derivatives(name):
     case = CASES[name]
     coordinates, points, direction = scaled(case, np.float64)
