@@ -26,6 +26,7 @@ SOLVERS = {
     "Richardson": lambda: cfjax.Richardson(cfjax.CF2()),
 }
 ON_SPHERE = np.array([0.6, 0.0, 0.8])
+SQUARE = np.array([[0.4, -0.2], [0.1, 0.3]])
 FRAME = np.linalg.qr(np.array([[1.0, 0.2], [0.5, 1.0], [0.3, -0.4]]))[0]
 
 
@@ -55,6 +56,12 @@ FIELDS = {
     ),
     "LeftMatrix": (lambda t, y, args: cfjax.LeftMatrix(jnp.outer(args, y)), ON_SPHERE),
     "RightMatrix": (lambda t, y, args: cfjax.RightMatrix(jnp.outer(y, args)), ON_SPHERE),
+    "Conjugation": (lambda t, y, args: cfjax.Conjugation(args[:2, None] * y + t), SQUARE),
+    "Congruence": (lambda t, y, args: cfjax.Congruence(args[:2, None] * y, jnp.sin(y + t)), SQUARE),
+    "LinearAffine": (
+        lambda t, y, args: cfjax.LinearAffine(jnp.outer(args, jnp.sin(y)), y + t),
+        ON_SPHERE,
+    ),
     "LowRankSkew": (unit, FRAME),
     "SphereRotation": (lambda t, y, args: cfjax.SphereRotation(args * y + t), ON_SPHERE),
     "BorderedSkew": (
