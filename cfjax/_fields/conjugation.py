@@ -81,8 +81,10 @@ class Conjugation(AbstractTwoSided):
     """
 
     def move(self, x: Inexact[Array, "n n"]) -> tuple[Inexact[Array, ""], Inexact[Array, "n n"]]:
-        weight, plus, minus = expm_both_parts(self.a)
-        return _from_both_sides(weight, (self.a, plus), x, (-self.a, minus))
+        # A multiple of the identity has no effect, and the norm is smaller without.
+        a = _minus_identity(self.a, jnp.trace(self.a) / self.a.shape[0])
+        weight, plus, minus = expm_both_parts(a)
+        return _from_both_sides(weight, (a, plus), x, (-a, minus))
 
     def velocity(self, x: Inexact[Array, "n n"]) -> Inexact[Array, "n n"]:
         return _commutator(self.a, x)
@@ -128,15 +130,19 @@ class Congruence(AbstractTwoSided):
             check_companion("q", self.q, self.a, self.a.shape[-2:])
 
     def move(self, x: Inexact[Array, "n n"]) -> tuple[Inexact[Array, ""], Inexact[Array, "n n"]]:
+        a = self.a
+        if jnp.iscomplexobj(a):
+            # An imaginary multiple of the identity has no effect, and the norm is smaller without.
+            a = _minus_identity(a, 1j * jnp.trace(a).imag / a.shape[0])
         is_hermitian = jnp.all(x == _adjoint(x))
         source = jnp.zeros((), x.dtype)
         if self.q is None:
-            weight, rest = expm_parts(self.a)
+            weight, rest = expm_parts(a)
         else:
             is_hermitian &= jnp.all(self.q == _adjoint(self.q))
-            weight, rest, source = expm_parts_with_source(*promoted(self.a, self.q))
-        adjoint = _adjoint(self.a), _adjoint(rest)
-        weight, moved = _from_both_sides(weight, (self.a, rest), x, adjoint)
+            weight, rest, source = expm_parts_with_source(*promoted(a, self.q))
+        adjoint = _adjoint(a), _adjoint(rest)
+        weight, moved = _from_both_sides(weight, (a, rest), x, adjoint)
         moved = jnp.add(*promoted(moved, source))
         return weight, _without_skew_part(moved, is_hermitian)
 
@@ -192,6 +198,10 @@ def _with_sources(fields: Sequence[Any]) -> Sequence[Any]:
         eqx.tree_at(lambda f: f.q, f, q, is_leaf=is_none)
         for f, q in zip(fields, given, strict=True)
     ]
+
+
+def _minus_identity(a: Array, number: Array) -> Array:
+    return a - number * jnp.eye(a.shape[0], dtype=a.dtype)
 
 
 def _linear_part(a: Array, x: Array) -> Array:

@@ -10,6 +10,7 @@ import mpmath
 import numpy as np
 import pytest
 import scipy.linalg
+from matrices import backward_error, coefficients
 
 from cfjax._numerics.expm import _DEGREE_15, _DEGREE_15_DOUBLE, _DEGREE_21, TAYLOR_SCHEMES, expm
 
@@ -63,36 +64,6 @@ def error(got, exact):
     return np.linalg.norm(np.asarray(got) - exact, 2) / np.linalg.norm(exact, 2)
 
 
-def coefficients(scheme):
-    """The scheme's polynomial, expanded without rounding."""
-
-    def plus(p, q):
-        length = max(len(p), len(q))
-        p, q = ([*r, *[Fraction(0)] * (length - len(r))] for r in (p, q))
-        return [x + y for x, y in zip(p, q, strict=True)]
-
-    def times(p, q):
-        out = [Fraction(0)] * (len(p) + len(q) - 1)
-        for i, x in enumerate(p):
-            for j, y in enumerate(q):
-                out[i + j] += x * y
-        return out
-
-    def combine(weights, known):
-        total = [Fraction(0)]
-        for w, p in zip(weights, known, strict=True):
-            total = plus(total, [Fraction(w) * x for x in p])
-        return total
-
-    rows = scheme.rows
-    known = [[Fraction(int(i == k)) for i in range(k + 1)] for k in range(1, scheme.powers + 1)]
-    known.append(times(known[-1], combine(rows[0], known)))
-    y1 = times(combine(rows[1], known), combine(rows[2], known))
-    known.append(plus(y1, combine(rows[3], known)))
-    rest = plus(times(combine(rows[4], known), combine(rows[5], known)), combine(rows[6], known))
-    return plus(rest, [Fraction(1), Fraction(1)])
-
-
 @SCHEMES
 def test_polynomial_is_the_taylor_polynomial(scheme, degree, unit):
     del unit
@@ -117,19 +88,7 @@ def test_the_first_coefficients_have_no_bias(scheme):
 
 @SCHEMES
 def test_theta_is_where_the_backward_error_reaches_the_unit_roundoff(scheme, degree, unit):
-    length = 60  # At theta the terms beyond are below 1e-20 of the first.
-    p = coefficients(scheme)
-    p = [Fraction(1, math.factorial(k)) for k in range(degree + 1)] + p[degree + 1 :]
-    p += [Fraction(0)] * (length - len(p))
-    exp = [Fraction((-1) ** k, math.factorial(k)) for k in range(length)]
-    q = [sum(p[i] * exp[k - i] for i in range(k + 1)) for k in range(length)]
-    log = [0.0] * length  # exp(x + Σ log_k xᵏ) is the polynomial.
-    exact = [Fraction(0)] * length
-    for k in range(1, length):
-        inner = sum((i * exact[i] * q[k - i] for i in range(degree, k)), Fraction(0))
-        exact[k] = q[k] - inner / k
-        log[k] = abs(float(exact[k]))
-    assert not any(log[: degree + 1])
+    log = backward_error(coefficients(scheme), degree)
 
     def backward(x):
         return sum(c * x ** (k - 1) for k, c in enumerate(log) if k > degree)
