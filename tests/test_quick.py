@@ -27,6 +27,7 @@ SOLVERS = {
 }
 ON_SPHERE = np.array([0.6, 0.0, 0.8])
 FRAME = np.linalg.qr(np.array([[1.0, 0.2], [0.5, 1.0], [0.3, -0.4]]))[0]
+SYMMETRIC = np.array([[1.0, 0.4], [0.4, -0.5]])
 
 
 def unit(t, y, args):
@@ -41,6 +42,18 @@ FIELDS = {
     "Rotation": (unit, ON_SPHERE),
     "LeftMatrix": (lambda t, y, args: cfjax.LeftMatrix(jnp.outer(args, y)), ON_SPHERE),
     "RightMatrix": (lambda t, y, args: cfjax.RightMatrix(jnp.outer(y, args)), ON_SPHERE),
+    "Conjugation": (
+        lambda t, y, args: cfjax.Conjugation(args[:2, None] * y - t * y.T),
+        SYMMETRIC,
+    ),
+    "Congruence": (
+        lambda t, y, args: cfjax.Congruence(args[0] * y, jnp.outer(args[1:], args[:2]) + t),
+        SYMMETRIC,
+    ),
+    "LinearAffine": (
+        lambda t, y, args: cfjax.LinearAffine(jnp.outer(args, y), jnp.cos(t) * args),
+        ON_SPHERE,
+    ),
     "LowRankSkew": (unit, FRAME),
     "BorderedSkew": (
         lambda t, y, args: cfjax.BorderedSkew(

@@ -133,7 +133,8 @@ class Congruence(AbstractTwoSided):
         a = self.a
         if jnp.iscomplexobj(a):
             # An imaginary multiple of the identity has no effect, and the norm is smaller without.
-            a = _minus_identity(a, 1j * jnp.trace(a).imag / a.shape[0])
+            trace = jnp.trace(a)
+            a = _minus_identity(a, (trace - trace.conj()) / (2 * a.shape[0]))
         is_hermitian = jnp.all(x == _adjoint(x))
         source = jnp.zeros((), x.dtype)
         if self.q is None:

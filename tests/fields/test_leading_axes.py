@@ -61,6 +61,14 @@ FIELDS = {
         lambda t, x: cfjax.LeftMatrix(0.1 * jnp.outer(x, jnp.cos(x + t))),
         normal(2, 12),
     ),
+    "Congruence": (
+        lambda t, x: cfjax.Congruence(0.3 * jnp.cos(t) * jnp.sin(A3 @ x), jnp.sin(x)),
+        normal(4, 3, 3),
+    ),
+    "LinearAffine": (
+        lambda t, x: cfjax.LinearAffine(0.3 * jnp.outer(jnp.sin(x), jnp.cos(x + t)), x),
+        normal(5, 3),
+    ),
     "LowRankSkew": (lambda t, x: cfjax.LowRankSkew(jnp.cos(t) * A6 @ x), FRAMES),
     "BorderedSkew": (lambda t, x: cfjax.BorderedSkew(jnp.cos(t) * A6 @ x), FRAMES),
     "elementwise": (lambda t, x: Written(jnp.sin(A3 @ x + t)), normal(5, 3)),
