@@ -54,7 +54,7 @@ def exact_expm(a):
 
 def to_numpy(m):
     out = np.array(m.tolist(), dtype=complex).reshape(m.rows, m.cols)
-    return out if np.any(np.imag(out)) else np.real(out)
+    return out if np.iscomplex(out).any() else np.real(out)
 
 
 def coefficients(scheme):

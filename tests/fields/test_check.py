@@ -31,6 +31,15 @@ BUILT_IN: dict[str, tuple[Any, Any]] = {
     "Rotation, float32": (lambda: cfjax.Rotation(random(F32, 3)), random(F32, 3)),
     "LeftMatrix": (lambda: cfjax.LeftMatrix(random(C64, 2, 2)), random(C64, 2, 3)),
     "RightMatrix": (lambda: cfjax.RightMatrix(random(F64, 2, 2)), random(F64, 2)),
+    "Conjugation": (lambda: cfjax.Conjugation(random(F32, 2, 2)), random(C64, 2, 2)),
+    "Congruence": (
+        lambda: cfjax.Congruence(random(C64, 2, 2), random(C64, 2, 2)),
+        random(C64, 2, 2),
+    ),
+    "LinearAffine": (
+        lambda: cfjax.LinearAffine(random(F32, 4, 4), random(F32, 4)),
+        random(F32, 4),
+    ),
     "Affine": (
         lambda: cfjax.Affine(random(F32), random(F32, 4), SPECTRUM.astype(F32)),
         random(F32, 4),

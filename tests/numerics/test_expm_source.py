@@ -61,9 +61,9 @@ def test_accuracy(n, dtype):
     for case, a1, q1, e, g in zip(CASES, a, q, *found, strict=True):
         kind, norm = case
         growth = 1.0 if kind in ("skew", "negative") else np.exp(2 * norm)
-        # As for expm: 4 n units of rounding, doubled by each squaring, and what is not normal may
+        # As for expm: n units of rounding, doubled by each squaring, and what is not normal may
         # lose its growth. Of one number exp(-theta) cancels.
-        bound = 8 * (n + 3) * np.finfo(dtype).eps * max(1.0, norm) * growth
+        bound = 2 * (n + 3) * np.finfo(dtype).eps * max(1.0, norm) * growth
         a1, q1 = a1.astype(wide), q1.astype(wide)
         assert g.dtype == dtype
         np.testing.assert_allclose(e, scipy.linalg.expm(a1), rtol=0, atol=bound, err_msg=str(case))
