@@ -12,6 +12,8 @@ import jax.tree_util as jtu
 import numpy as np
 from jaxtyping import Array, Inexact, PyTree, Real
 
+from ._xla import once_in_rows
+
 Weight = float | Real[Array, ""]
 
 
@@ -157,11 +159,11 @@ def flow(field: PyTree, point: PyTree) -> PyTree:
         if isinstance(p, Incremented) and is_field(f):
             moved = f.increment(p.value)
             if moved is not None:
-                return Incremented(p.start, p.increment + moved)
+                return Incremented(p.start, once_in_rows(p.increment + moved))
         p = value(p)
         if not is_field(f):
             return p + f
-        moved = f.flow(p)
+        moved = once_in_rows(f.flow(p))
         # A point in a step's own coordinates may come back in more of them.
         is_state = f.acts_on_subtree or jtu.all_leaves([p])
         if is_state and struct(moved) != struct(p):

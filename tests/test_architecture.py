@@ -16,8 +16,10 @@ PACKAGE = Path(cfjax.__file__).parent
 FACE = "cfjax"
 # From the ground up. A file may import from its own row's folder and from the rows above it here.
 ROWS = [
-    # Contract of a field, programs as XLA wants them, and the command's signals: none of ours.
-    {"_field", "_xla", "_signals"},
+    # Programs as XLA wants them, and the command's signals: none of ours.
+    {"_xla", "_signals"},
+    # The contract of a field.
+    {"_field"},
     # Its term for diffrax; functions of arrays.
     {"_term", "_numerics"},
     # Fields, and coefficients of methods.

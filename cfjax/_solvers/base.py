@@ -15,7 +15,7 @@ from jaxtyping import Array, Inexact, PyTree, Real
 
 from .._field import Incremented, flow, is_field, is_incremented, value
 from .._term import product
-from .._xla import by_components, once_for_sums
+from .._xla import by_components, once_for_sums, once_in_rows
 from .dense import Interpolation, Path
 from .failure import result_of
 
@@ -104,7 +104,7 @@ class AbstractLieSolver(diffrax.AbstractSolver):
                     else:
                         c = jnp.asarray(c, jnp.result_type(t0))
                         t = jnp.where(c == 1, t1, t0 + c * (t1 - t0))
-                    values.append(terms.vf(t, value(y), args))
+                    values.append(once_in_rows(terms.vf(t, value(y), args)))
                 else:
                     values.append(first)
                 return product(terms, values[-1], control)

@@ -14,7 +14,7 @@ from jax.interpreters import ad, batching, mlir
 from jaxtyping import Array, PyTree
 
 from .pack import pack, unpack
-from .scope import is_short, where
+from .scope import MAX_SIZE, has_rows, is_short, where
 
 # In a batch, what makes more entries at once is not vectorised any more.
 _MAX_TOGETHER = 12
@@ -55,6 +55,20 @@ def once_for_sums(tree: PyTree) -> PyTree:
     return structure.unflatten(
         x for group in groups for x in _once(group, in_batches=True, alone=alone)
     )
+
+
+def once_in_rows(tree: PyTree) -> PyTree:
+    """The same arrays, computed once in states with leading axes.
+
+    Along these axes a point needs its neighbours, and would compute them anew.
+    """
+    if not has_rows():
+        return tree
+    leaves, structure = jtu.tree_flatten(tree)
+    places = [k for k, x in enumerate(leaves) if np.size(x) > MAX_SIZE]
+    for k in places:
+        (leaves[k],) = held([leaves[k]], in_batches=True)
+    return structure.unflatten(leaves)
 
 
 def _once(tree: PyTree, **options: bool) -> PyTree:

@@ -10,9 +10,9 @@ import jax.tree_util as jtu
 from jax import lax
 from jaxtyping import Array, Int, PyTree
 
-from .components import join, split, trace
 from .operation import operation
 from .pack import pack, unpack
+from .program import join, split, trace
 
 # Beyond, the derivative gains less than copying them costs.
 _MAX_TRAVELLERS = 16
@@ -42,7 +42,9 @@ def repeat(
         carry = jtu.tree_unflatten(structure, leaves)
         return structure.flatten_up_to(program.run(carry, parameters))
 
-    leaves = _repeat(leaves, program.parameters, run=of_leaves, num_steps=num_steps)
+    leaves = _repeat(
+        leaves, program.parameters, run=of_leaves, num_steps=num_steps, rows=program.rows
+    )
     return jtu.tree_unflatten(structure, leaves)
 
 
@@ -54,20 +56,27 @@ def _loop(step: Callable[[PyTree], PyTree], carry: PyTree, num_steps: Any) -> Py
 
 @eqx.filter_custom_jvp
 def _repeat(
-    leaves: list[Array], parameters: list[Array], *, run: Callable, num_steps: int | Array
+    leaves: list[Array],
+    parameters: list[Array],
+    *,
+    run: Callable,
+    num_steps: int | Array,
+    rows: bool,
 ) -> list[Array]:
     moves = [True] * len(leaves), [False] * len(parameters)
-    return _scan(run, num_steps, leaves, parameters, *moves)
+    return _scan(run, num_steps, leaves, parameters, moves[0], moves[1], rows)
 
 
 @_repeat.def_jvp
-def _(primals, tangents, *, run, num_steps):
+def _(primals, tangents, *, run, num_steps, rows):
     moves = [[tangent is not None for tangent in group] for group in tangents]
-    sizes = [len(jtu.tree_leaves(split(x))) for x in primals[1]]
+    sizes = [len(jtu.tree_leaves(split(x, rows))) for x in primals[1]]
     if sum(n for n, is_one in zip(sizes, moves[1], strict=True) if is_one) > _MAX_TRAVELLERS:
         moves[1] = [False] * len(sizes)
     return eqx.filter_jvp(
-        lambda leaves, parameters: _scan(run, num_steps, leaves, parameters, *moves),
+        lambda leaves, parameters: _scan(
+            run, num_steps, leaves, parameters, moves[0], moves[1], rows
+        ),
         primals,
         tangents,
     )
@@ -80,6 +89,7 @@ def _scan(
     parameters: list[Array],
     leaves_move: Sequence[bool],
     parameters_move: Sequence[bool],
+    rows: bool,
 ) -> list[Array]:
     """The loop, where those parameters travel that are in components, if they move.
 
@@ -89,18 +99,18 @@ def _scan(
     moves = [
         is_one
         for x, is_one in zip(leaves, leaves_move, strict=True)
-        for _ in jtu.tree_leaves(split(x))
+        for _ in jtu.tree_leaves(split(x, rows))
     ]
-    leaves, structure = jtu.tree_flatten(split(leaves))
+    leaves, structure = jtu.tree_flatten(split(leaves, rows))
     packed = _packed(leaves)
     moves, _ = _partition(moves, packed)
     numbers, rest = _partition(leaves, packed)
     travels = [
         is_one and bool(numbers) and _is_number(piece, numbers[0].dtype)
         for x, is_one in zip(parameters, parameters_move, strict=True)
-        for piece in jtu.tree_leaves(split(x))
+        for piece in jtu.tree_leaves(split(x, rows))
     ]
-    pieces, parameter_structure = jtu.tree_flatten(split(parameters))
+    pieces, parameter_structure = jtu.tree_flatten(split(parameters, rows))
     known, others = _partition(pieces, travels)
 
     def vectors(numbers: list[Array], travellers: list[Array]) -> list[Array]:
@@ -127,7 +137,9 @@ def _scan(
         return vectors(numbers, travellers), rest
 
     def body(carry: tuple[list[Array], list[Array]]) -> tuple[list[Array], list[Array]]:
-        return operation(step, *entries(carry[0]), carry[1], known, others, place="loop")
+        return operation(
+            step, *entries(carry[0]), carry[1], known, others, place="loop", is_batch=rows
+        )
 
     carried, rest = _loop(body, (vectors(numbers, known), rest), num_steps)
     numbers, _ = entries(carried)

@@ -53,8 +53,10 @@ _FREE = frozenset(
 )
 
 
-def operation(fun: Callable[..., PyTree], *args: PyTree, place: Place) -> PyTree:
-    """`fun(*args)`, as one operation.
+def operation(
+    fun: Callable[..., PyTree], *args: PyTree, place: Place, is_batch: bool = False
+) -> PyTree:
+    """`fun(*args)`, as one operation, of a batch if it is one already.
 
     `fun` may close over traced values, and has no effects. Reverse mode keeps the arguments and
     computes everything again, as with `jax.checkpoint`.
@@ -69,7 +71,7 @@ def operation(fun: Callable[..., PyTree], *args: PyTree, place: Place) -> PyTree
         out, out_structure = jtu.tree_flatten(jtu.tree_map(jnp.asarray, out))
         return out
 
-    kind = _Kind(place)
+    kind = _Kind(place, is_batch=is_batch)
     made = jax.make_jaxpr(of_leaves)(*leaves)
     jaxpr = without_dead_code(made.jaxpr)
     code = jaxpr.replace(

@@ -12,7 +12,10 @@ import jax.numpy as jnp
 import numpy as np
 
 # Of vectors that are taken apart. A pose is a quaternion and a position.
-_MAX_LENGTH = 7
+MAX_LENGTH = 7
+# Of arrays all of whose entries are taken apart, as they come up within a step: the 4 x 4 matrix of
+# a quaternion, and the 4 x 4 x 4 numbers that multiply two.
+MAX_SIZE = 64
 
 # JAX compiles anew where it changes.
 _is_on = jax.make_user_context(os.environ.get("CFJAX_REWRITE", "1") != "0")
@@ -53,21 +56,31 @@ def unread(error: Exception) -> None:
 
 Place = Literal["step", "loop"]
 _place: ContextVar[Place | None] = ContextVar("place", default=None)
+_has_rows: ContextVar[bool] = ContextVar("has_rows", default=False)
 
 
 @contextlib.contextmanager
-def within(place: Place) -> Iterator[None]:
-    """The time in which a program is traced that is to be taken apart as a whole."""
-    token = _place.set(place)
+def within(place: Place, rows: bool) -> Iterator[None]:
+    """The time in which a program is traced that is to be taken apart as a whole.
+
+    With `rows` its state has short vectors along leading axes.
+    """
+    tokens = _place.set(place), _has_rows.set(rows)
     try:
         yield
     finally:
-        _place.reset(token)
+        _place.reset(tokens[0])
+        _has_rows.reset(tokens[1])
 
 
 def where() -> Place | None:
     """What is taken apart around here: one step, or a loop of many."""
     return _place.get()
+
+
+def has_rows() -> bool:
+    """Whether short vectors along leading axes are taken apart around here."""
+    return _has_rows.get()
 
 
 def is_rewritten() -> bool:
@@ -77,7 +90,13 @@ def is_rewritten() -> bool:
 
 def is_short(x: Any) -> bool:
     """Whether this is a vector that is taken apart."""
-    return np.ndim(x) == 1 and 1 <= np.size(x) <= _MAX_LENGTH and is_numeric(x)
+    return np.ndim(x) == 1 and 1 <= np.size(x) <= MAX_LENGTH and is_numeric(x)
+
+
+def is_rows(x: Any) -> bool:
+    """Whether these are many short vectors along leading axes, more than are taken one by one."""
+    length = np.shape(x)[-1] if np.ndim(x) > 1 else 0
+    return 1 < length <= MAX_LENGTH and np.size(x) > length * MAX_SIZE and is_numeric(x)
 
 
 def is_numeric(x: Any) -> bool:

@@ -231,7 +231,9 @@ def test_the_program_does_not_grow_with_the_batch():
 
         return len(jax.jit(run).lower(jnp.ones((n, 3))).as_text().splitlines())
 
-    assert lines(7) == lines(1000)
+    # Few vectors are left as they are, many are taken apart.
+    assert lines(7) == lines(20)
+    assert lines(100) == lines(1000)
 
 
 def test_a_stiefel_step_keeps_one_span_for_its_stages():

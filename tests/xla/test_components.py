@@ -11,9 +11,9 @@ from jax import lax
 from jax.experimental import io_callback
 
 import cfjax
-from cfjax._xla import components
-from cfjax._xla.components import by_components
+from cfjax._xla import program
 from cfjax._xla.held import held
+from cfjax._xla.program import by_components
 
 pytestmark = pytest.mark.usefixtures("rewritten")
 
@@ -317,8 +317,8 @@ def test_values(name):
     ids=["branches", "loop", "exponential of a matrix"],
 )
 def test_branches_and_loops_are_left_alone(fun):
-    assert components.trace(fun, jnp.asarray(Y), "step") is None
-    assert components.trace(jnp.sin, jnp.asarray(Y), "step") is not None
+    assert program.trace(fun, jnp.asarray(Y), "step") is None
+    assert program.trace(jnp.sin, jnp.asarray(Y), "step") is not None
 
 
 @pytest.mark.parametrize("name", ["arithmetic", "elementary", "constants out", "integers", "loops"])
@@ -621,7 +621,7 @@ def test_what_cannot_be_read_runs_as_it_is(rule, monkeypatch):
     def fail(*args):
         raise KeyError("dimension")
 
-    monkeypatch.setattr(components, rule, fail)
+    monkeypatch.setattr(program, rule, fail)
     fun = lambda y: jnp.cross(W, y) @ M  # noqa: E731
     with pytest.warns(RuntimeWarning, match="could not rewrite a program .* KeyError: 'dimension'"):
         got = jax.jit(whole(fun))(jnp.asarray(Y))
