@@ -1,6 +1,7 @@
 """Problems with known answers, one to a module."""
 
 from . import heat as heat
+from . import heavy_top as heavy_top
 from . import rigid_body as rigid_body
 from . import spacecraft as spacecraft
 from . import spins as spins
