@@ -6,4 +6,5 @@ from . import rigid_body as rigid_body
 from . import spacecraft as spacecraft
 from . import spins as spins
 from . import stiefel as stiefel
+from . import toda as toda
 from . import wilson_flow as wilson_flow
