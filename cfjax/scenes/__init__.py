@@ -8,3 +8,4 @@ from . import spins as spins
 from . import stiefel as stiefel
 from . import toda as toda
 from . import wilson_flow as wilson_flow
+from . import zeitlin as zeitlin
