@@ -7,18 +7,18 @@ matrices W and P that of w and psi, and a commutator that of the bracket:
 `W' = 1j / h (P W - W P)`, with `-sum_k [S_k, [S_k, P]] = W` and `h = 2 / sqrt(N^2 - 1)`.
 
 The Laplacian has the right eigenvalues -l (l + 1) for l = 1 .. N - 1, and its eigenvectors are
-matrices for the spherical harmonics. The coordinates themselves are `h S_k`. The radius and the
-total area of the sphere are one, so energies are means.
+matrices for the spherical harmonics. The coordinates themselves are `h S_k`. The radius is one, and
+energies are means over the sphere. All quantities are dimensionless.
 
 Frozen, the field is a conjugation by a unitary matrix. So all eigenvalues of W are kept to
 rounding, N quantities that stand for the areas where the vorticity has this or that value. Energy
 and angular momentum are kept to the method's order.
 
 Source: Hoppe & Yau, Some properties of matrix harmonics on S^2, Commun. Math. Phys. 195 (1998),
-doi:10.1007/s002200050379; Zeitlin, Self-consistent finite-mode approximations for the hydrodynamics
-of an incompressible fluid on nonrotating and rotating spheres, Phys. Rev. Lett. 93 (2004),
+67-77; Zeitlin, Self-consistent finite-mode approximations for the hydrodynamics of an
+incompressible fluid on nonrotating and rotating spheres, Phys. Rev. Lett. 93 (2004),
 doi:10.1103/PhysRevLett.93.264501; Modin & Viviani, A Casimir preserving scheme for long-time
-simulation of spherical ideal hydrodynamics, J. Fluid Mech. 884 (2020).
+simulation of spherical ideal hydrodynamics, J. Fluid Mech. 884 (2020), A22.
 """
 
 from functools import lru_cache
@@ -194,6 +194,7 @@ def reference(t: float, start: Complex[np.ndarray, "N N"]) -> Complex[np.ndarray
     """The vorticity at time `t`, by SciPy's DOP853 in plain space, with a tolerance of 1e-13.
 
     The Laplacian is the sum of the double commutators, one sparse matrix that is factorised.
+    The error of `y0()` at 4 is about 1e-11.
     """
     from scipy import sparse
     from scipy.integrate import solve_ivp
