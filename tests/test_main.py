@@ -68,7 +68,8 @@ def test_charts_of_the_other_scenes(name, monkeypatch):
 
     def work_precision(*args, methods, num_steps=None, tolerances=None, **options):
         some = {"CF4": methods["CF4"]}
-        num_steps, tolerances = num_steps and [32, 64], tolerances and [1e-4, 1e-6]
+        # Steps from the middle of the chart, where methods have their order and no rounding.
+        num_steps, tolerances = num_steps and num_steps[3:5], tolerances and [1e-4, 1e-6]
         settings = dict(num_steps=num_steps, tolerances=tolerances)
         return original(*args, methods=some, **(options | settings))
 

@@ -1,8 +1,11 @@
 """Problems with known answers, one to a module."""
 
 from . import heat as heat
+from . import heavy_top as heavy_top
 from . import rigid_body as rigid_body
 from . import spacecraft as spacecraft
 from . import spins as spins
 from . import stiefel as stiefel
+from . import toda as toda
 from . import wilson_flow as wilson_flow
+from . import zeitlin as zeitlin

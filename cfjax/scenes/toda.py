@@ -1,0 +1,164 @@
+"""The Toda lattice: particles on a line that repel their neighbours, as an isospectral flow.
+
+With the energy `sum p_k^2 / 2 + sum exp(q_k - q_(k+1))` and free ends, take the symmetric
+tridiagonal matrix L with `-p_k / 2` on the diagonal and `exp((q_k - q_(k+1)) / 2) / 2` beside it.
+Then `L' = B L - L B`, where B is the part of L above the diagonal less that below. The eigenvalues
+of L do not change. As time goes on the particles part, and L becomes diagonal, with its eigenvalues
+in falling order. All quantities are dimensionless.
+
+The equation moves any symmetric matrix like that. Frozen, it is a conjugation, which keeps the
+eigenvalues. A method leaves the tridiagonal matrices by its error.
+
+Source: Flaschka, The Toda lattice. II. Existence of integrals, Phys. Rev. B 9 (1974),
+doi:10.1103/PhysRevB.9.1924; Calvo, Iserles & Zanna, Numerical solution of isospectral flows, Math.
+Comp. 66 (1997), doi:10.1090/S0025-5718-97-00902-2.
+"""
+
+from typing import TYPE_CHECKING, Any
+
+import diffrax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Float
+
+from .. import (
+    CF3,
+    CF4,
+    CF43,
+    CF54,
+    RKMK4,
+    Conjugation,
+    LieTerm,
+    WorkPrecision,
+    integrate,
+    tangent,
+    work_precision,
+)
+
+if TYPE_CHECKING:
+    from matplotlib.figure import Figure
+
+t0, t1 = 0.0, 10.0
+
+# The particles of `y0()`: they run into each other.
+positions = np.array([-10.0, -5.0, -1.0, 4.0, 9.0])
+momenta = np.array([2.0, 1.0, 0.2, -0.8, -1.8])
+
+
+def y0() -> Float[np.ndarray, "5 5"]:
+    """The matrix of five particles that run into each other."""
+    return matrix(positions, momenta)
+
+
+def matrix(q: Float[np.ndarray, " n"], p: Float[np.ndarray, " n"]) -> Float[np.ndarray, "n n"]:
+    """The matrix L of particles at `q` with momenta `p`."""
+    beside = np.exp(-np.diff(q) / 2) / 2
+    return np.diag(-p / 2) + np.diag(beside, 1) + np.diag(beside, -1)
+
+
+def field(t: Any, y: Float[Array, "n n"], args: Any = None) -> Conjugation:
+    """The frozen field at any symmetric matrix."""
+    # As B is skew, `Congruence` would do it too, for less. Other isospectral flows need this.
+    return Conjugation(jnp.triu(y, 1) - jnp.tril(y, -1))
+
+
+def velocity(t: Any, y: Float[Array, "n n"], args: Any = None) -> Float[Array, "n n"]:
+    """The same field in plain space, where methods lose the eigenvalues."""
+    return tangent(field(t, y), y)
+
+
+def energy(y: Float[Array | np.ndarray, "*times n n"]) -> Float[Array, "*times"]:
+    """The energy of the lattice, twice the sum of the squared eigenvalues."""
+    return 2 * jnp.sum(jnp.square(y), axis=(-2, -1))
+
+
+def reference(t: float, start: Float[np.ndarray, "n n"] | None = None) -> Float[np.ndarray, "n n"]:
+    """The exact solution at time `t`, in NumPy's float64.
+
+    With the factors `exp(t L) = Q R` of the start it is `Q^T L Q`. It is taken in pieces in which
+    the exponential has a condition of at most e: of the whole, small columns would be rounding. The
+    error is some units of rounding for every piece.
+    """
+    y = y0() if start is None else start
+    values = np.linalg.eigvalsh(y)
+    pieces = max(1, int(np.ceil(abs(t) * (values[-1] - values[0]))))
+    for _ in range(pieces):
+        values, vectors = np.linalg.eigh(y)
+        exponential = (vectors * np.exp(t / pieces * (values - values.mean()))) @ vectors.T
+        q, r = np.linalg.qr(exponential)
+        q = q * np.sign(np.diag(r))
+        y = q.T @ y @ q
+        y = (y + y.T) / 2
+    return y
+
+
+def particles(
+    y: Float[Array | np.ndarray, "*times n n"], center: float | Float[np.ndarray, "*times"]
+) -> Float[np.ndarray, "*times n"]:
+    """The positions of the particles, from where their centre of mass is.
+
+    Beyond a distance of about 50 the numbers beside the diagonal drown in the method's error.
+    """
+    beside = np.diagonal(np.asarray(y), 1, -2, -1)
+    q = np.cumsum(-2 * np.log(2 * np.abs(beside)), axis=-1)
+    q = np.concatenate([np.zeros_like(q[..., :1]), q], axis=-1)
+    return q + (np.asarray(center) - q.mean(-1))[..., None]
+
+
+def chart(**options: Any) -> WorkPrecision:
+    """Five particles of a Toda lattice to t = 10, 20 to 1280 equal steps; Tsit5 in plain space."""
+    space = diffrax.ODETerm(velocity)
+    return work_precision(
+        LieTerm(field),
+        t0,
+        t1,
+        y0(),
+        methods={
+            "CF3": CF3(),
+            "CF4": CF4(),
+            "RKMK4": RKMK4(),
+            "CF43": CF43(),
+            "CF54": CF54(),
+            "Dopri5": (space, diffrax.Dopri5()),
+            "Tsit5": (space, diffrax.Tsit5()),
+        },
+        reference=reference(t1),
+        num_steps=[20 * 2**k for k in range(7)],
+        **options,
+    )
+
+
+def picture() -> "Figure":
+    """Where particles go that run into each other, and the matrix that becomes diagonal."""
+    from matplotlib.figure import Figure
+
+    n, end = 100, 14.0
+    solvers = {
+        "CF4": (LieTerm(field), CF4()),
+        "Tsit5": (diffrax.ODETerm(velocity), diffrax.Tsit5()),
+    }
+    options: Any = dict(num_steps=n, save_every=1)
+    found = {
+        name: integrate(term, solver, 0.0, end, y0(), **options)
+        for name, (term, solver) in solvers.items()
+    }
+    times = np.asarray(found["CF4"].ts)
+    ys = {name: np.asarray(sol.ys) for name, sol in found.items()}
+    q = particles(ys["CF4"], positions.mean() + momenta.mean() * times)
+    values = np.linalg.eigvalsh(y0())
+    figure = Figure((10.5, 3.6), layout="constrained")
+    lattice, diagonal, drift = figure.subplots(1, 3)
+    colours = ["#0072B2", "#009E73", "#E69F00", "#D55E00", "#CC79A7"]
+    for k, colour in enumerate(colours):
+        lattice.plot(q[:, k], times, color=colour)
+        diagonal.plot(times, ys["CF4"][:, k, k], color=colour)
+    for value in values:
+        diagonal.axhline(value, color="0.6", linestyle=":", linewidth=1, zorder=0)
+    for name, y in ys.items():
+        off = np.abs(np.linalg.eigvalsh((y + np.swapaxes(y, 1, 2)) / 2) - values).max(-1)
+        drift.semilogy(times, np.maximum(off, 1e-16), label=f"{name}, {n} steps")
+    lattice.set(title="Positions", xlabel="q", ylabel="t")
+    diagonal.set(title="The diagonal, and the eigenvalues", xlabel="t")
+    drift.set(title="Error of the eigenvalues", xlabel="t")
+    drift.legend(frameon=False)
+    return figure
