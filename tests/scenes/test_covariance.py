@@ -1,0 +1,191 @@
+"""The covariance of a filter: its closed form, and that it stays positive definite."""
+
+import diffrax
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from scipy.integrate import solve_ivp
+from scipy.linalg import solve_continuous_are
+
+import cfjax
+from cfjax.scenes import covariance
+
+TERM = cfjax.LieTerm(covariance.field)
+PLAIN = cfjax.LieTerm(covariance.velocity)
+SEEN = covariance.Track(lost=np.inf, found=np.inf)
+HIDDEN = covariance.Track(lost=-np.inf, found=np.inf)
+
+
+def matrices(t, args, sees):
+    """A, Q and S once more, by the directions along and across, in NumPy."""
+    across = np.array([np.cos(args.rate * t), np.sin(args.rate * t)])
+    along = np.array([-across[1], across[0]])
+    a, q, s = np.zeros((3, 4, 4))
+    a[:2, 2:] = np.eye(2)
+    a[2:, 2:] -= args.drag_across * np.outer(across, across)
+    a[2:, 2:] -= args.drag_along * np.outer(along, along)
+    q[2:, 2:] = args.noise * np.eye(2)
+    if sees:
+        s[:2, :2] = np.outer(across, across) / args.range + np.outer(along, along) / args.bearing
+    return a, q, s
+
+
+def by_dop853(start, args, *pieces):
+    """From one end of a piece to the next, each with whether the radar sees the ship."""
+    y = np.ravel(start)
+
+    def rate(t, flat, sees):
+        (a, q, s), p = matrices(t, args, sees), flat.reshape(4, 4)
+        return np.ravel(a @ p + p @ a.T + q - p @ s @ p)
+
+    for begin, end, sees in pieces:
+        options = dict(method="DOP853", rtol=1e-13, atol=1e-15)
+        y = solve_ivp(rate, (begin, end), y, args=(sees,), **options).y[:, -1]
+    return y.reshape(4, 4)
+
+
+def steps_of(term, solver):
+    """The states after each step: one program for all starts, ends, steps and tracks."""
+
+    @jax.jit
+    def solve(t1, step, start, args):
+        return diffrax.diffeqsolve(
+            term,
+            solver,
+            0.0,
+            t1,
+            step,
+            start,
+            args,
+            saveat=diffrax.SaveAt(steps=True),
+            max_steps=200,
+            throw=False,
+        )
+
+    def run(t1, num_steps, start, args):
+        args = jax.tree.map(jnp.asarray, args)
+        sol = solve(t1, t1 / num_steps, jnp.asarray(start), args)
+        return np.asarray(sol.ys)[: int(sol.stats["num_steps"])]
+
+    return run
+
+
+# With its estimate CF4 carries a field from step to step, which takes longer to compile.
+CF4 = steps_of(TERM, cfjax.CF4(estimate=None))
+# On arrays CF4 is the classical method of order 4.
+RK4 = steps_of(PLAIN, cfjax.CF4(estimate=None))
+
+
+def test_the_closed_form_against_dop853():
+    args = covariance.Track(lost=1.5, found=3.0)
+    pieces = [(0.0, 1.5, True), (1.5, 3.0, False), (3.0, 4.0, True)]
+    want = by_dop853(covariance.y0(), args, *pieces)
+    # Hundreds of steps with a tolerance of 1e-13.
+    found = covariance.reference(4.0, covariance.y0(), args)
+    np.testing.assert_allclose(found, want, rtol=0, atol=1e-13)
+    middle = by_dop853(covariance.y0(), args, *pieces[:1])
+    found = covariance.reference(np.array([[0.0, 1.5], [4.0, 3.0]]), covariance.y0(), args)
+    # In other pieces, which are exact to rounding.
+    np.testing.assert_allclose(found[0, 1], middle, rtol=0, atol=1e-13)
+    np.testing.assert_allclose(found[1, 0], want, rtol=0, atol=1e-13)
+    np.testing.assert_array_equal(found[0, 0], covariance.y0())
+
+
+def test_in_the_end_the_filter_solves_the_algebraic_riccati_equation():
+    # In axes that turn with the ship. Of the start e^(-2 * 0.3 * 60) is left, 2e-16.
+    a, q, s = matrices(0.0, SEEN, True)
+    spin = np.kron(np.eye(2), [[0, -SEEN.rate], [SEEN.rate, 0]])
+    root = np.sqrt(np.diag(s)[:2])
+    c = np.eye(4)[:, :2] * root
+    p = solve_continuous_are((a - spin).T, c, q, np.eye(2))
+    # After one round the axes are where they were.
+    found = covariance.reference(60.0, covariance.y0(2.0), SEEN)
+    # SciPy's solution has lost some digits.
+    np.testing.assert_allclose(found, p, rtol=0, atol=1e-12)
+
+
+@pytest.mark.parametrize(
+    ("args", "t1", "num_steps"), [(SEEN, 5.0, 80), (HIDDEN, 20.0, 40)], ids=["Riccati", "Lyapunov"]
+)
+def test_order(args, t1, num_steps):
+    start = covariance.y0()
+    exact = covariance.reference(t1, start, args)
+    errors = [np.abs(CF4(t1, n, start, args)[-1] - exact).max() for n in (num_steps, 2 * num_steps)]
+    # Of order 4: 16, and more where terms of the next order have not gone yet.
+    assert 14 < errors[0] / errors[1] < 24
+    assert errors[1] < 1e-6
+
+
+@pytest.mark.parametrize(
+    ("args", "t1", "deviation"),
+    [(SEEN, 5.0, 2.0), (HIDDEN._replace(drag_across=10.0), 20.0, 0.5)],
+    ids=["Riccati", "Lyapunov"],
+)
+def test_definite_where_rk4_in_plain_space_is_not(args, t1, deviation):
+    start = covariance.y0(deviation)
+    for n in (5, 20, 80):
+        ys = CF4(t1, n, start, args)
+        assert len(ys) == n
+        assert np.all(covariance.smallest(ys) > 0)
+        np.testing.assert_array_equal(ys, np.swapaxes(ys, 1, 2))
+        # What is indefinite runs away, in the end to NaN.
+        assert np.any(covariance.smallest(RK4(t1, n, start, args)) < 0)
+    # With short steps it is, so what fails is the method.
+    assert np.all(covariance.smallest(RK4(t1 / 10, 200, start, args)) > 0)
+
+
+@pytest.mark.slow
+def test_josephs_form_is_safe_with_order_2_alone():
+    def joseph(t, y, args):
+        a, q, s = covariance._coefficients(t, y, args)
+        return cfjax.Congruence(a - y @ s, q + y @ s @ y)
+
+    y, term = jnp.asarray(covariance.y0(2.0)), cfjax.LieTerm(joseph)
+    exact = covariance.reference(5.0, covariance.y0(2.0), SEEN)
+    ours, joseph2 = steps_of(TERM, cfjax.CF2()), steps_of(term, cfjax.CF2())
+    for n in (5, 20, 80):
+        ys = joseph2(5.0, n, y, SEEN)
+        assert np.all(covariance.smallest(ys) > 0)
+        off = np.abs(ours(5.0, n, y, SEEN)[-1] - exact).max()
+        assert np.abs(ys[-1] - exact).max() < off / 3
+    assert not np.all(covariance.smallest(steps_of(term, cfjax.CF4())(5.0, 20, y, SEEN)) > 0)
+
+
+def test_the_velocity_is_that_of_the_field():
+    y = covariance.reference(1.0, covariance.y0(), SEEN)
+    for t, args in ((1.0, SEEN), (2.0, HIDDEN)):
+        a, q, s = matrices(t, args, args is SEEN)
+        want = a @ y + y @ a.T + q - y @ s @ y
+        frozen = covariance.field(t, jnp.asarray(y), args)
+        for found in (covariance.velocity(t, jnp.asarray(y), args), frozen.tangent(jnp.asarray(y))):
+            # Sums of a dozen terms of size 1.
+            np.testing.assert_allclose(found, want, rtol=0, atol=1e-15)
+
+
+@pytest.mark.slow
+def test_error_control_with_the_jumps():
+    args, start = covariance.Track(), covariance.y0()
+    controller = diffrax.ClipStepSizeController(
+        diffrax.PIDController(rtol=0.0, atol=1e-8), jump_ts=jnp.array([args.lost, args.found])
+    )
+    sol = diffrax.diffeqsolve(
+        TERM,
+        cfjax.CF4(),
+        0.0,
+        60.0,
+        0.01,
+        start,
+        args,
+        saveat=diffrax.SaveAt(ts=jnp.array([20.0, 40.0, 42.0, 60.0])),
+        stepsize_controller=controller,
+    )
+    exact = covariance.reference(np.asarray(sol.ts), start, args)
+    # A few hundred steps with a tolerance of 1e-8 each.
+    np.testing.assert_allclose(sol.ys, exact, rtol=0, atol=1e-6)
+    assert np.all(covariance.smallest(sol.ys) > 0)
+
+
+@pytest.mark.slow
+def test_the_picture():
+    assert len(covariance.picture().axes) == 2
