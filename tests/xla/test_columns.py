@@ -62,13 +62,9 @@ def added_at(y):
 
 
 def sums(y):
-    centre = jnp.mean(y, (0, 1))
-    return (
-        y
-        - centre
-        + jnp.sum(y, 0)[None] * jnp.max(y)
-        + jnp.cumsum(y, 0) * jnp.prod(y, -1)[..., None]
-    )
+    centre = jnp.mean(y, (0, 1)) + jnp.sum(jnp.broadcast_to(W, y.shape), 0)
+    running = jnp.cumsum(y, 0) * jnp.prod(y, -1)[..., None]
+    return y - centre + jnp.sum(y, 0)[None] * jnp.max(y) + running
 
 
 def products(y):
