@@ -189,7 +189,7 @@ def picture() -> "Figure":
     curves.axvspan(args.lost, args.found, color="0.94")
     curves.axhspan(-1, 0, color="#D55E00", alpha=0.12, linewidth=0)
     curves.text(48.5, -0.0002, "no covariance", ha="right", va="top")
-    curves.text(40.2, 0.0003, "RK4 and Tsit5, as soon as\nthe ship is seen again", va="center")
+    curves.text(40.2, -0.0007, "RK4 and Tsit5, as soon as\nthe ship is seen again", va="center")
     near = np.linspace(34.0, 49.0, 301)
     exact = np.asarray(smallest(reference(near, y0(), args)))
     curves.plot(near, exact, color="0.7", linewidth=5, label="exact")
