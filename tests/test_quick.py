@@ -1,6 +1,6 @@
 """Every solver and every field once, with a gradient: minutes tell whether a version works at all.
 
-`make test-quick` runs this with the canary and the public names. In `make test` other tests see the
+`make test-quick` runs this with the canary, leading axes and the public names. In `make test` other tests see the
 same solvers and fields.
 """
 

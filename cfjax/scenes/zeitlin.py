@@ -202,7 +202,8 @@ def reference(t: float, start: Complex[np.ndarray, "N N"]) -> Complex[np.ndarray
 
     n = len(start)
     # Acts on the rows of a matrix, one after the other.
-    turns = [sparse.kron(s, np.eye(n)) - sparse.kron(np.eye(n), s.T) for s in spins(n)]
+    eye = sparse.eye_array(n)
+    turns = [sparse.kron(s, eye) - sparse.kron(eye, s.T) for s in spins(n)]
     laplacian = -sum(np.real(turn @ turn) for turn in turns)
     # A stream function is known but for a constant: of this one the first element is zero.
     laplacian += sparse.coo_array(([1.0], ([0], [0])), shape=(n**2, n**2))

@@ -186,7 +186,7 @@ TREE = {
         {"a": Y, "b": (np.linspace(0.1, 1, 9),), "c": np.ones((2, 2))},
     ),
     "only long": (lambda y: jnp.sin(y) * y[0], np.linspace(0.1, 1, 9)),
-    "length seven and eight": (lambda y: jnp.exp(y[0][:3]) * y[1][2] + y[1][4:], (
+    "length seven and eight": (lambda y: jnp.exp(y[0][:3]) * y[1][2] + y[1][5:], (
         np.linspace(0.1, 1, 7), np.linspace(0.1, 1, 8))),
     "scalars": (lambda y: (y[0] * y[1], y[1] ** 2, jnp.stack([y[1], y[1]])), (Y, np.asarray(0.4))),
     "integers and flags": (
