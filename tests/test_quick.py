@@ -1,7 +1,7 @@
 """Every solver and every field once, with a gradient: minutes tell whether a version works at all.
 
-`make test-quick` runs this with the canary, leading axes and the public names. In `make test` other tests see the
-same solvers and fields.
+`make test-quick` runs this with the canary, leading axes and the public names. In `make test` other
+tests see the same solvers and fields.
 """
 
 import inspect
