@@ -11,6 +11,7 @@ from jax import lax
 from jax.custom_batching import custom_vmap
 from jaxtyping import Array, Inexact, PyTree
 
+from . import cayley_hamilton
 from .matmul import matmul
 
 T = TypeVar("T", bound=PyTree)
@@ -75,11 +76,14 @@ _WRITTEN_OUT = 4
 
 
 def small_product(x: Array, y: Array) -> Array:
-    """`x @ y` for square matrices of one dtype that may be small."""
+    """`x @ y` for matrices, or a vector and a matrix, of one dtype that may be small."""
     # XLA:CPU writes a real dot up to n = 3 into the code around it. The next ones are calls, two
     # to four times slower than a sum, which fuses.
-    if x.shape[0] == 4 or (x.shape[0] < 4 and jnp.iscomplexobj(x)):
-        return jnp.sum(x[:, :, None] * y[None, :, :], axis=1)
+    n = x.shape[-1]
+    if n == 4 or (n < 4 and jnp.iscomplexobj(x)):
+        if x.ndim == 1:
+            return jnp.sum(x[:, None] * y, axis=0)
+        return jnp.sum(x[:, :, None] * y[None, :, :] if y.ndim == 2 else x * y, axis=1)
     return matmul(x, y)
 
 
@@ -213,13 +217,27 @@ def expm_parts(
     if a.shape[0] <= 1:
         return jnp.zeros((), a.dtype), jnp.where(jnp.isfinite(a), jnp.exp(a), jnp.nan)
 
+    if a.shape[0] > 3:
+        return _parts(a)
+    c, size = cayley_hamilton.characteristic(a)
+    # A size of NaN stays NaN.
+    return lax.cond(
+        max_over_batch(lax.stop_gradient(size)) <= 1,
+        lambda a, c: (jnp.ones((), a.dtype), cayley_hamilton.taylor(a, c)),
+        lambda a, c: jax.checkpoint(_parts)(a),
+        a,
+        c,
+    )
+
+
+def _parts(a: Array) -> tuple[Array, Array]:
     schemes = TAYLOR_SCHEMES[a.dtype.name]
 
     def parts(k: int, a: Array, a2: Array, s: Array | None) -> tuple[Array, Array]:
         rest = taylor_from_second(schemes[k], a, a2)
         if s is None:
             return jnp.ones((), a.dtype), rest
-        squared = repeat(lambda x: small_product(x, x), plus_identity(rest + a), s)
+        squared = _squared(plus_identity(rest + a), s)
         return (s == 0).astype(a.dtype), jnp.where(s == 0, rest, squared)
 
     n = a.shape[0]
@@ -227,6 +245,23 @@ def expm_parts(
     thetas = [scheme.theta for scheme in schemes]
     weight, rest = by_norm(thetas, a, small_product(a, a), parts)
     return weight, rest[:n, :n]
+
+
+@jax.custom_jvp
+def _squared(x: Array, s: Array) -> Array:
+    """x^(2^s)."""
+
+    def once(k, x):
+        return jnp.where(k < s, small_product(x, x), x)
+
+    return lax.fori_loop(0, max_over_batch(s), once, x)
+
+
+@_squared.defjvp
+def _(primals, tangents):
+    x, s = primals
+    # A loop of unknown length has no reverse mode.
+    return jax.jvp(lambda x: repeat(lambda x: small_product(x, x), x, s), (x,), tangents[:1])
 
 
 def plus_identity(a: Array) -> Array:

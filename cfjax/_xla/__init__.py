@@ -9,9 +9,11 @@ Nothing outside may import from the files within. `README.md` here says what eac
 """
 
 from .components import by_components as by_components
+from .held import held as held
 from .held import once as once
 from .held import once_for_sums as once_for_sums
 from .loop import repeat as repeat
 from .pack import pack as pack
+from .pack import unpack as unpack
 from .scope import is_rewritten as is_rewritten
 from .scope import rewriting as rewriting
