@@ -40,27 +40,41 @@ def characteristic(a: Inexact[Array, "n n"]) -> tuple[list[Inexact[Array, ""]], 
     squares = sum((1 + (i < j)) * _magnitude(x) for (i, j), x in pairs.items())
     trace = sum(a_[i, i] for i in range(n))
     if n == 2:
-        return [minors[0], trace], squares / 4
+        return [minors[0], trace], [squares]
     around = [a_[0, 1] * a_[1, 2] * a_[2, 0], a_[0, 2] * a_[2, 1] * a_[1, 0]]
     rest = -a_[0, 0] * minors[2] - pairs[0, 1] * a_[2, 2] - pairs[0, 2] * a_[1, 1]
     determinant = around[0] + around[1] + rest
-    return [determinant, sum(minors), trace], jnp.maximum(squares / 4, sum(map(_magnitude, around)) / 1.6)
+    return [determinant, sum(minors), trace], [squares, sum(map(_magnitude, around))]
 
 
 def _magnitude(x: Array) -> Array:
     return jnp.abs(x.real) + jnp.abs(x.imag) if jnp.iscomplexobj(x) else jnp.abs(x)
 
 
-def taylor(a: Inexact[Array, "n n"], c: Sequence[Inexact[Array, ""]]) -> Inexact[Array, "n n"]:
-    """`exp(a) - I - a`, with a rounding as small as it is."""
+def num_squarings(exponents: Sequence[Array]) -> Array:
+    """For the exponents of the sizes: so many that `taylor` takes the matrix over 2^s."""
+    s = (exponents[0] - 1) // 2
+    return jnp.maximum(functools.reduce(jnp.maximum, [(e + 1) // 3 for e in exponents[1:]], s), 0)
+
+
+def taylor(
+    a: Inexact[Array, "n n"], c: Sequence[Inexact[Array, ""]], scale: Inexact[Array, ""]
+) -> Inexact[Array, "n n"]:
+    """`exp(b) - I - b` for `b = scale * a`, with a rounding as small as it is."""
     n = a.shape[0]
-    # exp(a) = I + a + c_0 f_n I + (c_1 f_n + c_0 f_(n+1)) a for n = 2, and so on.
-    f = series(1, 2, n, list(c))
+    powers = [scale]
+    for _ in range(n - 1):
+        powers.append(powers[-1] * scale)
+    c = [x * power for x, power in zip(c, reversed(powers), strict=True)]
+    # exp(b) = I + b + c_0 f_n I + (c_1 f_n + c_0 f_(n+1)) b + ..
+    f = series(1, 2, n, c)
+    eye = jnp.eye(n, dtype=a.dtype)
     if n == 2:
-        return (c[0] * f[0]) * jnp.eye(2, dtype=a.dtype) + (c[1] * f[0] + c[0] * f[1]) * a
+        return (c[0] * f[0]) * eye + ((c[1] * f[0] + c[0] * f[1]) * scale) * a
+    # The matrix as it is, or each of the nine would be scaled anew for every use.
     square = jnp.sum(a[:, :, None] * a[None, :, :], axis=1)
-    number = (c[0] * f[1]) * jnp.eye(3, dtype=a.dtype)
-    return number + ((c[1] * f[1] + c[0] * f[2]) * a + f[0] * square)
+    linear = ((c[1] * f[1] + c[0] * f[2]) * scale) * a + (f[0] * powers[1]) * square
+    return (c[0] * f[1]) * eye + linear
 
 
 def series(m: int, first: int, count: int, c: list[Inexact[Array, ""]]) -> list[Inexact[Array, ""]]:

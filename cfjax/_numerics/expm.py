@@ -76,14 +76,14 @@ _WRITTEN_OUT = 4
 
 
 def small_product(x: Array, y: Array) -> Array:
-    """`x @ y` for matrices, or a vector and a matrix, of one dtype that may be small."""
+    """`x @ y` for matrices, or a matrix and a vector, of one dtype that may be small."""
     # XLA:CPU writes a real dot up to n = 3 into the code around it. The next ones are calls, two
     # to four times slower than a sum, which fuses.
     n = x.shape[-1]
     if n == 4 or (n < 4 and jnp.iscomplexobj(x)):
         if x.ndim == 1:
             return jnp.sum(x[:, None] * y, axis=0)
-        return jnp.sum(x[:, :, None] * y[None, :, :] if y.ndim == 2 else x * y, axis=1)
+        return jnp.sum(x * y if y.ndim == 1 else x[:, :, None] * y[None, :, :], axis=1)
     return matmul(x, y)
 
 
@@ -120,16 +120,24 @@ def one_norm(a: Array) -> Array:
 
 def _scaling(theta: float, size: Array) -> tuple[Array, Array]:
     """The number of squarings s for ‖a²‖ = `size`, and 2⁻ˢ (NaN where no s will do)."""
-    square = size / theta**2
-    info = jnp.finfo(square.dtype)
+    return _power(jnp.maximum((_exponent(size / theta**2) + 1) // 2, 0), size.dtype)
+
+
+def _exponent(size: Array) -> Array:
+    """The least e with `size < 2^e`; large if the size is inf or NaN."""
     # The exponent field is exact where a rounded log2 is not, and puts inf and NaN on top.
-    integer = jnp.dtype(f"int{info.bits}")
-    exponent = (lax.bitcast_convert_type(square, integer) >> info.nmant) - (info.maxexp - 2)
-    s = jnp.maximum((exponent + 1) // 2, 0)
+    info = jnp.finfo(size.dtype)
+    bits = lax.bitcast_convert_type(size, jnp.dtype(f"int{info.bits}"))
+    return (bits >> info.nmant) - (info.maxexp - 2)
+
+
+def _power(s: Array, dtype: np.dtype) -> tuple[Array, Array]:
+    """The number of squarings, and 2^-s; NaN where no s will do."""
+    info = jnp.finfo(dtype)
     # Every squaring doubles the error: after as many as there are digits, none is left.
     possible = s <= info.nmant
     s = jnp.where(possible, s, 0)
-    power = lax.bitcast_convert_type((info.maxexp - 1 - s) << info.nmant, square.dtype)
+    power = lax.bitcast_convert_type((info.maxexp - 1 - s) << info.nmant, dtype)
     return s.astype(jnp.int32), jnp.where(possible, power, jnp.nan)
 
 
@@ -217,27 +225,16 @@ def expm_parts(
     if a.shape[0] <= 1:
         return jnp.zeros((), a.dtype), jnp.where(jnp.isfinite(a), jnp.exp(a), jnp.nan)
 
-    if a.shape[0] > 3:
-        return _parts(a)
-    c, size = cayley_hamilton.characteristic(a)
-    # A size of NaN stays NaN.
-    return lax.cond(
-        max_over_batch(lax.stop_gradient(size)) <= 1,
-        lambda a, c: (jnp.ones((), a.dtype), cayley_hamilton.taylor(a, c)),
-        lambda a, c: jax.checkpoint(_parts)(a),
-        a,
-        c,
-    )
+    if a.shape[0] <= 3:
+        return _small_parts(a)
 
-
-def _parts(a: Array) -> tuple[Array, Array]:
     schemes = TAYLOR_SCHEMES[a.dtype.name]
 
     def parts(k: int, a: Array, a2: Array, s: Array | None) -> tuple[Array, Array]:
         rest = taylor_from_second(schemes[k], a, a2)
         if s is None:
             return jnp.ones((), a.dtype), rest
-        squared = _squared(plus_identity(rest + a), s)
+        squared = repeat(lambda x: small_product(x, x), plus_identity(rest + a), s)
         return (s == 0).astype(a.dtype), jnp.where(s == 0, rest, squared)
 
     n = a.shape[0]
@@ -247,11 +244,27 @@ def _parts(a: Array) -> tuple[Array, Array]:
     return weight, rest[:n, :n]
 
 
+@jax.jit  # One trace for the many exponentials of a step.
+def _small_parts(a: Array) -> tuple[Array, Array]:
+    c, sizes = cayley_hamilton.characteristic(a)
+    exponents = [_exponent(lax.stop_gradient(size)) for size in sizes]
+    s, scale = _power(cayley_hamilton.num_squarings(exponents), sizes[0].dtype)
+    scale = scale.astype(a.dtype)
+    rest = cayley_hamilton.taylor(a, c, scale)
+
+    def squared(a: Array, rest: Array) -> Array:
+        return jnp.where(s == 0, rest, _squared(plus_identity(rest + scale * a), s))
+
+    is_needed = max_over_batch(s) > 0
+    rest = lax.cond(is_needed, squared, lambda a, rest: rest, a, rest)
+    return (s == 0).astype(a.dtype), rest
+
+
 @jax.custom_jvp
 def _squared(x: Array, s: Array) -> Array:
     """x^(2^s)."""
 
-    def once(k, x):
+    def once(k: Array, x: Array) -> Array:
         return jnp.where(k < s, small_product(x, x), x)
 
     return lax.fori_loop(0, max_over_batch(s), once, x)
