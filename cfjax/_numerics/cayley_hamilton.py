@@ -83,8 +83,8 @@ def series(m: int, first: int, count: int, c: list[Inexact[Array, ""]]) -> list[
     `h_i` are the coefficients of the power series of g^m with
     `g(x) = 1 / (1 - c_(n-1) x - .. - c_0 x^n)`.
     """
-    # Else all that uses one of them would compute them anew.
-    return held(_series((m, first, count), c), in_batches=True, alone=False)
+    # Else all that uses one of them would compute them anew: alone, a derivative.
+    return held(_series((m, first, count), c), in_batches=True, alone=m > 1)
 
 
 @functools.partial(jax.custom_jvp, nondiff_argnums=(0,))

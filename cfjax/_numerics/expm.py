@@ -256,7 +256,7 @@ def _small_parts(a: Array) -> tuple[Array, Array]:
         return jnp.where(s == 0, rest, _squared(plus_identity(rest + scale * a), s))
 
     is_needed = max_over_batch(s) > 0
-    rest = lax.cond(is_needed, squared, lambda a, rest: rest, a, rest)
+    rest = lax.cond(is_needed, jax.checkpoint(squared), lambda a, rest: rest, a, rest)
     return (s == 0).astype(a.dtype), rest
 
 
@@ -273,8 +273,23 @@ def _squared(x: Array, s: Array) -> Array:
 @_squared.defjvp
 def _(primals, tangents):
     x, s = primals
+    most = max_over_batch(s)
+
+    @jax.checkpoint
+    def once(x,k):
+        return jnp.where(k < s, small_product(x, x), x)
+
+    def step(x,k):
+        return lax.cond(k < most, once, lambda x, k: x, x, k), None
+
     # A loop of unknown length has no reverse mode.
-    return jax.jvp(lambda x: repeat(lambda x: small_product(x, x), x, s), (x,), tangents[:1])
+    def squared(x):
+        digits=jnp.finfo(x.dtype).nmant
+        first,rest=jnp.arange(_WRITTEN_OUT,dtype=s.dtype),jnp.arange(_WRITTEN_OUT,digits,dtype=s.dtype)
+        x = lax.scan(step, x, first)[0]
+        return lax.cond(most > _WRITTEN_OUT, jax.checkpoint(lambda x: lax.scan(step, x, rest)[0]), lambda x:x, x)
+
+    return jax.jvp(squared, (x,), tangents[:1])
 
 
 def plus_identity(a: Array) -> Array:
