@@ -274,20 +274,22 @@ def _squared(x: Array, s: Array) -> Array:
 def _(primals, tangents):
     x, s = primals
     most = max_over_batch(s)
+    digits = jnp.finfo(x.dtype).nmant
+    ks = jnp.arange(-(-digits // 4) * 4, dtype=s.dtype).reshape(-1, 4)
+
+    def once(x: Array, k: Array) -> tuple[Array, None]:
+        return jnp.where(k < s, small_product(x, x), x), None
 
     @jax.checkpoint
-    def once(x,k):
-        return jnp.where(k < s, small_product(x, x), x)
+    def four(x: Array, ks: Array) -> Array:
+        return lax.scan(once, x, ks)[0]
 
-    def step(x,k):
-        return lax.cond(k < most, once, lambda x, k: x, x, k), None
+    # A loop of unknown length has no reverse mode. Four at a time: most of them are not needed.
+    def some(x: Array, ks: Array) -> tuple[Array, None]:
+        return lax.cond(ks[0] < most, four, lambda x, ks: x, x, ks), None
 
-    # A loop of unknown length has no reverse mode.
-    def squared(x):
-        digits=jnp.finfo(x.dtype).nmant
-        first,rest=jnp.arange(_WRITTEN_OUT,dtype=s.dtype),jnp.arange(_WRITTEN_OUT,digits,dtype=s.dtype)
-        x = lax.scan(step, x, first)[0]
-        return lax.cond(most > _WRITTEN_OUT, jax.checkpoint(lambda x: lax.scan(step, x, rest)[0]), lambda x:x, x)
+    def squared(x: Array) -> Array:
+        return lax.scan(some, x, ks)[0]
 
     return jax.jvp(squared, (x,), tangents[:1])
 
