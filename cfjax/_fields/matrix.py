@@ -8,9 +8,9 @@ import jax.numpy as jnp
 from jaxtyping import Array, Inexact
 
 from .._field import AbstractAlgebraElement
-from .._numerics.expm import expm_parts, one_norm, small_product
+from .._numerics.expm import expm_parts, one_norm
 from .._numerics.expm_times import expm_minus_one_times
-from .._numerics.matmul import promoted
+from .._numerics.matmul import promoted, small_product
 from .elementwise import check_point, each
 
 

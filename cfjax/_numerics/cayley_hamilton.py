@@ -6,89 +6,149 @@ in the numbers c. These are entire functions, and nothing happens where eigenval
 """
 
 import functools
-from collections.abc import Sequence
 from math import factorial
 
 import jax
 import jax.numpy as jnp
 from jax import lax
-from jaxtyping import Array, Inexact, Real
+from jaxtyping import Array, Inexact
 
-from .._xla import held, pack, unpack
+from .._xla import held, unpack
+from .squaring import exponent, max_over_batch, squared, squarings
 
-# Of Taylor's polynomial, with a backward error below half a unit in the last place for norms up to
-# 2.2 and 2.4. So there is room for matrices that are not normal, see `cycles`.
-_DEGREE = {"float32": 15, "float64": 25}
+# Of Taylor's polynomial.
+_DEGREE = {"float32": 13, "float64": 22}
+# The largest sizes without a squaring: see `_characteristic`. For skew-Hermitian matrices a
+# Frobenius norm of 2^½, where the polynomials have a backward error below half a unit in the last
+# place up to norms of 1.7 and 1.8. Other matrices may need that, as eigenvalues do not bound them.
+_SIZES = (2.0, 0.56)
 
 # A real number, or a complex one in two parts: XLA makes slow code of complex arithmetic.
 _Number = tuple[Array, ...]
 
 
-def characteristic(a: Inexact[Array, "n n"]) -> tuple[list[Inexact[Array, ""]], Real[Array, "2"]]:
-    """The numbers `c_0 .. c_(n-1)`, and how large the matrix is by its cycles.
+@jax.jit  # One trace for the many exponentials of a step.
+def expm_parts(
+    a: Inexact[Array, "n n"],
+) -> tuple[Inexact[Array, ""], Inexact[Array, "n n"]]:
+    """`weight, rest` with `exp(a) = weight (I + a) + rest`, for n = 2 or 3, as `expm.expm_parts`.
 
-    The sizes are `sum_ij |a_ij a_ji|` and the sum of `|a_ij a_jk a_ki|` for different i, j, k, each
-    up to a factor 2^½. A change of units `d a d^-1`, d diagonal, does not alter them. There is
-    one after which no entry is larger than the largest mean of a cycle, and all of `exp` is the
-    same up to that change. For normal matrices the first is the square of the Frobenius norm.
+    **Cost:** one matrix product, some 70 products of numbers, and a matrix product for each of s
+    squarings. s is 0 for a skew-Hermitian matrix up to a Frobenius norm of 2^½, and then grows with
+    its logarithm to base 2. A change of units, `d a d^-1` with d diagonal, does not alter s.
+
+    The rounding of the rest is as small as a^2.
+    """
+    c, s, scale = _scaled(a)
+    rest = _taylor(a, _square(a), c, scale)
+
+    def with_squarings(a: Array, rest: Array) -> Array:
+        return jnp.where(s == 0, rest, squared(_exponential(scale * a, rest), s))
+
+    # Without a checkpoint the branch not taken must still hand out room for what the other saves.
+    is_needed = max_over_batch(s) > 0
+    rest = lax.cond(is_needed, jax.checkpoint(with_squarings), lambda a, rest: rest, a, rest)
+    return (s == 0).astype(a.dtype), rest
+
+
+@jax.jit
+def expm_both_parts(
+    a: Inexact[Array, "n n"],
+) -> tuple[Inexact[Array, ""], Inexact[Array, "n n"], Inexact[Array, "n n"]]:
+    """`w, p, m` with `exp(a) = w (I + a) + p` and `exp(-a) = w (I - a) + m`, for n = 2 or 3."""
+    c, s, scale = _scaled(a)
+    square = _square(a)
+    # Those of -a: the k-th from the last has k factors a.
+    opposite = [x if (len(c) - j) % 2 == 0 else -x for j, x in enumerate(c)]
+    both = _taylor(a, square, c, scale), _taylor(-a, square, opposite, scale)
+
+    def with_squarings(a: Array, both: tuple[Array, Array]) -> tuple[Array, Array]:
+        first = _exponential(scale * a, both[0]), _exponential(-scale * a, both[1])
+        plus, minus = squared(first, s)
+        return jnp.where(s == 0, both[0], plus), jnp.where(s == 0, both[1], minus)
+
+    is_needed = max_over_batch(s) > 0
+    both = lax.cond(is_needed, jax.checkpoint(with_squarings), lambda a, both: both, a, both)
+    return (s == 0).astype(a.dtype), *both
+
+
+def _exponential(a: Array, rest: Array) -> Array:
+    return rest + a + jnp.eye(a.shape[0], dtype=a.dtype)
+
+
+def _square(a: Array) -> Array:
+    return jnp.sum(a[:, :, None] * a[None, :, :], axis=1)
+
+
+def _scaled(a: Array) -> tuple[list[Array], Array, Array]:
+    """The `c_0 .. c_(n-1)` of a times 2^-s, the number of squarings s, and 2^-s."""
+    c, sizes = _characteristic(a)
+    sizes = [lax.stop_gradient(size) / most for size, most in zip(sizes, _SIZES, strict=False)]
+    s = (exponent(sizes[0]) + 1) // 2
+    if len(sizes) > 1:
+        s = jnp.maximum(s, (exponent(sizes[1]) + 2) // 3)
+    s, scale = squarings(jnp.maximum(s, 0), sizes[0].dtype)
+    # The power of two is locally constant, so its derivative is zero.
+    scale = factor = scale.astype(a.dtype)
+    for j in reversed(range(len(c))):
+        c[j] = c[j] * factor
+        factor = factor * scale
+    return c, s, scale
+
+
+def _characteristic(a: Array) -> tuple[list[Array], list[Array]]:
+    """The numbers `c_0 .. c_(n-1)`, and how large the matrix is.
+
+    The sizes are `sum_ij |a_ij a_ji|` and, for n = 3, the sum of both `|a_ij a_jk a_ki|`, each up
+    to a factor 2^½. After some change of units no entry is larger than the largest mean of those
+    cycles, and in exponentials and their roundings here a change of units changes nothing else. For
+    a skew-Hermitian matrix the first is the square of its Frobenius norm, which bounds the second.
     """
     n = a.shape[0]
     entries = unpack(a.reshape(n * n))
-    a_ = {(i, j): entries[n * i + j] for i in range(n) for j in range(n)}
-    pairs = {(i, j): a_[i, j] * a_[j, i] for i in range(n) for j in range(i, n)}
-    minors = [pairs[i, j] - a_[i, i] * a_[j, j] for i, j in pairs if i < j]
-    squares = sum((1 + (i < j)) * _magnitude(x) for (i, j), x in pairs.items())
-    trace = sum(a_[i, i] for i in range(n))
+    x = {(i, j): entries[n * i + j] for i in range(n) for j in range(n)}
+    pairs = {(i, j): x[i, j] * x[j, i] for i in range(n) for j in range(i, n)}
+    minors = [pair - x[i, i] * x[j, j] for (i, j), pair in pairs.items() if i < j]
+    squares = sum((1 + (i < j)) * _magnitude(pair) for (i, j), pair in pairs.items())
     if n == 2:
-        return [minors[0], trace], [squares]
-    around = [a_[0, 1] * a_[1, 2] * a_[2, 0], a_[0, 2] * a_[2, 1] * a_[1, 0]]
-    rest = -a_[0, 0] * minors[2] - pairs[0, 1] * a_[2, 2] - pairs[0, 2] * a_[1, 1]
-    determinant = around[0] + around[1] + rest
-    return [determinant, sum(minors), trace], [squares, sum(map(_magnitude, around))]
+        return [minors[0], x[0, 0] + x[1, 1]], [squares]
+    around = [x[0, 1] * x[1, 2] * x[2, 0], x[0, 2] * x[2, 1] * x[1, 0]]
+    rest = x[0, 0] * minors[2] + x[2, 2] * pairs[0, 1] + x[1, 1] * pairs[0, 2]
+    c = [around[0] + around[1] - rest, sum(minors), x[0, 0] + x[1, 1] + x[2, 2]]
+    return c, [squares, sum(map(_magnitude, around))]
 
 
 def _magnitude(x: Array) -> Array:
     return jnp.abs(x.real) + jnp.abs(x.imag) if jnp.iscomplexobj(x) else jnp.abs(x)
 
 
-def num_squarings(exponents: Sequence[Array]) -> Array:
-    """For the exponents of the sizes: so many that `taylor` takes the matrix over 2^s."""
-    s = (exponents[0] - 1) // 2
-    return jnp.maximum(functools.reduce(jnp.maximum, [(e + 1) // 3 for e in exponents[1:]], s), 0)
-
-
-def taylor(
-    a: Inexact[Array, "n n"], c: Sequence[Inexact[Array, ""]], scale: Inexact[Array, ""]
-) -> Inexact[Array, "n n"]:
-    """`exp(b) - I - b` for `b = scale * a`, with a rounding as small as it is."""
+def _taylor(a: Array, square: Array, c: list[Array], scale: Array) -> Array:
+    """`exp(b) - I - b` for `b = scale * a` and the `c` of b."""
     n = a.shape[0]
-    powers = [scale]
-    for _ in range(n - 1):
-        powers.append(powers[-1] * scale)
-    c = [x * power for x, power in zip(c, reversed(powers), strict=True)]
     # exp(b) = I + b + c_0 f_n I + (c_1 f_n + c_0 f_(n+1)) b + ..
-    f = series(1, 2, n, c)
+    f = _series(1, 2, n, c)
     eye = jnp.eye(n, dtype=a.dtype)
     if n == 2:
         return (c[0] * f[0]) * eye + ((c[1] * f[0] + c[0] * f[1]) * scale) * a
-    # The matrix as it is, or each of the nine would be scaled anew for every use.
-    square = jnp.sum(a[:, :, None] * a[None, :, :], axis=1)
-    linear = ((c[1] * f[1] + c[0] * f[2]) * scale) * a + (f[0] * powers[1]) * square
+    # Numbers are scaled and not the matrix: XLA would compute its scale anew for every product.
+    linear = ((c[1] * f[1] + c[0] * f[2]) * scale) * a + (f[0] * (scale * scale)) * square
     return (c[0] * f[1]) * eye + linear
 
 
-def series(m: int, first: int, count: int, c: list[Inexact[Array, ""]]) -> list[Inexact[Array, ""]]:
+def _series(
+    m: int, first: int, count: int, c: list[Inexact[Array, ""]]
+) -> list[Inexact[Array, ""]]:
     """`f_k = sum_i h_i / (i + k)!` for k = first, first + 1, and so on.
 
     `h_i` are the coefficients of the power series of g^m with
     `g(x) = 1 / (1 - c_(n-1) x - .. - c_0 x^n)`.
     """
     # Else all that uses one of them would compute them anew: alone, a derivative.
-    return held(_series((m, first, count), c), in_batches=True, alone=m > 1)
+    return held(_series_of((m, first, count), c), in_batches=True, alone=m > 1)
 
 
 @functools.partial(jax.custom_jvp, nondiff_argnums=(0,))
-def _series(which: tuple[int, int, int], c: list[Array]) -> list[Array]:
+def _series_of(which: tuple[int, int, int], c: list[Array]) -> list[Array]:
     m, first, count = which
     is_complex = jnp.iscomplexobj(c[0])
     parts = [(x.real, x.imag) if is_complex else (x,) for x in c]
@@ -107,15 +167,15 @@ def _series(which: tuple[int, int, int], c: list[Array]) -> list[Array]:
     return [lax.complex(*x) if is_complex else x[0] for x in out]
 
 
-@_series.defjvp
+@_series_of.defjvp
 def _(which, primals, tangents):
     m, first, count = which
     (c,), (c_dot,) = primals, tangents
     n = len(c)
     # The derivative of g^m with respect to c_j is m x^(n-j) g^(m+1).
-    slopes = series(m + 1, first + 1, count + n - 1, c)
+    slopes = _series(m + 1, first + 1, count + n - 1, c)
     out = [m * sum(slopes[k + n - j - 1] * c_dot[j] for j in range(n)) for k in range(count)]
-    return _series(which, c), out
+    return _series_of(which, c), out
 
 
 def _times(x: _Number, y: _Number) -> _Number:

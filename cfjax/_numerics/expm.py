@@ -8,11 +8,11 @@ import jax.numpy as jnp
 import jax.tree_util as jtu
 import numpy as np
 from jax import lax
-from jax.custom_batching import custom_vmap
 from jaxtyping import Array, Inexact, PyTree
 
 from . import cayley_hamilton
-from .matmul import matmul
+from .matmul import small_product
+from .squaring import exponent, max_over_batch, repeat, squarings
 
 T = TypeVar("T", bound=PyTree)
 
@@ -71,21 +71,6 @@ TAYLOR_SCHEMES = {
     "complex128": (_DEGREE_15_DOUBLE, _DEGREE_21),
 }
 
-# Squarings beyond these go through a loop: each one written out costs compile time everywhere.
-_WRITTEN_OUT = 4
-
-
-def small_product(x: Array, y: Array) -> Array:
-    """`x @ y` for matrices, or a matrix and a vector, of one dtype that may be small."""
-    # XLA:CPU writes a real dot up to n = 3 into the code around it. The next ones are calls, two
-    # to four times slower than a sum, which fuses.
-    n = x.shape[-1]
-    if n == 4 or (n < 4 and jnp.iscomplexobj(x)):
-        if x.ndim == 1:
-            return jnp.sum(x[:, None] * y, axis=0)
-        return jnp.sum(x * y if y.ndim == 1 else x[:, :, None] * y[None, :, :], axis=1)
-    return matmul(x, y)
-
 
 def weighted_sum(weights: Sequence[float], terms: Sequence[T]) -> T:
     used = [(w, term) for w, term in zip(weights, terms, strict=True) if w != 0]
@@ -120,61 +105,8 @@ def one_norm(a: Array) -> Array:
 
 def _scaling(theta: float, size: Array) -> tuple[Array, Array]:
     """The number of squarings s for ‖a²‖ = `size`, and 2⁻ˢ (NaN where no s will do)."""
-    return _power(jnp.maximum((_exponent(size / theta**2) + 1) // 2, 0), size.dtype)
-
-
-def _exponent(size: Array) -> Array:
-    """The least e with `size < 2^e`; large if the size is inf or NaN."""
-    # The exponent field is exact where a rounded log2 is not, and puts inf and NaN on top.
-    info = jnp.finfo(size.dtype)
-    bits = lax.bitcast_convert_type(size, jnp.dtype(f"int{info.bits}"))
-    return (bits >> info.nmant) - (info.maxexp - 2)
-
-
-def _power(s: Array, dtype: np.dtype) -> tuple[Array, Array]:
-    """The number of squarings, and 2^-s; NaN where no s will do."""
-    info = jnp.finfo(dtype)
-    # Every squaring doubles the error: after as many as there are digits, none is left.
-    possible = s <= info.nmant
-    s = jnp.where(possible, s, 0)
-    power = lax.bitcast_convert_type((info.maxexp - 1 - s) << info.nmant, dtype)
-    return s.astype(jnp.int32), jnp.where(possible, power, jnp.nan)
-
-
-# A condition that vmap batches becomes a select, which runs both branches. The maximum over the
-# batch is not batched, so a condition on it stays a real branch.
-@custom_vmap
-def max_over_batch(s: Array) -> Array:
-    return s
-
-
-@max_over_batch.def_vmap
-def _(axis_size: int, in_batched: list[bool], s: Array) -> tuple[Array, bool]:
-    del axis_size, in_batched
-    return max_over_batch(jnp.max(s)), False
-
-
-def repeat(step: Callable[[T], T], x: T, s: Array) -> T:
-    """`step` s times. A loop of branches, since one of unknown length has no reverse mode."""
-    most = max_over_batch(s)
-
-    # Without checkpoints the branch not taken must still hand out room for what the other saves.
-    @jax.checkpoint
-    def once(x: T, k: int | Array) -> T:
-        return jtu.tree_map(lambda new, old: jnp.where(k < s, new, old), step(x), x)
-
-    def step_if(x: T, k: int | Array) -> tuple[T, None]:
-        return lax.cond(k < most, once, lambda x, k: x, x, k), None
-
-    @jax.checkpoint
-    def many(x: T) -> T:
-        digits = jnp.finfo(jtu.tree_leaves(x)[0].dtype).nmant
-        ks = jnp.arange(_WRITTEN_OUT, digits, dtype=s.dtype)
-        return lax.scan(step_if, x, ks)[0]
-
-    for k in range(_WRITTEN_OUT):
-        x, _ = step_if(x, k)
-    return lax.cond(most > _WRITTEN_OUT, many, lambda x: x, x)
+    s = jnp.maximum((exponent(size / theta**2) + 1) // 2, 0)
+    return squarings(s, size.dtype)
 
 
 def expm(a: Inexact[Array | np.ndarray, "n n"]) -> Inexact[Array, "n n"]:
@@ -226,7 +158,7 @@ def expm_parts(
         return jnp.zeros((), a.dtype), jnp.where(jnp.isfinite(a), jnp.exp(a), jnp.nan)
 
     if a.shape[0] <= 3:
-        return _small_parts(a)
+        return cayley_hamilton.expm_parts(a)
 
     schemes = TAYLOR_SCHEMES[a.dtype.name]
 
@@ -242,56 +174,6 @@ def expm_parts(
     thetas = [scheme.theta for scheme in schemes]
     weight, rest = by_norm(thetas, a, small_product(a, a), parts)
     return weight, rest[:n, :n]
-
-
-@jax.jit  # One trace for the many exponentials of a step.
-def _small_parts(a: Array) -> tuple[Array, Array]:
-    c, sizes = cayley_hamilton.characteristic(a)
-    exponents = [_exponent(lax.stop_gradient(size)) for size in sizes]
-    s, scale = _power(cayley_hamilton.num_squarings(exponents), sizes[0].dtype)
-    scale = scale.astype(a.dtype)
-    rest = cayley_hamilton.taylor(a, c, scale)
-
-    def squared(a: Array, rest: Array) -> Array:
-        return jnp.where(s == 0, rest, _squared(plus_identity(rest + scale * a), s))
-
-    is_needed = max_over_batch(s) > 0
-    rest = lax.cond(is_needed, jax.checkpoint(squared), lambda a, rest: rest, a, rest)
-    return (s == 0).astype(a.dtype), rest
-
-
-@jax.custom_jvp
-def _squared(x: Array, s: Array) -> Array:
-    """x^(2^s)."""
-
-    def once(k: Array, x: Array) -> Array:
-        return jnp.where(k < s, small_product(x, x), x)
-
-    return lax.fori_loop(0, max_over_batch(s), once, x)
-
-
-@_squared.defjvp
-def _(primals, tangents):
-    x, s = primals
-    most = max_over_batch(s)
-    digits = jnp.finfo(x.dtype).nmant
-    ks = jnp.arange(-(-digits // 4) * 4, dtype=s.dtype).reshape(-1, 4)
-
-    def once(x: Array, k: Array) -> tuple[Array, None]:
-        return jnp.where(k < s, small_product(x, x), x), None
-
-    @jax.checkpoint
-    def four(x: Array, ks: Array) -> Array:
-        return lax.scan(once, x, ks)[0]
-
-    # A loop of unknown length has no reverse mode. Four at a time: most of them are not needed.
-    def some(x: Array, ks: Array) -> tuple[Array, None]:
-        return lax.cond(ks[0] < most, four, lambda x, ks: x, x, ks), None
-
-    def squared(x: Array) -> Array:
-        return lax.scan(some, x, ks)[0]
-
-    return jax.jvp(squared, (x,), tangents[:1])
 
 
 def plus_identity(a: Array) -> Array:
