@@ -14,6 +14,7 @@ from jax import lax
 from jaxtyping import Array, Inexact
 
 from .._xla import held, unpack
+from .matmul import small_product
 from .squaring import exponent, max_over_batch, squared, squarings
 
 # Of Taylor's polynomial.
@@ -40,10 +41,10 @@ def expm_parts(
     The rounding of the rest is as small as a^2.
     """
     c, s, scale = _scaled(a)
-    rest = _taylor(a, _square(a), c, scale)
+    rest = _taylor(a, small_product(a, a), c, scale)
 
     def with_squarings(a: Array, rest: Array) -> Array:
-        return jnp.where(s == 0, rest, squared(_exponential(scale * a, rest), s))
+        return jnp.where(s == 0, rest, squared(_exponential(_times_real(scale, a), rest), s))
 
     # Without a checkpoint the branch not taken must still hand out room for what the other saves.
     is_needed = max_over_batch(s) > 0
@@ -57,13 +58,13 @@ def expm_both_parts(
 ) -> tuple[Inexact[Array, ""], Inexact[Array, "n n"], Inexact[Array, "n n"]]:
     """`w, p, m` with `exp(a) = w (I + a) + p` and `exp(-a) = w (I - a) + m`, for n = 2 or 3."""
     c, s, scale = _scaled(a)
-    square = _square(a)
+    square = small_product(a, a)
     # Those of -a: the k-th from the last has k factors a.
     opposite = [x if (len(c) - j) % 2 == 0 else -x for j, x in enumerate(c)]
     both = _taylor(a, square, c, scale), _taylor(-a, square, opposite, scale)
 
     def with_squarings(a: Array, both: tuple[Array, Array]) -> tuple[Array, Array]:
-        first = _exponential(scale * a, both[0]), _exponential(-scale * a, both[1])
+        first = _exponential(_times_real(scale, a), both[0]), _exponential(_times_real(-scale, a), both[1])
         plus, minus = squared(first, s)
         return jnp.where(s == 0, both[0], plus), jnp.where(s == 0, both[1], minus)
 
@@ -76,10 +77,6 @@ def _exponential(a: Array, rest: Array) -> Array:
     return rest + a + jnp.eye(a.shape[0], dtype=a.dtype)
 
 
-def _square(a: Array) -> Array:
-    return jnp.sum(a[:, :, None] * a[None, :, :], axis=1)
-
-
 def _scaled(a: Array) -> tuple[list[Array], Array, Array]:
     """The `c_0 .. c_(n-1)` of a times 2^-s, the number of squarings s, and 2^-s."""
     c, sizes = _characteristic(a)
@@ -89,9 +86,9 @@ def _scaled(a: Array) -> tuple[list[Array], Array, Array]:
         s = jnp.maximum(s, (exponent(sizes[1]) + 2) // 3)
     s, scale = squarings(jnp.maximum(s, 0), sizes[0].dtype)
     # The power of two is locally constant, so its derivative is zero.
-    scale = factor = scale.astype(a.dtype)
+    factor = scale
     for j in reversed(range(len(c))):
-        c[j] = c[j] * factor
+        c[j] = _times_real(factor, c[j])
         factor = factor * scale
     return c, s, scale
 
@@ -118,6 +115,10 @@ def _characteristic(a: Array) -> tuple[list[Array], list[Array]]:
     return c, [squares, sum(map(_magnitude, around))]
 
 
+def _times_real(factor: Array, x: Array) -> Array:
+    return lax.complex(factor * x.real, factor * x.imag) if jnp.iscomplexobj(x) else factor * x
+
+
 def _magnitude(x: Array) -> Array:
     return jnp.abs(x.real) + jnp.abs(x.imag) if jnp.iscomplexobj(x) else jnp.abs(x)
 
@@ -129,9 +130,10 @@ def _taylor(a: Array, square: Array, c: list[Array], scale: Array) -> Array:
     f = _series(1, 2, n, c)
     eye = jnp.eye(n, dtype=a.dtype)
     if n == 2:
-        return (c[0] * f[0]) * eye + ((c[1] * f[0] + c[0] * f[1]) * scale) * a
+        return (c[0] * f[0]) * eye + _times_real(scale, c[1] * f[0] + c[0] * f[1]) * a
     # Numbers are scaled and not the matrix: XLA would compute its scale anew for every product.
-    linear = ((c[1] * f[1] + c[0] * f[2]) * scale) * a + (f[0] * (scale * scale)) * square
+    linear = _times_real(scale, c[1] * f[1] + c[0] * f[2]) * a
+    linear = linear + _times_real(scale * scale, f[0]) * square
     return (c[0] * f[1]) * eye + linear
 
 
