@@ -118,14 +118,17 @@ def expm(a: Inexact[Array | np.ndarray, "n n"]) -> Inexact[Array, "n n"]:
 
     **Cost:** 5 matrix products (4 in single precision) and s more, with
     s = ⌈log₂(‖a²‖^½ / θ)⌉ ≥ 0 in the 1-norm and θ = 1.687 (2.346 in single precision). In double
-    precision 4 products are enough up to ‖a²‖^½ = 0.676, if n > 4. There is no linear solve and no
-    custom call. Under `jax.vmap` every matrix is scaled by its own norm, and the products are those
-    of the largest. A derivative of any order works, forward and reverse.
+    precision 4 products are enough up to ‖a²‖^½ = 0.676, if n > 4. For n = 2 and 3 there are other
+    formulas, 2 to 4 times faster, and s = ⌈log₂(‖a‖ / 2^½)⌉ ≥ 0 in the Frobenius norm of a matrix
+    that is Hermitian or skew-Hermitian; else s depends on products of entries around cycles, and a
+    change of units does not alter it. There is no linear solve and no custom call. Under `jax.vmap`
+    every matrix is scaled by its own norm, and the products are those of the largest. A derivative
+    of any order works, forward and reverse.
 
     **Accuracy:** a backward error of a few units in the last place of the scaled matrix, doubled
-    by every squaring at worst. exp(0) = I holds exactly, and so does its derivative.
-    ‖a²‖^½ may be up to θ·2⁵² (θ·2²³): beyond, no digit of the answer would be right, and it is
-    NaN. An overflow of exp(a) or of a² gives inf or NaN, an entry that is not finite gives NaN.
+    by every squaring at worst. exp(0) = I holds exactly, and so does its derivative. s may be up to
+    52 (23): beyond, no digit of the answer would be right, and it is NaN. An overflow of exp(a) or
+    of a² gives inf or NaN, an entry that is not finite gives NaN.
 
     **Raises:** `ValueError` if `a` is not a square matrix, `TypeError` for another dtype.
 
@@ -156,7 +159,6 @@ def expm_parts(
         )
     if a.shape[0] <= 1:
         return jnp.zeros((), a.dtype), jnp.where(jnp.isfinite(a), jnp.exp(a), jnp.nan)
-
     if a.shape[0] <= 3:
         return cayley_hamilton.expm_parts(a)
 
