@@ -29,5 +29,5 @@ def small_product(x: Array, y: Array) -> Array:
     if n == 4 or (n < 4 and jnp.iscomplexobj(x)):
         if x.ndim == 1:
             return jnp.sum(x[:, None] * y, axis=0)
-        return jnp.sum(x * y if y.ndim == 1 else x[:, :, None] * y[None, :, :], axis=1)
+        return jnp.sum(x * y[None, :] if y.ndim == 1 else x[:, :, None] * y[None, :, :], axis=1)
     return matmul(x, y)
