@@ -2,12 +2,14 @@
 
 - `by_components`, `repeat`: a step, and many equal ones, on single numbers.
 - `once`, `once_for_sums`: values that several results need, computed once.
-- `pack`: `jnp.stack` in a form that XLA fuses.
+- `pack`, `unpack`: `jnp.stack` and `jnp.unstack` in a form that XLA fuses.
+- `held`, `call`: arrays through memory, and functions that XLA compiles on their own.
 - `rewriting`: the switch that turns it all off; `is_rewritten`: what there is around.
 
 Nothing outside may import from the files within. `README.md` here says what each trick buys.
 """
 
+from .call import call as call
 from .components import by_components as by_components
 from .held import held as held
 from .held import once as once
