@@ -10,10 +10,10 @@ from jax import lax
 from jaxtyping import Array, Bool, Inexact
 
 from .._field import Weight
-from .._numerics.expm import expm_parts, small_product
+from .._numerics.expm import expm_parts
 from .._numerics.expm_both import expm_both_parts
 from .._numerics.expm_source import expm_parts_with_source
-from .._numerics.matmul import promoted
+from .._numerics.matmul import promoted, small_product
 from .elementwise import check_point, each
 from .matrix import AbstractMatrix, check_companion
 

@@ -10,7 +10,7 @@ from jaxtyping import Array, Inexact
 from .._field import AbstractAlgebraElement
 from .._numerics.expm import expm_parts, one_norm
 from .._numerics.expm_times import expm_minus_one_times
-from .._numerics.matmul import matmul, promoted
+from .._numerics.matmul import promoted, small_product
 from .elementwise import check_point, each
 
 
@@ -146,7 +146,7 @@ class LeftMatrix(AbstractOneSided):
 
     @staticmethod
     def act(a: Inexact[Array, "n n"], x: Inexact[Array, "n *k"]) -> Inexact[Array, "n *k"]:
-        return matmul(*promoted(a, x))
+        return small_product(*promoted(a, x))
 
 
 class RightMatrix(AbstractOneSided):
@@ -160,7 +160,7 @@ class RightMatrix(AbstractOneSided):
 
     @staticmethod
     def act(a: Inexact[Array, "n n"], x: Inexact[Array, "*k n"]) -> Inexact[Array, "*k n"]:
-        return matmul(*promoted(x, a))
+        return small_product(*promoted(x, a))
 
 
 def _is_thin(a: Array, point: Array) -> bool:

@@ -8,10 +8,11 @@ import jax.numpy as jnp
 import jax.tree_util as jtu
 import numpy as np
 from jax import lax
-from jax.custom_batching import custom_vmap
 from jaxtyping import Array, Inexact, PyTree
 
-from .matmul import matmul
+from . import cayley_hamilton
+from .matmul import small_product
+from .squaring import exponent, max_over_batch, repeat, squarings
 
 T = TypeVar("T", bound=PyTree)
 
@@ -70,18 +71,6 @@ TAYLOR_SCHEMES = {
     "complex128": (_DEGREE_15_DOUBLE, _DEGREE_21),
 }
 
-# Squarings beyond these go through a loop: each one written out costs compile time everywhere.
-_WRITTEN_OUT = 4
-
-
-def small_product(x: Array, y: Array) -> Array:
-    """`x @ y` for square matrices of one dtype that may be small."""
-    # XLA:CPU writes a real dot up to n = 3 into the code around it. The next ones are calls, two
-    # to four times slower than a sum, which fuses.
-    if x.shape[0] == 4 or (x.shape[0] < 4 and jnp.iscomplexobj(x)):
-        return jnp.sum(x[:, :, None] * y[None, :, :], axis=1)
-    return matmul(x, y)
-
 
 def weighted_sum(weights: Sequence[float], terms: Sequence[T]) -> T:
     used = [(w, term) for w, term in zip(weights, terms, strict=True) if w != 0]
@@ -116,53 +105,8 @@ def one_norm(a: Array) -> Array:
 
 def _scaling(theta: float, size: Array) -> tuple[Array, Array]:
     """The number of squarings s for ‖a²‖ = `size`, and 2⁻ˢ (NaN where no s will do)."""
-    square = size / theta**2
-    info = jnp.finfo(square.dtype)
-    # The exponent field is exact where a rounded log2 is not, and puts inf and NaN on top.
-    integer = jnp.dtype(f"int{info.bits}")
-    exponent = (lax.bitcast_convert_type(square, integer) >> info.nmant) - (info.maxexp - 2)
-    s = jnp.maximum((exponent + 1) // 2, 0)
-    # Every squaring doubles the error: after as many as there are digits, none is left.
-    possible = s <= info.nmant
-    s = jnp.where(possible, s, 0)
-    power = lax.bitcast_convert_type((info.maxexp - 1 - s) << info.nmant, square.dtype)
-    return s.astype(jnp.int32), jnp.where(possible, power, jnp.nan)
-
-
-# A condition that vmap batches becomes a select, which runs both branches. The maximum over the
-# batch is not batched, so a condition on it stays a real branch.
-@custom_vmap
-def max_over_batch(s: Array) -> Array:
-    return s
-
-
-@max_over_batch.def_vmap
-def _(axis_size: int, in_batched: list[bool], s: Array) -> tuple[Array, bool]:
-    del axis_size, in_batched
-    return max_over_batch(jnp.max(s)), False
-
-
-def repeat(step: Callable[[T], T], x: T, s: Array) -> T:
-    """`step` s times. A loop of branches, since one of unknown length has no reverse mode."""
-    most = max_over_batch(s)
-
-    # Without checkpoints the branch not taken must still hand out room for what the other saves.
-    @jax.checkpoint
-    def once(x: T, k: int | Array) -> T:
-        return jtu.tree_map(lambda new, old: jnp.where(k < s, new, old), step(x), x)
-
-    def step_if(x: T, k: int | Array) -> tuple[T, None]:
-        return lax.cond(k < most, once, lambda x, k: x, x, k), None
-
-    @jax.checkpoint
-    def many(x: T) -> T:
-        digits = jnp.finfo(jtu.tree_leaves(x)[0].dtype).nmant
-        ks = jnp.arange(_WRITTEN_OUT, digits, dtype=s.dtype)
-        return lax.scan(step_if, x, ks)[0]
-
-    for k in range(_WRITTEN_OUT):
-        x, _ = step_if(x, k)
-    return lax.cond(most > _WRITTEN_OUT, many, lambda x: x, x)
+    s = jnp.maximum((exponent(size / theta**2) + 1) // 2, 0)
+    return squarings(s, size.dtype)
 
 
 def expm(a: Inexact[Array | np.ndarray, "n n"]) -> Inexact[Array, "n n"]:
@@ -174,14 +118,17 @@ def expm(a: Inexact[Array | np.ndarray, "n n"]) -> Inexact[Array, "n n"]:
 
     **Cost:** 5 matrix products (4 in single precision) and s more, with
     s = ⌈log₂(‖a²‖^½ / θ)⌉ ≥ 0 in the 1-norm and θ = 1.687 (2.346 in single precision). In double
-    precision 4 products are enough up to ‖a²‖^½ = 0.676, if n > 4. There is no linear solve and no
-    custom call. Under `jax.vmap` every matrix is scaled by its own norm, and the products are those
-    of the largest. A derivative of any order works, forward and reverse.
+    precision 4 products are enough up to ‖a²‖^½ = 0.676, if n > 4. For n = 2 and 3 there are other
+    formulas, 2 to 4 times faster, and s = ⌈log₂(‖a‖ / 2^½)⌉ ≥ 0 in the Frobenius norm of a matrix
+    that is Hermitian or skew-Hermitian; else s depends on products of entries around cycles, and a
+    change of units does not alter it. There is no linear solve and no custom call. Under `jax.vmap`
+    every matrix is scaled by its own norm, and the products are those of the largest. A derivative
+    of any order works, forward and reverse.
 
     **Accuracy:** a backward error of a few units in the last place of the scaled matrix, doubled
-    by every squaring at worst. exp(0) = I holds exactly, and so does its derivative.
-    ‖a²‖^½ may be up to θ·2⁵² (θ·2²³): beyond, no digit of the answer would be right, and it is
-    NaN. An overflow of exp(a) or of a² gives inf or NaN, an entry that is not finite gives NaN.
+    by every squaring at worst. exp(0) = I holds exactly, and so does its derivative. s may be up to
+    52 (23): beyond, no digit of the answer would be right, and it is NaN. An overflow of exp(a) or
+    of a² gives inf or NaN, an entry that is not finite gives NaN.
 
     **Raises:** `ValueError` if `a` is not a square matrix, `TypeError` for another dtype.
 
@@ -212,6 +159,8 @@ def expm_parts(
         )
     if a.shape[0] <= 1:
         return jnp.zeros((), a.dtype), jnp.where(jnp.isfinite(a), jnp.exp(a), jnp.nan)
+    if a.shape[0] <= 3:
+        return cayley_hamilton.expm_parts(a)
 
     schemes = TAYLOR_SCHEMES[a.dtype.name]
 

@@ -12,8 +12,8 @@ import numpy as np
 from jax import lax
 from jaxtyping import Array, Float
 
-from .expm import max_over_batch
 from .matmul import matmul
+from .squaring import max_over_batch
 
 # On shorter intervals the error of the second derivative at zero, `eps / length^2`, would show.
 _SHORTEST = 0.1

@@ -5,7 +5,10 @@ import math
 import jax.numpy as jnp
 from jaxtyping import Array, Inexact
 
-from .expm import by_norm, in_full_register, plus_identity, repeat, small_product, weighted_sum
+from . import cayley_hamilton
+from .expm import by_norm, in_full_register, plus_identity, weighted_sum
+from .matmul import small_product
+from .squaring import repeat
 
 # `Z^4 + 120 Z^3`, which both polynomials contain, as Z² times these weights of Z and Z².
 _SHARED = (120.0, 1.0)
@@ -43,6 +46,9 @@ def expm_both_parts(
     The even and the odd part of exp are polynomials in a², evaluated in the form of Sastre, Linear
     Algebra Appl. 539 (2018), doi:10.1016/j.laa.2017.11.010.
     """
+
+    if a.shape[0] in (2, 3):
+        return cayley_hamilton.expm_both_parts(a)
 
     def parts(k: int, a: Array, z: Array, s: Array) -> tuple[Array, Array, Array]:
         z2 = small_product(z, z)

@@ -8,10 +8,10 @@ from .expm import (
     by_norm,
     in_full_register,
     plus_identity,
-    repeat,
-    small_product,
     taylor_from_second,
 )
+from .matmul import small_product
+from .squaring import repeat
 
 # The backward error in the source has a factor k in its k-th term, so norms must be smaller.
 # tests/numerics/test_expm_source.py derives it.

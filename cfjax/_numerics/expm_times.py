@@ -7,7 +7,7 @@ import jax.numpy as jnp
 from jax import lax
 from jaxtyping import Array, Inexact, Real
 
-from .expm import max_over_batch
+from .squaring import max_over_batch
 
 # So many terms of Taylor's series, and the largest norm for which they have a backward error below
 # half a unit in the last place, up to where the terms grow and cancel. As in Table 3.1 of the

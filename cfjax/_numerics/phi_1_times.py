@@ -9,12 +9,11 @@ from .expm import (
     in_full_register,
     one_norm,
     plus_identity,
-    repeat,
-    small_product,
     taylor_from_second,
 )
 from .expm_times import phi_1_series
-from .matmul import matmul, promoted
+from .matmul import matmul, promoted, small_product
+from .squaring import repeat
 
 # A matrix a and a vector v, for the block matrix `[[a, v], [0, 0]]`.
 _Pair = tuple[Array, Array]

@@ -16,6 +16,7 @@ from typing import TYPE_CHECKING, Any
 import diffrax
 import jax.numpy as jnp
 import numpy as np
+from jax import lax
 from jaxtyping import Array, Complex, Float
 
 from .. import (
@@ -31,6 +32,7 @@ from .. import (
     work_precision,
 )
 from .._numerics.matmul import matmul
+from .._xla import call
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
@@ -59,22 +61,34 @@ def field(t: Any, y: Links, args: Any = None) -> LeftMatrix:
 def generator(y: Links) -> Complex[Array, "d *sides 3 3"]:
     """Z: minus the gradient of the action, in su(3)."""
     d = y.shape[0]
-    loops = jnp.stack([matmul(y[mu], _staples(y, mu)) for mu in range(d)])
-    skew = (_dagger(loops) - loops) / 2
-    trace = jnp.trace(skew, axis1=-2, axis2=-1) / 3
-    return skew - trace[..., None, None] * jnp.eye(3, dtype=y.dtype).reshape(*[1] * (d + 1), 3, 3)
+    links = [_apart(y[mu]) for mu in range(d)]
+    ahead = {(mu, nu): _moved(links[mu], -1, nu) for mu in range(d) for nu in range(d) if mu != nu}
+    # What closes a link to squares, on both sides in each other direction.
+    staples: list[list[_Matrices]] = [[] for _ in range(d)]
+    for mu in range(d):
+        for nu in range(mu + 1, d):
+            # The two ways to the opposite corner, backwards.
+            first = _dagger(_product(links[mu], ahead[nu, mu]))
+            second = _dagger(_product(links[nu], ahead[mu, nu]))
+            staples[mu].append(_product(ahead[nu, mu], second))
+            staples[nu].append(_product(ahead[mu, nu], first))
+            staples[mu].append(_moved(_product(first, links[nu]), 1, nu))
+            staples[nu].append(_moved(_product(second, links[mu]), 1, mu))
+    sums = [tuple(map(sum, zip(*each, strict=True))) for each in staples]
+    return jnp.stack([_together(_force(_product(links[mu], sums[mu]))) for mu in range(d)])
 
 
 def velocity(t: Any, y: Links, args: Any = None) -> Complex[Array, "d *sides 3 3"]:
     """The same field in plain space, where no method keeps links unitary."""
-    return matmul(generator(y), y)
+    z = generator(y)
+    return jnp.sum(z[..., :, :, None] * y[..., None, :, :], axis=-2)
 
 
 def plaquettes(y: Links, mu: int, nu: int) -> Complex[Array, "*sides 3 3"]:
     """The product of links around the square that leaves each point along `mu`, then `nu`."""
     there = matmul(y[mu], _ahead(y[nu], mu))
     back = matmul(y[nu], _ahead(y[mu], nu))
-    return matmul(there, _dagger(back))
+    return matmul(there, jnp.conj(jnp.swapaxes(back, -1, -2)))
 
 
 def density(y: Links) -> Float[Array, "*sides"]:
@@ -161,22 +175,47 @@ def picture(side: int = 8) -> "Figure":
     return figure
 
 
-def _staples(y: Links, mu: int) -> Complex[Array, "*sides 3 3"]:
-    """The sum over the other axes of what closes a link along `mu` to a square, on both sides."""
-    total = jnp.zeros_like(y[mu])
-    for nu in range(y.shape[0]):
-        if nu != mu:
-            back = matmul(y[nu], _ahead(y[mu], nu))
-            total = total + matmul(_ahead(y[nu], mu), _dagger(back))
-            below = matmul(_dagger(_ahead(y[nu], mu)), _dagger(y[mu]))
-            total = total + jnp.roll(matmul(below, y[nu]), 1, nu)
-    return total
+# Matrices as real and imaginary parts with the entries in front, (3, 3, *sides): loops over sites
+# become vector instructions.
+_Matrices = tuple[Array, Array]
+
+
+@call
+def _apart(x: Complex[Array, "*sides 3 3"]) -> _Matrices:
+    return jnp.moveaxis(x.real, (-2, -1), (0, 1)), jnp.moveaxis(x.imag, (-2, -1), (0, 1))
+
+
+def _together(x: _Matrices) -> Complex[Array, "*sides 3 3"]:
+    return jnp.moveaxis(lax.complex(*x), (0, 1), (-2, -1))
+
+
+@call
+def _product(x: _Matrices, y: _Matrices) -> _Matrices:
+    # Written out: XLA makes no vector instructions of a sum over an axis.
+    def real(x: Array, y: Array) -> Array:
+        first, second, third = (x[:, k, None] * y[None, k] for k in range(3))
+        return first + second + third
+
+    return real(x[0], y[0]) - real(x[1], y[1]), real(x[0], y[1]) + real(x[1], y[0])
+
+
+def _moved(x: _Matrices, steps: int, axis: int) -> _Matrices:
+    """Along a lattice axis."""
+    return jnp.roll(x[0], steps, axis + 2), jnp.roll(x[1], steps, axis + 2)
+
+
+def _dagger(x: _Matrices) -> _Matrices:
+    return x[0].swapaxes(0, 1), -x[1].swapaxes(0, 1)
+
+
+def _force(loops: _Matrices) -> _Matrices:
+    """The part in su(3) of minus the loops."""
+    real, imaginary = ((back - x) / 2 for back, x in zip(_dagger(loops), loops, strict=True))
+    trace = (imaginary[0, 0] + imaginary[1, 1] + imaginary[2, 2]) / 3
+    eye = jnp.eye(3, dtype=trace.dtype).reshape(3, 3, *[1] * trace.ndim)
+    return real, imaginary - trace[None, None] * eye
 
 
 def _ahead(x: Array, axis: int) -> Array:
     """The neighbours' values along a lattice axis."""
     return jnp.roll(x, -1, axis)
-
-
-def _dagger(x: Array) -> Array:
-    return jnp.conj(jnp.swapaxes(x, -1, -2))
