@@ -47,6 +47,7 @@ AGAINST_THE_DIRECTION = {
 PRIVATE = {
     ("scenes.rigid_body", "_numerics.matmul"): "a rotation of a start, in full precision",
     ("scenes.wilson_flow", "_numerics.matmul"): "products of links, in full precision",
+    ("scenes.wilson_flow", "_xla"): "its field in the form that XLA vectorises",
     ("_paper", "_measure"): "reports, charts and flops are what it shows",
     ("_paper", "scenes"): "its problems",
     ("_paper", "_integrate.integrate"): "counts a step without what estimates its error",
