@@ -356,6 +356,20 @@ DEFECTS = [
         "numerics/test_expm.py",
     ),
     Defect(
+        "_numerics/cayley_hamilton.py",
+        "_plus(*(slopes[k + n - j - 1] * c_dot[j] for j in range(n)))",
+        "_plus(*(slopes[k + j] * c_dot[j] for j in range(n)))",
+        "a derivative of a characteristic polynomial backwards",
+        "numerics/test_cayley_hamilton.py -k derivatives",
+    ),
+    Defect(
+        "_numerics/cayley_hamilton.py",
+        "x if (len(c) - j) % 2 == 0 else -x",
+        "-x",
+        "the characteristic polynomial of -a",
+        "numerics/test_cayley_hamilton.py -k both",
+    ),
+    Defect(
         "_numerics/expm_times.py",
         "term = product(term) / k",
         "term = product(term) / (k + 1)",
