@@ -71,6 +71,12 @@ from ._solvers.low_storage import CK54 as CK54
 from ._solvers.low_storage import YRK135 as YRK135
 from ._solvers.low_storage import Luscher3 as Luscher3
 from ._solvers.low_storage import Williamson3 as Williamson3
+from ._solvers.magnus import Magnus2 as Magnus2
+from ._solvers.magnus import Magnus4 as Magnus4
+from ._solvers.magnus import Magnus4Lobatto as Magnus4Lobatto
+from ._solvers.magnus import Magnus6 as Magnus6
+from ._solvers.magnus import Magnus8 as Magnus8
+from ._solvers.magnus import Magnus10 as Magnus10
 from ._solvers.munthe_kaas import RKMK as RKMK
 from ._solvers.munthe_kaas import RKMK3 as RKMK3
 from ._solvers.munthe_kaas import RKMK4 as RKMK4

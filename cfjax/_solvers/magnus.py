@@ -1,0 +1,215 @@
+"""Commutator-free Magnus methods: high order for fields that depend on time alone."""
+
+import dataclasses
+from collections.abc import Callable, Sequence
+from typing import Any, ClassVar, Literal
+
+import diffrax
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import jax.tree_util as jtu
+from jaxtyping import PyTree
+
+from .._field import combine, enter, flow, is_field, leave, value
+from .._methods import magnus as _magnus
+from .._methods.magnus import MagnusTableau
+from .._methods.tableau import Product
+from .._term import product
+from .base import AbstractLieSolver, Move, State
+from .commutator_free import minus
+from .dense import Path
+from .stages import along, can_loop
+
+
+class AbstractMagnus(AbstractLieSolver):
+    """Flows of linear combinations of the fields at some times within the step.
+
+    For `y' = A(t) y`, and any other field whose coordinates depend on time alone.
+
+    Where the method has an embedded one, the end of that is compared with the step's: the error
+    estimate is `y1 - embedded`. Under a controller of constant steps it costs nothing.
+    `estimate=None` switches it off. (`cfjax.integrate` does.)
+
+    Where the nodes have both ends of the step, its last evaluation is the first one of the next.
+
+    **Raises** `TypeError` when the program is traced if the field depends on the state, be it that
+    it is frozen there as `cfjax.LowRankSkew` is; `ValueError` for another `estimate`.
+    """
+
+    tableau: eqx.AbstractVar[MagnusTableau]
+    estimate: Literal["group"] | None = eqx.field(static=True, default="group", kw_only=True)
+
+    def __check_init__(self):
+        if self.estimate not in ("group", None):
+            raise ValueError(f"estimate must be 'group' or None, got {self.estimate!r}.")
+
+    def without_estimate(self) -> "AbstractMagnus":
+        return dataclasses.replace(self, estimate=None)
+
+    @property
+    def first_same_as_last(self) -> bool:
+        return self.tableau.shares_ends
+
+    def order(self, terms) -> int:
+        return self.tableau.order
+
+    def error_order(self, terms) -> int | None:
+        order = self.tableau.embedded_order
+        return None if order is None else order + 1
+
+    def init(self, terms, t0, t1, y0, args) -> State:
+        def field(y):
+            value = product(terms, terms.vf(t0, y, args), terms.contr(t0, t1))
+            return enter(value, y, ())[0]
+
+        found = _varying(field, y0)
+        if found:
+            raise TypeError(_depends_on_state(type(self).__name__, *found[0]))
+        return super().init(terms, t0, t1, y0, args)
+
+    def move(self, field, y0):
+        tableau = self.tableau
+        fields: list[PyTree] = []
+        start = y0
+        for c in tableau.nodes:
+            # Any state will do.
+            entered, here = enter(field(c, y0), start, fields)
+            start = start if fields else here
+            fields.append(entered)
+
+        embedded = None if self.estimate is None else tableau.embedded
+        num_shared = 0 if embedded is None else _num_shared(tableau.rows, embedded)
+        middle = _moved(tableau.rows[:num_shared], fields, start)
+        end = leave(fields[0], _moved(tableau.rows[num_shared:], fields, middle))
+        error = None
+        if embedded is not None:
+            other = _moved(embedded[num_shared:], fields, middle)
+            error = minus(end, leave(fields[0], other))
+        path = Path.of(tableau.continuous_extension, value(start), fields)
+        return Move(end, path, error)
+
+
+def _num_shared(a: Product, b: Product) -> int:
+    """With how many rows both begin."""
+    return next(n for n, (x, y) in enumerate(zip(a, b, strict=False)) if x != y)
+
+
+def _moved(rows: Product, fields: Sequence[PyTree], point: PyTree) -> PyTree:
+    if len(rows) > 1 and can_loop(fields[0]):
+        return along(rows, fields, point)
+    for row in rows:
+        used = [(a, f) for a, f in zip(row, fields, strict=True) if a != 0]
+        point = flow(combine(*zip(*used, strict=True)), point)
+    return point
+
+
+def _varying(field: Callable[[PyTree], PyTree], y0: PyTree) -> list[tuple[str, Any]]:
+    """The parts of `field(y)` that depend on y, each with its place.
+
+    Under `jax.vmap` over y alone, what does not depend on it has no axis of the batch. That sees
+    through every operation, and takes shapes and dtypes of y for what they are. (A derivative would
+    not see comparisons.)
+    """
+    found = []
+
+    def look(y: PyTree) -> PyTree:
+        for path, part in jtu.tree_leaves_with_path(field(y), is_leaf=is_field):
+
+            def rule(size, is_mapped, leaves, path=path, part=part):
+                found.append((jtu.keystr(path), part))
+                return leaves, is_mapped[0]
+
+            probe = jax.custom_batching.custom_vmap(lambda leaves: leaves)
+            probe.def_vmap(rule)
+            probe(jtu.tree_leaves(part))
+        return y
+
+    if jtu.tree_leaves(y0):
+        many = jtu.tree_map(
+            lambda y: jax.ShapeDtypeStruct((1, *jnp.shape(y)), jnp.result_type(y)), y0
+        )
+        jax.eval_shape(jax.vmap(look), many)
+    return found
+
+
+def _depends_on_state(solver: str, place: str, part: Any) -> str:
+    name = type(part).__name__ if is_field(part) else "a translation"
+    advice = "" if is_field(part) else " Return y' = A(t) y as cfjax.LeftMatrix(A(t))."
+    return (
+        f"{solver} takes fields that depend on time alone, and for y{place} the field, {name}, "
+        f"depends on the state.{advice} Use a method for such fields, for example cfjax.CF4()."
+    )
+
+
+class Magnus2(AbstractMagnus):
+    """The exponential midpoint rule, for fields of time alone. Order 2, 1 evaluation, 1 flow.
+
+    Dense output of order 1. No estimate: `cfjax.Richardson(cfjax.Magnus2())` has one.
+    """
+
+    tableau: ClassVar[MagnusTableau] = _magnus.MAGNUS2
+
+
+class Magnus4(AbstractMagnus, diffrax.AbstractAdaptiveSolver):
+    """Order 4, for fields of time alone: 3 evaluations, 3 flows. All flows go forwards in time.
+
+    The estimate, with an embedded method of order 2, costs 1 flow more and asks for small steps:
+    `cfjax.Richardson(cfjax.Magnus4())` takes fewer. Dense output of order 3.
+
+    Source: Blanes & Moan, Appl. Numer. Math. 56 (2006), doi:10.1016/j.apnum.2005.11.004; Alvermann
+    & Fehske, J. Comput. Phys. 230 (2011), doi:10.1016/j.jcp.2011.04.006. The embedded method was
+    derived for this package.
+    """
+
+    tableau: ClassVar[MagnusTableau] = _magnus.MAGNUS4
+
+
+class Magnus4Lobatto(AbstractMagnus, diffrax.AbstractAdaptiveSolver):
+    """What `CF4` is for fields of time alone, with 2 evaluations and 2 flows instead of 4 and 5.
+
+    Order 4. The estimate, with the midpoint rule, costs 1 flow more. Dense output of order 3.
+    `Magnus4` has an error constant 50 times smaller for one evaluation and one flow more.
+    """
+
+    tableau: ClassVar[MagnusTableau] = _magnus.MAGNUS4_LOBATTO
+
+
+class Magnus6(AbstractMagnus, diffrax.AbstractAdaptiveSolver):
+    """Order 6, for fields of time alone: 4 evaluations, 5 flows, 2 more for the estimate.
+
+    The embedded method has order 4. Dense output of order 5. One flow goes backwards in time, by
+    0.09 of the step: not for fields that hold strong dissipation, see `CF54`.
+
+    Source: derived for this package from the order conditions.
+    """
+
+    tableau: ClassVar[MagnusTableau] = _magnus.MAGNUS6
+
+
+class Magnus8(AbstractMagnus, diffrax.AbstractAdaptiveSolver):
+    """Order 8, for fields of time alone: 6 evaluations, 8 flows, 5 more for the estimate.
+
+    The embedded method is `Magnus6` on these nodes. Dense output of order 7. Two flows go backwards
+    in time, each by 0.44 of the step: not for fields that hold strong dissipation, see `CF54`.
+
+    Source: Alvermann & Fehske, J. Comput. Phys. 230 (2011), doi:10.1016/j.jcp.2011.04.006;
+    Hofstätter, Auzinger & Koch, arXiv:1912.01399. The nodes, seven of Lobatto's, and the estimate
+    were chosen for this package.
+    """
+
+    tableau: ClassVar[MagnusTableau] = _magnus.MAGNUS8
+
+
+class Magnus10(AbstractMagnus, diffrax.AbstractAdaptiveSolver):
+    """Order 10, for fields of time alone: 8 evaluations, 16 flows, 5 more for the estimate.
+
+    The embedded method is `Magnus6` on these nodes. Dense output of order 9. Some flows go
+    backwards in time, by up to 0.31 of the step: not for fields that hold strong dissipation, see
+    `CF54`.
+
+    Source: Hofstätter, Auzinger & Koch, arXiv:1912.01399. The nodes, nine of Lobatto's, and the
+    estimate were chosen for this package.
+    """
+
+    tableau: ClassVar[MagnusTableau] = _magnus.MAGNUS10
