@@ -3,6 +3,7 @@
 from . import covariance as covariance
 from . import heat as heat
 from . import heavy_top as heavy_top
+from . import landau_zener as landau_zener
 from . import rigid_body as rigid_body
 from . import spacecraft as spacecraft
 from . import spins as spins

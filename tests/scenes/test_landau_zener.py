@@ -1,0 +1,124 @@
+"""The Landau-Zener problem: its closed form at any time, its limit, and the norm."""
+
+import diffrax
+import jax
+import jax.numpy as jnp
+import mpmath
+import numpy as np
+import pytest
+
+import cfjax
+from cfjax.scenes import landau_zener
+
+TERM = cfjax.LieTerm(landau_zener.field)
+SWEEPS = [landau_zener.slow, landau_zener.Sweep(3.0, 0.2)]
+
+
+def closed_form(t, t_start, args):
+    """By parabolic cylinder functions, in 30 digits.
+
+    With `n = -i coupling^2 / rate` and `z = exp(i pi / 4) sqrt(rate) t`, `D_n(z)` and `D_n(-z)` are
+    the first amplitudes of two solutions.
+    """
+    with mpmath.workdps(30):
+        rate, coupling = mpmath.mpf(args.rate), mpmath.mpf(args.coupling)
+        n = -1j * coupling**2 / rate
+        unit = mpmath.exp(1j * mpmath.pi / 4) * mpmath.sqrt(rate)
+
+        def solutions(t):
+            columns = []
+            for slope in (unit, -unit):
+                z = slope * t
+                d = mpmath.pcfd(n, z)
+                change = slope * (z / 2 * d - mpmath.pcfd(n + 1, z))
+                columns.append([d, (1j * change - rate * t / 2 * d) / coupling])
+            return mpmath.matrix(columns).T
+
+        weights = mpmath.lu_solve(solutions(mpmath.mpf(t_start)), mpmath.matrix([1, 0]))
+        end = solutions(mpmath.mpf(t)) * weights
+        return np.array([complex(end[0]), complex(end[1])])
+
+
+def end(solver, num_steps, args=landau_zener.slow, y0=None, term=TERM):
+    y0 = landau_zener.y0() if y0 is None else y0
+    t0, t1 = landau_zener.t0, landau_zener.t1
+    sol = cfjax.integrate(term, solver, t0, t1, y0, args, num_steps=num_steps)
+    return np.asarray(sol.ys[-1])
+
+
+@pytest.mark.parametrize("args", SWEEPS)
+@pytest.mark.parametrize("times", [(-10.0, 10.0), (-3.0, 2.0), (4.0, -1.0)])
+def test_the_reference_is_the_closed_form(args, times):
+    t_start, t = times
+    found = landau_zener.reference(t, args=args, t_start=t_start)
+    # A hundred steps or three hundred, of a few roundings each.
+    np.testing.assert_allclose(found, closed_form(t, t_start, args), rtol=0, atol=1e-13)
+
+
+# Steps in which the error is well above rounding and the order seen.
+@pytest.mark.parametrize(
+    ("solver", "num_steps", "order"),
+    [
+        (cfjax.CF4(), 160, 4),
+        (cfjax.Magnus4(), 80, 4),
+        (cfjax.Magnus6(), 80, 6),
+        (cfjax.Magnus8(), 80, 8),
+    ],
+)
+def test_order(solver, num_steps, order):
+    exact = closed_form(landau_zener.t1, landau_zener.t0, landau_zener.slow)
+    errors = [np.abs(end(solver, n) - exact).max() for n in (num_steps, 2 * num_steps)]
+    assert 0.7 * 2**order < errors[0] / errors[1] < 1.4 * 2**order
+
+
+def test_the_limit():
+    args = landau_zener.Sweep(2.0, 0.4)
+    exact = landau_zener.reference(30.0, args=args, t_start=-30.0)
+    # From -T to T the probability is off by some `coupling / (rate T)`.
+    off = float(landau_zener.staying(exact)) - float(landau_zener.limit(args))
+    assert 1e-5 < abs(off) < 2 * 0.4 / (2 * 30)
+    # Without coupling it stays, and slowly swept it does not.
+    assert landau_zener.limit(landau_zener.Sweep(1.0, 0.0)) == 1
+    assert landau_zener.limit(landau_zener.Sweep(0.1, 1.0)) < 1e-27
+
+
+def test_the_norm_stays_where_plain_space_loses_it():
+    plain = diffrax.ODETerm(landau_zener.velocity)
+    y, off = end(cfjax.Magnus6(), 400), end(diffrax.Tsit5(), 400, term=plain)
+    # Sums over the steps are compensated: a few roundings.
+    np.testing.assert_allclose(np.linalg.norm(y), 1, rtol=0, atol=2e-15)
+    assert abs(np.linalg.norm(off) - 1) > 1e-9
+
+
+def test_a_propagator():
+    u = end(cfjax.Magnus6(), 400, y0=np.eye(2, dtype=complex))
+    np.testing.assert_allclose(u @ landau_zener.y0(), end(cfjax.Magnus6(), 400), atol=1e-14)
+    np.testing.assert_allclose(np.conj(u.T) @ u, np.eye(2), rtol=0, atol=4e-15)
+
+
+def test_the_derivative_in_the_coupling():
+    def stays(coupling):
+        args = landau_zener.Sweep(1.0, coupling)
+        sol = cfjax.integrate(
+            TERM, cfjax.Magnus8(), -10.0, 10.0, landau_zener.y0(), args, num_steps=320
+        )
+        return landau_zener.staying(sol.ys[-1])
+
+    def exactly(coupling):
+        args = landau_zener.Sweep(1.0, coupling)
+        return np.abs(closed_form(10.0, -10.0, args)[0]) ** 2
+
+    slope = (exactly(0.5 + 1e-5) - exactly(0.5 - 1e-5)) / 2e-5
+    # The difference is off by 1e-10 times a third derivative, and by 1e-16 / 1e-5.
+    np.testing.assert_allclose(jax.grad(stays)(0.5), slope, rtol=0, atol=1e-8)
+
+
+def test_energies():
+    t = np.array([-3.0, 0.0, 0.7])
+    for s, levels in zip(t, landau_zener.energies(t, landau_zener.slow), strict=True):
+        a = landau_zener.field(s, jnp.zeros(2, complex), landau_zener.slow).a
+        np.testing.assert_allclose(levels, np.linalg.eigvalsh(1j * np.asarray(a)), atol=1e-15)
+
+
+def test_the_picture():
+    assert len(landau_zener.picture().axes) == 3
