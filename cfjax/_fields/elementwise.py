@@ -78,9 +78,9 @@ def check_point(
         more = point.ndim - len(expected)
         if num_axes == 0 and more > 0 and _fits(point.shape[more:], expected):
             hint = (
-                f" For one motion of each point give {coordinates} leading axes: shape "
-                f"{_text(*point.shape[:more], *shape)}, or {_text(*[1] * more, *shape)} for equal "
-                "motions."
+                " For one motion of each point give the coordinates leading axes: "
+                f"{coordinates} of shape {_text(*point.shape[:more], *shape)}, or "
+                f"{_text(*[1] * more, *shape)} for equal motions."
             )
             break
     raise ValueError(

@@ -54,8 +54,9 @@ from .scope import (
 
 # A state is taken apart if all of it is numbers and short vectors, so many entries together, and if
 # a step is not longer than that, counted in operations on single numbers: the time to compile grows
-# with it, and more so in derivatives. `README.md` here has what that buys and costs.
-_MAX_ENTRIES = 16
+# with it, and more so in derivatives. `README.md` here has what that buys and costs. What a loop
+# carries may have what sums have lost of each entry too, the number of the step and a result.
+_MAX_ENTRIES: dict[Place, int] = {"step": 16, "loop": 34}
 _MAX_OPERATIONS = 3000
 
 _CALLS = frozenset(("jit", "pjit"))
@@ -128,8 +129,8 @@ def trace(fun: Callable[[PyTree], PyTree], y: PyTree, place: Place) -> Program |
     It must have no effects, no branches or loops, and no function with a rule for reverse mode
     alone.
     """
-    rows = _has_rows(y)
-    if not is_on() or not (rows or _is_small_state(y)):
+    rows = _has_rows(y, _MAX_ENTRIES[place])
+    if not is_on() or not (rows or _is_small_state(y, _MAX_ENTRIES[place])):
         return None
     with within(place, rows):
         jaxpr, out = jax.make_jaxpr(fun, return_shape=True)(y)
@@ -169,22 +170,22 @@ def _constant(x: Any) -> np.ndarray | None:
     return None if np.size(x) > MAX_SIZE or is_inexact(x) or not is_numeric(x) else np.asarray(x)
 
 
-def _is_small_state(y: PyTree) -> bool:
+def _is_small_state(y: PyTree, max_entries: int) -> bool:
     leaves = jtu.tree_leaves(y)
     return (
         any(map(is_short, leaves))
         and all(is_short(x) or (np.ndim(x) == 0 and is_numeric(x)) for x in leaves)
-        and sum(map(np.size, leaves)) <= _MAX_ENTRIES
+        and sum(map(np.size, leaves)) <= max_entries
     )
 
 
-def _has_rows(y: PyTree) -> bool:
+def _has_rows(y: PyTree, max_entries: int) -> bool:
     """Whether this is a state with short vectors along leading axes."""
     leaves = jtu.tree_leaves(y)
     return (
         any(map(is_rows, leaves))
         and all(map(is_numeric, leaves))
-        and sum(map(_entries, map(np.shape, leaves))) <= _MAX_ENTRIES
+        and sum(map(_entries, map(np.shape, leaves))) <= max_entries
     )
 
 

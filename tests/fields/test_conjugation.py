@@ -373,7 +373,7 @@ def test_leading_axes_of_one_are_broadcast():
         (
             lambda: Congruence(np.eye(3)).tangent(jnp.ones((7, 3, 3))),
             ValueError,
-            r"For one motion of each point give a leading axes: shape \(7, 3, 3\)",
+            r"give the coordinates leading axes: a of shape \(7, 3, 3\)",
         ),
         (
             lambda: Congruence(np.ones((1, 3, 3)), np.ones((5, 3, 3))).flow(jnp.ones((7, 3, 3))),

@@ -269,8 +269,8 @@ def test_a_stiefel_step_keeps_one_span_for_its_stages():
         (
             lambda: cfjax.Rotation(np.ones(3)),
             (100, 3),
-            r"got \(100, 3\). For one motion of each point give omega leading axes: shape "
-            r"\(100, 3\), or \(1, 3\) for equal motions",
+            r"got \(100, 3\). For one motion of each point give the coordinates leading axes: "
+            r"omega of shape \(100, 3\), or \(1, 3\) for equal motions",
         ),
         (
             lambda: cfjax.LeftMatrix(np.ones((16, 3, 3))),

@@ -389,7 +389,7 @@ def planar(frame="body", w=(), v=(2,)):
             lambda: rigid().tangent(jnp.ones((100, 7))),
             ValueError,
             r"acts on shapes \(4, 4\) and \(7,\), got \(100, 7\). For one motion of each point "
-            r"give v leading axes: shape \(100, 3\)",
+            r"give the coordinates leading axes: v of shape \(100, 3\)",
         ),
         (
             lambda: rigid().increment(jnp.ones(7, np.float32)),

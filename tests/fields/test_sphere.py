@@ -311,7 +311,7 @@ def test_wrong_point(n, no_shape_hook):
     field = SphereRotation(jnp.ones(n))
     texts = {
         (5,): rf"g of shape \({n},\) acts on shapes \({n},\), got \(5,\)",
-        (7, n): rf"For one motion of each point give g leading axes: shape \(7, {n}\), or \(1, {n}",
+        (7, n): rf"give the coordinates leading axes: g of shape \(7, {n}\), or \(1, {n}",
     }
     for shape, text in texts.items():
         with pytest.raises(ValueError, match=text):
