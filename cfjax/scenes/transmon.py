@@ -190,9 +190,10 @@ def picture() -> "Figure":
         sol = integrate(
             LieTerm(field), Magnus6(), t0, args.duration, y0(), args, num_steps=n, save_every=1
         )
+        ys = np.asarray(sol.ys)
         times = args.duration * np.arange(1, n + 1) / n
         up, down = axes[:, column]
-        loss = float(infidelity(sol.ys[-1], args))
+        loss = float(infidelity(ys[-1], args))
         up.set_title(f"{name}: infidelity {loss:.1e}")
         up.plot(times, np.asarray(drive(times, args)), color="0.8", linewidth=0.8, label="drive")
         for part, label, colour in zip(
@@ -200,7 +201,7 @@ def picture() -> "Figure":
         ):
             up.plot(times, np.asarray(part), color=colour, label=label)
         for k, colour in enumerate(["#0072B2", "#E69F00", "#D55E00", "#CC79A7"]):
-            down.semilogy(times, np.abs(sol.ys[:, k, 0]) ** 2, color=colour, label=f"level {k}")
+            down.semilogy(times, np.abs(ys[:, k, 0]) ** 2, color=colour, label=f"level {k}")
         down.set(ylim=(1e-7, 2), xlabel="time, ns")
     axes[0, 0].set_ylabel("rad/ns")
     axes[1, 0].set_ylabel("population")
