@@ -60,8 +60,7 @@ class AbstractMagnus(AbstractLieSolver):
 
     def init(self, terms, t0, t1, y0, args) -> State:
         def field(y):
-            value = product(terms, terms.vf(t0, y, args), terms.contr(t0, t1))
-            return enter(value, y, ())[0]
+            return product(terms, terms.vf(t0, y, args), terms.contr(t0, t1))
 
         found = _varying(field, y0)
         if found:
@@ -105,7 +104,7 @@ def _moved(rows: Product, fields: Sequence[PyTree], point: PyTree) -> PyTree:
 
 
 def _varying(field: Callable[[PyTree], PyTree], y0: PyTree) -> list[tuple[str, Any]]:
-    """The parts of `field(y)` that depend on y, each with its place.
+    """The parts of `field(y)` that depend on y or on being frozen there, each with its place.
 
     Under `jax.vmap` over y alone, what does not depend on it has no axis of the batch. That sees
     through every operation, and takes shapes and dtypes of y for what they are. (A derivative would
@@ -114,7 +113,10 @@ def _varying(field: Callable[[PyTree], PyTree], y0: PyTree) -> list[tuple[str, A
     found = []
 
     def look(y: PyTree) -> PyTree:
-        for path, part in jtu.tree_leaves_with_path(field(y), is_leaf=is_field):
+        frozen = field(y)
+        parts, treedef = jtu.tree_flatten_with_path(frozen, is_leaf=is_field)
+        entered = treedef.flatten_up_to(enter(frozen, y, ())[0])
+        for (path, part), coordinates in zip(parts, entered, strict=True):
 
             def rule(size, is_mapped, leaves, path=path, part=part):
                 found.append((jtu.keystr(path), part))
@@ -122,7 +124,7 @@ def _varying(field: Callable[[PyTree], PyTree], y0: PyTree) -> list[tuple[str, A
 
             probe = jax.custom_batching.custom_vmap(lambda leaves: leaves)
             probe.def_vmap(rule)
-            probe(jtu.tree_leaves(part))
+            probe(jtu.tree_leaves(coordinates))
         return y
 
     if jtu.tree_leaves(y0):
