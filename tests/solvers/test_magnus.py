@@ -99,7 +99,8 @@ def test_order_within_a_step(name):
     order = np.log(errors[0] / errors[1]) / np.log(1.5)
     # The error of one step of a method of this order is of one more.
     expected = max(2, solver.order(None))
-    assert expected - 0.5 < order < expected + 0.6
+    # From above in the long steps which orders 8 and 10 need to be seen over rounding.
+    assert expected - 0.5 < order < expected + 0.9
 
 
 @pytest.mark.parametrize("name", MAGNUS)
