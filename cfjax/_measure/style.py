@@ -26,6 +26,9 @@ _OTHER_STYLES = [
     dict(color="#E69F00", linestyle="--", marker="P"),
     dict(color="#000000", linestyle="-.", marker="X"),
     dict(color="#999999", linestyle=":", marker="*"),
+    dict(color="#D55E00", linestyle="-", marker="<"),
+    dict(color="#CC79A7", linestyle="--", marker=">"),
+    dict(color="#009E73", linestyle=":", marker="h"),
 ]
 
 

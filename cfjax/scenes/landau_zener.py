@@ -156,7 +156,9 @@ def picture() -> "Figure":
         share = np.abs(np.einsum("ti,ti->t", np.linalg.eigh(h)[1][:, :, k].conj(), psi)) ** 2
         points = np.stack([t, bands[:, k]], axis=-1)
         pieces = np.stack([points[:-1], points[1:]], axis=1)
-        lines = LineCollection(pieces, linewidths=1 + 6 * share, capstyle="round", color="#0072B2")
+        lines = LineCollection(
+            list(pieces), linewidths=1 + 6 * share, capstyle="round", color="#0072B2"
+        )
         levels.add_collection(lines)
     levels.set(title="Levels, as wide as they are filled", xlabel="t", ylabel="energy")
 
