@@ -110,6 +110,13 @@ def expm_minus_one_multiply(
     return _by_real(moved, lambda x: jnp.where(possible, x, jnp.nan))
 
 
+def row_norm(a: Inexact[Array, "n *n"]) -> Real[Array, ""]:
+    """The largest sum of absolute values in a row of a matrix, or entry of a diagonal."""
+    # Without a hypot, which no vector instruction has. What underflows does not matter here.
+    size = jnp.sqrt(a.real**2 + a.imag**2) if jnp.iscomplexobj(a) else jnp.abs(a)
+    return jnp.max(size if a.ndim == 1 else jnp.sum(size, axis=1), initial=0)
+
+
 def _by_real(x: Array, scale: Callable[[Array], Array]) -> Array:
     """A product or quotient with a real number, without the products with its imaginary zero."""
     return lax.complex(scale(x.real), scale(x.imag)) if jnp.iscomplexobj(x) else scale(x)

@@ -76,7 +76,7 @@ class Path(eqx.Module):
             leaves = [arrays[i] for i in self.places]
             point, fields = jtu.tree_unflatten(self.structure, leaves)
             rows = [_polynomials(powers, theta) for powers in self.continuous_extension]
-            if self.move is flow and len(rows) > 1 and can_loop(fields[0]):
+            if self.move is flow and len(rows) > 1 and can_loop(fields[0], point):
                 return along(rows, fields, point)
             for weights in rows:
                 used = [(w, f) for w, f in zip(weights, fields, strict=False) if w is not None]
