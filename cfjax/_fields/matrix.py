@@ -148,8 +148,9 @@ class LeftMatrix(AbstractOneSided):
 
     A flow costs one dense exponential, 4 or 5 products of size n and one for each squaring, and a
     product with the point. For n = 2 and 3 the exponential costs 1 product and some 70 products of
-    numbers. For few columns, `8 k <= n` (`16 k <= n` if complex), and a 1-norm of `a` up to 2.4 it
-    costs 12 to 25 products with the point and no exponential.
+    numbers. For few columns, `8 k <= n` (`16 k <= n` if complex), it costs 10 to 25 products with
+    the point for norms up to 2.4 and 10 for each unit beyond; the norm is the largest sum of
+    absolute values in a row. Norms above n / 2 take the exponential.
 
     **Arguments:** `a`, shape `(*batch, n, n)`, float32, float64, complex64 or complex128. A real
     `a` may act on a complex point of the same precision.

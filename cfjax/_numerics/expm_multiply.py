@@ -66,8 +66,8 @@ def expm_minus_one_multiply(
 
     **Cost:** in double precision 9, 13, 17 and 25 products for norms of 0.09, 0.4, 0.93 and 2.4,
     and 10.3 for each unit of larger ones; if A is skew 9, 12, 16, 24, 40 and 64 for norms of
-    0.125, 0.5, 1.25, 4, 12 and 28, and 2.3 for each unit beyond. Reverse mode keeps no more than
-    112 vectors, however large the norm is. Under `jax.vmap` the largest norm decides.
+    0.125, 0.5, 1.25, 4, 12 and 28, and 2.3 for each unit beyond. Reverse mode keeps fewer than
+    200 vectors, however large the norm is. Under `jax.vmap` the largest norm decides.
 
     **Accuracy:** a backward error of a few units in the last place for each unit of the norm; the
     number of terms depends on A alone and not on `x`, so derivatives are as accurate. NaN for
