@@ -82,6 +82,7 @@ def velocity(t: Any, y: State, args: Any = None) -> Complex[Array, " size"]:
 
 def energy(t: Any, y: State, args: Any = None) -> Float[Array, ""]:
     """The mean energy at time t."""
+    y = jnp.asarray(y)
     return jnp.vdot(y, 1j * velocity(t, y, args)).real
 
 
