@@ -94,7 +94,7 @@ def fidelity(y: State) -> Float[Array, ""]:
 def reference(t: float, num_spins: int = 8) -> Complex[np.ndarray, " size"]:
     """The state at time `t`, by SciPy's DOP853 in plain space, with a tolerance of 1e-13.
 
-    With sparse matrices made of Kronecker products. The error is about 1e-12.
+    With sparse matrices made of Kronecker products. The error is about 1e-11.
     """
     import scipy.sparse as sparse
     from scipy.integrate import solve_ivp
@@ -117,7 +117,7 @@ def reference(t: float, num_spins: int = 8) -> Complex[np.ndarray, " size"]:
 
 
 def chart(num_spins: int = 10, **options: Any) -> WorkPrecision:
-    """Ten spins, 20 to 1280 equal steps; Tsit5 and Dopri8 in plain space with equal operators."""
+    """Ten spins, 80 to 1280 equal steps; Tsit5 and Dopri8 in plain space with equal operators."""
     space = diffrax.ODETerm(velocity)
     return work_precision(
         LieTerm(field),
@@ -132,7 +132,8 @@ def chart(num_spins: int = 10, **options: Any) -> WorkPrecision:
             "Dopri8": (space, diffrax.Dopri8()),
         },
         reference=reference(t1, num_spins),
-        num_steps=[20 * 2**k for k in range(7)],
+        # With fewer, methods in plain space are not stable.
+        num_steps=[80 * 2**k for k in range(5)],
         **options,
     )
 
