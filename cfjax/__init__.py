@@ -25,6 +25,7 @@ from ._fields.low_rank import BorderedSkew as BorderedSkew
 from ._fields.low_rank import LowRankSkew as LowRankSkew
 from ._fields.matrix import LeftMatrix as LeftMatrix
 from ._fields.matrix import RightMatrix as RightMatrix
+from ._fields.operator_sum import OperatorSum as OperatorSum
 from ._fields.quaternion import QuaternionRotation as QuaternionRotation
 from ._fields.rigid_motion import PlanarMotion as PlanarMotion
 from ._fields.rigid_motion import RigidMotion as RigidMotion

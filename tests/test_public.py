@@ -24,6 +24,7 @@ PROMISED = [
     "Conjugation",
     "Congruence",
     "LinearAffine",
+    "OperatorSum",
     "LowRankSkew",
     "BorderedSkew",
     "SphereRotation",

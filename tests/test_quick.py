@@ -75,6 +75,12 @@ FIELDS = {
         ),
         FRAME,
     ),
+    "OperatorSum": (
+        lambda t, y, args: cfjax.OperatorSum(
+            args[:2] * y[:2] + t, [np.eye(3, k=1), np.arange(3.0)]
+        ),
+        ON_SPHERE,
+    ),
     "Affine": (
         lambda t, y, args: cfjax.Affine(1.0, jnp.sin(y), -args, cfjax.SineTransform()),
         ON_SPHERE,

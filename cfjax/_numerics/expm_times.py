@@ -1,4 +1,4 @@
-"""The exponential of a dense matrix, applied to a few columns."""
+"""phi_1 of a dense matrix, applied to a few columns."""
 
 from collections.abc import Callable
 
@@ -16,19 +16,6 @@ _DEGREES = {
     "float32": ((5, 0.1308), (10, 0.9951), (15, 2.217)),
     "float64": ((12, 0.2996), (16, 0.7802), (20, 1.438), (25, 2.428)),
 }
-
-
-def expm_minus_one_times(
-    product: Callable[[Array], Array],
-    x: Inexact[Array, "..."],
-    norm: Real[Array, ""],
-    dense: Callable[[], Array],
-) -> Inexact[Array, "..."]:
-    """`(exp(A) - 1) x = A x + A^2 x / 2! + ...`. Added to x, it rounds less than exp(A) times x.
-
-    Arguments, cost and accuracy as for `phi_1_series`, but for one product more.
-    """
-    return phi_1_series(product, product(x), norm, dense)
 
 
 def phi_1_series(

@@ -106,7 +106,7 @@ class AbstractCommutatorFree(AbstractLieSolver):
         is_looped = False
         is_usual = type(self).element is AbstractCommutatorFree.element
         # Two stages at one point would be one flow with two times.
-        if is_usual and len({*stages[:-1]}) == len(times) and can_loop(fields[0]):
+        if is_usual and len({*stages[:-1]}) == len(times) and can_loop(fields[0], y0):
             first = fields[0]
 
             def entered(c, here: PyTree) -> PyTree:

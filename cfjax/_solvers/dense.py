@@ -8,6 +8,7 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 import jax.tree_util as jtu
+import numpy as np
 from jaxtyping import Array, PyTree
 
 from .._field import combine, flow, leave
@@ -48,7 +49,7 @@ class Path(eqx.Module):
     kept is put back in all its places, so fields on a common span know it as one again.
     """
 
-    arrays: tuple[Array, ...]
+    arrays: tuple[Array | np.ndarray, ...]
     places: tuple[int, ...] = eqx.field(static=True)
     structure: Any = eqx.field(static=True)
     continuous_extension: ContinuousExtension = eqx.field(static=True)
@@ -72,11 +73,11 @@ class Path(eqx.Module):
     def point(self, theta: Any) -> PyTree:
         """The solution at a part `theta` of the step."""
 
-        def end(arrays: tuple[Array, ...]) -> PyTree:
+        def end(arrays: tuple[Array | np.ndarray, ...]) -> PyTree:
             leaves = [arrays[i] for i in self.places]
             point, fields = jtu.tree_unflatten(self.structure, leaves)
             rows = [_polynomials(powers, theta) for powers in self.continuous_extension]
-            if self.move is flow and len(rows) > 1 and can_loop(fields[0]):
+            if self.move is flow and len(rows) > 1 and can_loop(fields[0], point):
                 return along(rows, fields, point)
             for weights in rows:
                 used = [(w, f) for w, f in zip(weights, fields, strict=False) if w is not None]

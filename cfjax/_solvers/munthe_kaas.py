@@ -187,7 +187,7 @@ class RKMK(AbstractMuntheKaas):
             return _dexpinv(u, field(c, u), degree)
 
         stages = [field(0.0, None)]
-        if all(map(any, self.a[1:])) and can_loop(stages[0]):
+        if all(map(any, self.a[1:])) and can_loop(stages[0], stages[0]):
             with contextlib.suppress(FieldVaries):
                 return elements(stages[0], self.a, self.c, element)
         for c, row in zip(self.c[1:], self.a[1:], strict=True):

@@ -14,6 +14,10 @@ from .._field import AbstractFrozenField, Incremented, flow, is_field, is_increm
 from .._fields.elementwise import Elementwise
 from .._xla import is_rewritten, pack
 
+# A loop copies the fields of all stages in each of its turns. For a dense matrix of more entries
+# that moves a vector, this takes longer than the flow.
+_SMALL = 100
+
 _is_written_out: ContextVar[bool] = ContextVar("is_written_out", default=False)
 
 
@@ -43,19 +47,25 @@ class FieldVaries(Exception):
     """The field has not one structure, shape and dtype at all stages."""
 
 
-def can_loop(field: PyTree) -> bool:
+def can_loop(field: PyTree, point: PyTree) -> bool:
     """Whether a loop over the stages pays: where there are flows, written for one point as for all.
 
     A step that is rewritten for XLA is faster written out. So are fields that combine in a way of
-    their own or work in coordinates of the step, whose arrays grow from stage to stage.
+    their own or work in coordinates of the step, whose arrays grow from stage to stage, and fields
+    of far more numbers than the point has.
     """
     parts = jtu.tree_leaves(field, is_leaf=is_field)
     return (
         not is_rewritten()
         and not _is_written_out.get()
         and any(map(is_field, parts))
+        and _size(field) <= max(_SMALL, 4 * _size(point))
         and is_plain(field)
     )
+
+
+def _size(tree: PyTree) -> int:
+    return sum(jnp.size(x) for x in jtu.tree_leaves(tree))
 
 
 def is_plain(field: PyTree) -> bool:

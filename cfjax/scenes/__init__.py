@@ -1,5 +1,6 @@
 """Problems with known answers, one to a module."""
 
+from . import annealing as annealing
 from . import covariance as covariance
 from . import heat as heat
 from . import heavy_top as heavy_top

@@ -91,6 +91,16 @@ def border(gamma):
 
 
 TURN = np.array([[0, -1], [1, 0]])
+# Fixed operators of which only the coefficients vary: a matrix, and a function of a vector.
+OPERATORS = skew(np.triu(normal(4, 4))) / 4, skew(np.eye(4, k=1)) / 2
+
+
+def from_neighbour(x):
+    """Half of the next entry less half of the one before."""
+    zero = jnp.zeros_like(x[:1])
+    return (jnp.concatenate([x[1:], zero]) - jnp.concatenate([zero, x[:-1]])) / 2
+
+
 SPECTRUM = -np.array([0.0, 1.0, 1.0, 2.5])
 CASES = {
     "Rotation": Case(
@@ -280,6 +290,32 @@ CASES = {
         lambda x, alpha, b: (alpha * np.diag(SPECTRUM).astype(LONG), b),
         SIZES,
     ),
+    "OperatorSum": Case(
+        lambda coefficients: cfjax.OperatorSum(
+            coefficients, [OPERATORS[0].astype(coefficients.dtype), (from_neighbour, 1.0)]
+        ),
+        lambda: unit(coefficients=normal(2)),
+        normal(4),
+        lambda x, coefficients: (
+            coefficients[0] * OPERATORS[0] + coefficients[1] * OPERATORS[1],
+            0,
+        ),
+        has_bracket=False,
+    ),
+    "OperatorSum of columns, skew": Case(
+        lambda coefficients: cfjax.OperatorSum(
+            coefficients,
+            [OPERATORS[0].astype(coefficients.dtype), (from_neighbour, 1.0)],
+            is_skew=True,
+        ),
+        lambda: unit(coefficients=normal(2)),
+        normal(4, 2),
+        lambda x, coefficients: (
+            columns(coefficients[0] * OPERATORS[0] + coefficients[1] * OPERATORS[1], 2),
+            0,
+        ),
+        has_bracket=False,
+    ),
 }
 # One of each kind; the others compile for minutes.
 QUICK = {
@@ -293,7 +329,7 @@ QUICK = {
 SOME_SLOW = [
     name if name in QUICK else pytest.param(name, marks=pytest.mark.slow) for name in CASES
 ]
-WITH_AXES = [name for name in CASES if name != "Affine"]
+WITH_AXES = [name for name in CASES if name.partition(" ")[0] not in ("Affine", "OperatorSum")]
 
 
 def exact(case, coordinates, point):

@@ -1,0 +1,255 @@
+"""Sums of operators: every kind of them, derivatives, solves, and what is refused."""
+
+import functools
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import lineax as lx
+import numpy as np
+import pytest
+import scipy.linalg
+from jax.experimental.sparse import BCOO
+
+import cfjax
+from cfjax import OperatorSum
+
+N = 6
+RNG = np.random.default_rng(0)
+EPS = 2.0**-52
+
+
+def symmetric():
+    a = RNG.normal(size=(N, N))
+    return (a + a.T) / np.linalg.norm(a + a.T, 2)
+
+
+def reverse(x):
+    return x[::-1]
+
+
+class Shift(eqx.Module):
+    """A function with an array."""
+
+    weights: jax.Array
+
+    def __call__(self, x):
+        return self.weights.astype(x.dtype) * jnp.roll(x, 1)
+
+
+MATRICES = [symmetric() for _ in range(4)]
+DIAGONALS = RNG.normal(size=(3, N))
+KINDS = {
+    "array": (MATRICES[0], MATRICES[0]),
+    "diagonal": (DIAGONALS[0], np.diag(DIAGONALS[0])),
+    "sparse": (BCOO.fromdense(jnp.asarray(np.triu(MATRICES[1]))), np.triu(MATRICES[1])),
+    "lineax matrix": (lx.MatrixLinearOperator(jnp.asarray(MATRICES[2])), MATRICES[2]),
+    "lineax diagonal": (
+        lx.DiagonalLinearOperator(jnp.asarray(DIAGONALS[1])),
+        np.diag(DIAGONALS[1]),
+    ),
+    "lineax sum": (
+        (
+            lx.MatrixLinearOperator(jnp.asarray(MATRICES[3]))
+            + lx.DiagonalLinearOperator(jnp.asarray(DIAGONALS[2])),
+            10.0,
+        ),
+        MATRICES[3] + np.diag(DIAGONALS[2]),
+    ),
+    "function": ((reverse, 1), np.eye(N)[::-1]),
+    "module": (
+        (Shift(jnp.asarray(DIAGONALS[0])), 3.0),
+        DIAGONALS[0][:, None] * np.roll(np.eye(N), 1, axis=0),
+    ),
+}
+OPERATORS = [operator for operator, _ in KINDS.values()]
+DENSE = np.stack([matrix for _, matrix in KINDS.values()])
+K = len(OPERATORS)
+C = RNG.normal(size=K) / 2
+X = RNG.normal(size=N) + 1j * RNG.normal(size=N)
+
+
+@eqx.filter_jit
+def flow(field, x):
+    return field.flow(x)
+
+
+@eqx.filter_jit
+def tangent(field, x):
+    return field.tangent(x)
+
+
+@pytest.mark.parametrize("x", [X, X.real, np.stack([X, X[::-1]], 1)], ids=["", "real", "columns"])
+def test_every_kind_of_operator(x):
+    total = np.tensordot(C, DENSE, 1)
+    field = OperatorSum(C, OPERATORS)
+    # Some units of rounding of terms that are as large as the norms say.
+    norms = np.linalg.norm(DENSE, 2, axis=(1, 2))
+    scale = np.exp(np.abs(C) @ norms) * np.abs(x).sum() * EPS
+    np.testing.assert_allclose(tangent(field, x), total @ x, rtol=0, atol=10 * scale)
+    np.testing.assert_allclose(
+        flow(field, x), scipy.linalg.expm(total) @ x, rtol=0, atol=20 * scale
+    )
+
+
+def test_complex_coefficients_and_single_precision():
+    h = np.tensordot(C[:2], DENSE[:2], 1)
+    field = OperatorSum(-1j * C[:2], OPERATORS[:2], is_skew=True)
+    expected = scipy.linalg.expm(-1j * h) @ X
+    np.testing.assert_allclose(flow(field, X), expected, rtol=0, atol=20 * EPS)
+    single = [a.astype(np.float32) for a in OPERATORS[:2]]
+    field = OperatorSum((-1j * C[:2]).astype(np.complex64), single, is_skew=True)
+    found = flow(field, X.astype(np.complex64))
+    assert found.dtype == np.complex64
+    np.testing.assert_allclose(found, expected, rtol=0, atol=20 * 2.0**-23)
+
+
+@functools.partial(jax.jit, static_argnums=0)
+def pulled_back(flow, c, a, x, w):
+    return jax.vjp(flow, c, a, x)[1](w)
+
+
+def test_derivatives_in_coefficients_operators_and_state():
+    def flow(c, a, x):
+        return OperatorSum(c, [a, sparse]).flow(x)
+
+    sparse = BCOO.fromdense(jnp.asarray(MATRICES[1]))
+
+    a, x, w, d = MATRICES[0], X.real, X.imag, MATRICES[2]
+    c = C[:2]
+    total = c[0] * a + c[1] * MATRICES[1]
+    in_c, in_a, in_x = pulled_back(flow, c, a, x, w)
+
+    def along(direction):
+        return w @ scipy.linalg.expm_frechet(total, direction, compute_expm=False) @ x
+
+    # Some units for numbers of size 10.
+    close = functools.partial(np.testing.assert_allclose, rtol=0, atol=1e-13)
+    close(in_c, [along(a), along(MATRICES[1])])
+    close(np.vdot(in_a, d), c[0] * along(d))
+    close(in_x, scipy.linalg.expm(total).T @ w)
+
+
+def test_check_field():
+    fields = [OperatorSum(c, OPERATORS) for c in RNG.normal(size=(2, K)) / 2]
+    cfjax.check_field(fields, X)
+
+
+def generator(t, args):
+    return jnp.stack([jnp.ones_like(t), args * jnp.sin(t)])
+
+
+SKEW = [-1j * MATRICES[0], -1j * DIAGONALS[0]]
+
+
+def test_a_solve_is_that_with_the_dense_matrix():
+    dense = jnp.stack([jnp.asarray(SKEW[0]), jnp.diag(jnp.asarray(SKEW[1]))])
+
+    def field(t, y, args):
+        return OperatorSum(generator(t, args), SKEW, is_skew=True)
+
+    def left(t, y, args):
+        return cfjax.LeftMatrix(jnp.tensordot(generator(t, args).astype(complex), dense, 1))
+
+    ends = [
+        cfjax.integrate(cfjax.LieTerm(f), cfjax.CF4(), 0.0, 2.0, X, 1.5, num_steps=10).ys[-1]
+        for f in (field, left)
+    ]
+    # The same steps, to rounding.
+    np.testing.assert_allclose(*ends, rtol=0, atol=1e-13)
+    assert np.linalg.norm(ends[0]) == pytest.approx(np.linalg.norm(X), rel=1e-14)
+
+
+def test_operators_in_args_have_a_gradient_through_a_solve():
+    def end(a):
+        def field(t, y, args):
+            return OperatorSum(generator(t, 1.0), [args, DIAGONALS[0]])
+
+        found = cfjax.integrate(cfjax.LieTerm(field), cfjax.CF2(), 0.0, 1.0, X.real, a, num_steps=3)
+        return jnp.sum(found.ys[-1] * X.imag)
+
+    d, h = MATRICES[1], 1e-5
+    slope, ends = jax.jit(lambda a: (jax.grad(end)(a), [end(a + h * d), end(a - h * d)]))(
+        MATRICES[0]
+    )
+    # Truncation h^2 and rounding eps / h.
+    np.testing.assert_allclose(np.vdot(slope, d), (ends[0] - ends[1]) / (2 * h), rtol=1e-8)
+
+
+def test_fields_with_other_operators_are_not_added():
+    field = OperatorSum([1.0], [MATRICES[0]])
+    for other in (
+        OperatorSum([1.0], [DIAGONALS[0]]),
+        OperatorSum([1.0], [(reverse, 1.0)]),
+        OperatorSum([1.0], [MATRICES[0] - MATRICES[0].T], is_skew=True),
+    ):
+        with pytest.raises(ValueError, match="must have the same operators"):
+            cfjax.combine((1.0, 1.0), (field, other))
+    with pytest.raises(eqx.EquinoxRuntimeError, match="must have the same operators"):
+        cfjax.combine((1.0, 1.0), (field, OperatorSum([1.0], [MATRICES[1]])))
+    total = cfjax.combine((1.0, 2.0), (field, OperatorSum([1.0], [MATRICES[0] + 0.0])))
+    np.testing.assert_array_equal(total.coefficients, [3.0])
+
+
+def square(x):
+    return x * x
+
+
+A = MATRICES[0]
+
+
+@pytest.mark.parametrize(
+    ("arguments", "error", "message"),
+    [
+        (
+            ([1.0, 2.0], [A]),
+            ValueError,
+            r"coefficients .* the 1 operators, shape \(1,\), got \(2,\)",
+        ),
+        (([np.ones(2)], [A]), ValueError, r"coefficients must be an array .* shapes \[\(2,\)\]"),
+        (([1], []), TypeError, "operators must be a sequence of at least one"),
+        (([1, 1], [A, A[:2, :2]]), ValueError, r"one size, got 6 for .*\[0\] and 2 for .*\[1\]"),
+        (([1], [A[:2]]), ValueError, r"operators\[0\] must have shape \(n, n\).* got \(2, 6\)"),
+        (
+            ([1, 1], [A, A.astype(np.float32)]),
+            TypeError,
+            r"one precision, got float64 for operators\[0\] and float32 for operators\[1\]",
+        ),
+        (([1], [np.eye(2, dtype=int)]), TypeError, r"operators\[0\] must be one of float32.*int64"),
+        ((np.ones(1, np.float32), [A]), TypeError, "coefficients must .* float64, got float32"),
+        (([np.float32(1)], [A]), TypeError, "coefficients must have the precision float64"),
+        (([1], ["H"]), TypeError, r"operators\[0\] must be an array, .* got 'H'"),
+        (([1, 1], [A, reverse]), ValueError, r"function needs a bound .* for operators\[1\]"),
+        (
+            ([1], [lx.IdentityLinearOperator(jax.ShapeDtypeStruct((3,), float))]),
+            ValueError,
+            r"IdentityLinearOperator needs a bound on its norm",
+        ),
+        (([1, 1], [A, (reverse, "1")]), TypeError, r"norm of operators\[1\] must be a real"),
+        (([1, 1], [A, (reverse, -1)]), ValueError, r"norm of operators\[1\] must be finite and >="),
+        (([1, 1], [A, (reverse, 0.5)]), ValueError, r"operators\[1\] must have a norm of at least"),
+        (([1, 1], [A, (square, 9.0)]), ValueError, r"operators\[1\] must be linear"),
+        (([1, 1], [A, (jnp.sum, 9.0)]), ValueError, r"operators\[1\] must return a vector of size"),
+    ],
+)
+def test_wrong_arguments(arguments, error, message, no_shape_hook):
+    with pytest.raises(error, match=message):
+        OperatorSum(*arguments)
+
+
+def test_what_is_not_skew(no_shape_hook):
+    with pytest.raises(ValueError, match=r"operators\[0\] must be skew-Hermitian"):
+        OperatorSum([1.0], [A], is_skew=True)
+    with pytest.raises(TypeError, match="is_skew must be True or False"):
+        OperatorSum([1.0], [A], is_skew=1)
+
+
+def test_functions_are_checked_where_a_program_is_traced(no_shape_hook):
+    term = cfjax.LieTerm(lambda t, y, args: OperatorSum([t], [(square, 100.0)]))
+    with pytest.raises(ValueError, match=r"operators\[0\] must be linear"):
+        cfjax.integrate(term, cfjax.CF4(), 0.0, 1.0, X.real, num_steps=1)
+
+
+def test_wrong_point(no_shape_hook):
+    with pytest.raises(ValueError, match=r"acts on shapes \(6,\) and \(6, k\), got \(5,\)"):
+        OperatorSum([1.0], [A]).flow(jnp.ones(5))
