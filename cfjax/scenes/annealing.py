@@ -21,7 +21,18 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Complex, Float
 
-from .. import CF4, CF43, CF54, LieTerm, OperatorSum, WorkPrecision, tangent, work_precision
+from .. import (
+    CF4,
+    CF54,
+    LieTerm,
+    Magnus4,
+    Magnus6,
+    Magnus8,
+    OperatorSum,
+    WorkPrecision,
+    tangent,
+    work_precision,
+)
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
@@ -126,8 +137,10 @@ def chart(num_spins: int = 10, **options: Any) -> WorkPrecision:
         y0(num_spins),
         methods={
             "CF4": CF4(),
-            "CF43": CF43(),
             "CF54": CF54(),
+            "Magnus4": Magnus4(),
+            "Magnus6": Magnus6(),
+            "Magnus8": Magnus8(),
             "Tsit5": (space, diffrax.Tsit5()),
             "Dopri8": (space, diffrax.Dopri8()),
         },
@@ -145,22 +158,24 @@ def picture(num_spins: int = 8) -> "Figure":
 
     from .. import integrate
 
-    n = 100
+    n = 50
     term = LieTerm(field)
 
     def solve(duration: Any) -> Any:
         start = y0(num_spins)
-        return integrate(term, CF4(), 0.0, duration, start, duration, num_steps=n, save_every=2)
+        return integrate(term, Magnus6(), 0.0, duration, start, duration, num_steps=n, save_every=1)
 
     durations = np.geomspace(1.0, 100.0, 25)
     ends = jax.lax.map(lambda duration: solve(duration).ys[-1], jnp.asarray(durations))
     found = solve(jnp.asarray(t1))
     times, ys = np.asarray(found.ts), np.asarray(found.ys)
     eye = jnp.eye(2**num_spins, dtype=complex)
-    lowest = [
-        np.linalg.eigvalsh(1j * np.asarray(tangent(field(t, eye[0]), eye)))[:12] for t in times
-    ]
-    energies = [float(energy(t, jnp.asarray(y))) for t, y in zip(times, ys, strict=True)]
+    # One after the other, in one program.
+    h, energies = jax.lax.map(
+        lambda pair: (1j * tangent(field(pair[0], eye[0]), eye), energy(*pair)),
+        (jnp.asarray(times), jnp.asarray(ys)),
+    )
+    lowest = np.linalg.eigvalsh(h)[:, :12]
 
     figure = Figure((10.5, 3.4), layout="constrained")
     levels, spins, slow = figure.subplots(1, 3)
