@@ -5,7 +5,6 @@ import contextlib
 import functools
 from collections.abc import Callable
 from fractions import Fraction
-from math import factorial
 from typing import Any, ClassVar
 
 import diffrax
@@ -17,6 +16,7 @@ from .._field import (
     AbstractAlgebraElement,
     bracket,
     combine,
+    dexpinv,
     enter,
     flow,
     is_field,
@@ -184,7 +184,7 @@ class RKMK(AbstractMuntheKaas):
         degree = self.order(None) - 2
 
         def element(c: Any, u: PyTree) -> PyTree:
-            return _dexpinv(u, field(c, u), degree)
+            return dexpinv(u, field(c, u), degree)
 
         stages = [field(0.0, None)]
         if all(map(any, self.a[1:])) and can_loop(stages[0]):
@@ -202,21 +202,3 @@ _classical_order = functools.lru_cache(runge_kutta_order)
 def _combine_nonzero(weights: Any, fields: Any) -> PyTree:
     used = [(float(w), f) for w, f in zip(weights, fields, strict=True) if w != 0]
     return combine(*zip(*used, strict=True))
-
-
-def _dexpinv(u: PyTree, v: PyTree, degree: int) -> PyTree:
-    """`sum_k B_k / k! ad_u^k(v)` for k up to `degree`, with the Bernoulli numbers B_k."""
-    weights, terms = [1.0], [v]
-    for k in range(1, degree + 1):
-        v = bracket(u, v)
-        weights.append(float(_bernoulli(k) / factorial(k)))
-        terms.append(v)
-    return _combine_nonzero(weights, terms)
-
-
-def _bernoulli(n: int) -> Fraction:
-    """Bernoulli numbers with `B_1 = -1/2`, by the Akiyama-Tanigawa recursion."""
-    row = [Fraction(1, m + 1) for m in range(n + 1)]
-    for k in range(n, 0, -1):
-        row = [(j + 1) * (row[j] - row[j + 1]) for j in range(k)]
-    return -row[0] if n == 1 else row[0]
