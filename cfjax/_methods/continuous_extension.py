@@ -65,21 +65,19 @@ def runge_kutta_extension(
 ) -> RungeKuttaExtension:
     """One of uniform order p - 1 in a linear space, for a Runge-Kutta method of order p.
 
-    `a[i]` and `b[i]` belong to stage i; in the end `a` may have stages without weight. The method's
-    own stages suffice up to order 5 with as few as diffrax has. `diffrax.Dopri8` takes 4 more,
-    which evaluate the field at the end of the step and at three points within. These points are
-    where the stages so far reach one order more than elsewhere. Where there are no such points the
-    order is what the stages reach.
+    `a[i]` and `b[i]` belong to stage i. The method's own stages suffice up to order 5 with as few
+    as diffrax has. `diffrax.Dopri8` takes 4 more, which evaluate the field at the end of the step
+    and at three points within. These points are where the stages so far reach one order more than
+    elsewhere. Where there are no such points the order is what the stages reach.
     """
-    rows, more = list(a), []
-    found, reached = _solve((b,), _tree_conditions(a[: len(b)], len(b)), _MAX_POWER)
-    promised = runge_kutta_order(a[1 : len(b)], b) - 1
+    more = []
+    found, reached = _solve((b,), _tree_conditions(a, len(b)), _MAX_POWER)
+    promised = runge_kutta_order(a[1:], b) - 1
     if reached < promised:
-        if b not in rows:
-            more.append((b, 1.0))
+        more.append((b, 1.0))
         points = [1.0]
         while points:
-            stages = (*rows, *(row for row, _ in more))
+            stages = (*a, *(row for row, _ in more))
             padded = (*b, *[0.0] * (len(stages) - len(b)))
             conditions = list(islice(_tree_conditions(stages, len(stages)), promised))
             found, reached = _solve((padded,), iter(conditions), _MAX_POWER)

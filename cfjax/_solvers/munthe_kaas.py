@@ -26,7 +26,7 @@ from .._field import (
     without_bracket,
 )
 from .._field import value as value_of
-from .._methods.continuous_extension import RungeKuttaExtension, runge_kutta_extension
+from .._methods.continuous_extension import runge_kutta_extension
 from .._methods.order_conditions import runge_kutta_order
 from .._methods.tableau import ContinuousExtension, Row
 from .._xla import once
@@ -75,10 +75,10 @@ class AbstractMuntheKaas(AbstractLieSolver):
         `field(c, u)` is `h f(t + c h, exp(u) y0)`, and `u = None` means zero.
         """
 
-    def more_elements(
+    def estimating(
         self, elements: list[PyTree], v: PyTree, end: PyTree, start: PyTree, field: _FieldAt
     ) -> list[PyTree]:
-        """These and what else the estimate and the output within the step take."""
+        """These and what else the estimate takes; v leads from the start to the end."""
         return elements
 
     def move(self, field, y0):
@@ -87,18 +87,17 @@ class AbstractMuntheKaas(AbstractLieSolver):
         if self.first_same_as_last:
             # Two results of the step, the state and the last field, need its end.
             end = once(end)
+        left, error = leave(v, end), None
         # All that follows is for error control and output within the step. It is dead code, left
         # out by the compiler, where nobody asks for them.
-        elements = self.more_elements(elements, v, end, start, field_at)
-        path = Path.of(self.continuous_extension, value_of(start), elements)
-        left, error = leave(v, end), None
         if self.estimate is not None and self.b_error is not None:
+            elements = self.estimating(elements, v, end, start, field_at)
             off = _combine_nonzero(self.b_error, elements)
             if self.estimate == "algebra":
                 error = tangent(off, value_of(left))
             else:
                 error = minus(left, leave(v, flow(combine((1.0, -1.0), (v, off)), start)))
-        return Move(left, path, error)
+        return Move(left, Path.of(self.continuous_extension, value_of(start), elements), error)
 
     def logarithm(self, field: Callable[[Any, PyTree], PyTree], y0: PyTree) -> Any:
         """The element v with the end of the step `exp(v) y0`, what it is a combination of, y0, and
@@ -189,7 +188,7 @@ class RKMK4(AbstractMuntheKaas):
 
 
 class RKMK(AbstractMuntheKaas, diffrax.AbstractAdaptiveSolver):
-    """The Munthe-Kaas method of any explicit Runge-Kutta method, with its order and embedded method.
+    """The Munthe-Kaas method of any explicit Runge-Kutta method, with its order and its estimate.
 
     Each stage but the first takes the inverse derivative of the exponential, `dexpinv` of the
     field: a closed form for `Rotation`, `QuaternionRotation`, `RigidMotion` and `PlanarMotion`,
@@ -252,32 +251,40 @@ class RKMK(AbstractMuntheKaas, diffrax.AbstractAdaptiveSolver):
 
     @property
     def first_same_as_last(self) -> bool:
-        return self.estimate is not None and self.b in self.a and not self._extension.rows
+        return self.estimate is not None and self.b == self.a[-1]
 
     @property
     def continuous_extension(self) -> ContinuousExtension:
-        return self._extension.weights
-
-    @property
-    def _extension(self) -> RungeKuttaExtension:
-        return runge_kutta_extension(self.a, self.b)
+        return runge_kutta_extension(self.a[: len(self.b)], self.b).weights
 
     def elements(self, field):
         n = len(self.b)
         return self._stages([field(0.0, None)], self.a[1:n], self.c[1:n], field)
 
-    def more_elements(self, elements, v, end, start, field):
-        extension, n = self._extension, len(self.b)
-        rows = (*self.a[n:], *extension.rows)
-        times = (*self.c[n:], *extension.times)
+    def estimating(self, elements, v, end, start, field):
+        n, elements = len(self.b), list(elements)
+        for c, row in zip(self.c[n:], self.a[n:], strict=True):
+            u, here = v, end
+            if row != self.b:
+                u = _combine_nonzero(row, elements)
+                here = flow(u, start)
+            elements.append(dexpinv(u, field(c, here), self._degree))
+        return elements
+
+    def extended(self, path, field):
+        n = len(self.b)
+        _, rows, times = runge_kutta_extension(self.a[:n], self.b)
+        if not rows:
+            return path
+        start, elements = path.parts(path.arrays)
 
         def along(c: Any, u: PyTree) -> PyTree:
-            return field(c, flow(u, start))
+            here = flow(u, start)
+            return enter(field(c, leave(elements[0], here)), here, elements)[0]
 
-        if rows and rows[0] == self.b:
-            elements = [*elements, dexpinv(v, field(times[0], end), self._degree)]
-            rows, times = rows[1:], times[1:]
-        return self._stages(elements, rows, times, along)
+        return Path.of(
+            path.continuous_extension, start, self._stages(elements[:n], rows, times, along)
+        )
 
     @property
     def _degree(self) -> int:

@@ -76,7 +76,7 @@ def _is_plain(field: AbstractFrozenField) -> bool:
 
 def elements(
     known: Sequence[PyTree],
-    rows: Sequence[Sequence[float]],
+    rows: Sequence[Sequence[Any]],
     times: Sequence[float],
     element: Callable[[Real[Array, ""], PyTree], PyTree],
 ) -> list[PyTree]:

@@ -268,7 +268,8 @@ def inexact_end() -> tuple[float, float]:
     "name, stages",
     [
         *[("RKMK3", 1), ("RKMK4", 1), ("Heun", 1), ("Bosh3", 0)],
-        *[("Dopri5", 1), ("Tsit5", 1), ("Dopri8", 2)],
+        # Of Dopri8's one is for output within the step, which runs here as all else does.
+        *[("Dopri5", 1), ("Tsit5", 1), ("Dopri8", 3)],
     ],
 )
 def test_the_last_stage_is_at_the_end_exactly(name, stages):
@@ -277,6 +278,7 @@ def test_the_last_stage_is_at_the_end_exactly(name, stages):
     The rows of a tableau in floating point sum to their stage time up to rounding only.
     """
     solver = METHODS[name] if name in METHODS else cfjax.RKMK(getattr(diffrax, name).tableau)
+    solver = solver.without_estimate()
     t0, t1 = inexact_end()
     times = []
 
@@ -341,18 +343,21 @@ def count_step(solver, y):
 )
 @pytest.mark.parametrize("shape", [(3,), (4, 4)])
 def test_a_step_costs_what_its_docstring_says(name, evaluations, flows, brackets, shape):
-    counts = count_step(METHODS[name], jnp.ones(shape))
+    counts = count_step(METHODS[name].without_estimate(), jnp.ones(shape))
     assert counts == {"evaluations": evaluations, "flows": flows, "brackets": brackets}
 
 
 @pytest.mark.representatives(1)
 @pytest.mark.parametrize("name", ["Dopri5", "Tsit5"])
 def test_a_method_of_order_five_keeps_within_its_brackets(name):
-    """`(s - 1)(q - 2)` at most, and no evaluation for a stage without weight."""
-    counts = count_step(METHODS[name], jnp.ones((4, 4)))
-    assert counts["evaluations"] == 6
-    assert counts["flows"] == 6
-    assert counts["brackets"] <= 5 * 3
+    """Two for each stage but the first, and no evaluation for a stage without weight."""
+    solver = METHODS[name]
+    counts = count_step(solver.without_estimate(), jnp.ones((4, 4)))
+    assert counts == {"evaluations": 6, "flows": 6, "brackets": 5 * 2}
+    # With the estimate the last evaluation is the first of the next step.
+    assert solver.first_same_as_last
+    counts = count_step(solver, jnp.ones((4, 4)))
+    assert counts == {"evaluations": 6, "flows": 6, "brackets": 6 * 2}
 
 
 # Refusals
