@@ -529,7 +529,13 @@ def exact_dexpinv(constants, u, v):
 
 
 @pytest.mark.parametrize("dtype", [np.float32, np.float64])
-@pytest.mark.parametrize("name", WITH_DEXPINV)
+@pytest.mark.parametrize(
+    "name",
+    [
+        pytest.param(name, marks=[pytest.mark.slow] * (name in ("LeftMatrix", "LinearAffine")))
+        for name in WITH_DEXPINV
+    ],
+)
 def test_the_inverse_derivative_of_the_exponential(name, dtype):
     """And its first and second derivative, by differences of 50 digits."""
     case, is_closed = CASES[name], WITH_DEXPINV[name]
