@@ -172,7 +172,7 @@ DEFECTS = [
         "solvers/test_munthe_kaas.py::test_one_step_is_the_published_formula",
     ),
     Defect(
-        "_solvers/munthe_kaas.py",
+        "_field.py",
         "weights.append(float(_bernoulli(k) / factorial(k)))",
         "weights.append(float(_bernoulli(k)))",
         "a missing factorial in the series of RKMK",
@@ -180,8 +180,8 @@ DEFECTS = [
     ),
     Defect(
         "_solvers/munthe_kaas.py",
-        "degree = self.order(None) - 2",
-        "degree = self.order(None) - 3",
+        "return self.order(None) - 2",
+        "return self.order(None) - 3",
         "one commutator too few in RKMK",
         "solvers/test_munthe_kaas.py::test_one_step_is_the_published_formula",
     ),
