@@ -61,20 +61,16 @@ METHODS: dict[str, tuple[diffrax.AbstractSolver, int]] = {
 
 
 def solve(scene: Scene, name: str, y0: Any, num_steps: Any) -> Any:
+    """`num_steps` may be traced, to look for it: then all are solved by diffrax."""
     solver, _ = METHODS[name]
-    if name.startswith("diffrax"):
+    in_space, is_known = name.startswith("diffrax"), isinstance(num_steps, int)
+    term = diffrax.ODETerm(scene.velocity) if in_space else cfjax.LieTerm(scene.field)
+    if in_space or not is_known:
         # Rounding of the times may make a step more.
-        sol = diffrax.diffeqsolve(
-            diffrax.ODETerm(scene.velocity),
-            solver,
-            0.0,
-            scene.end,
-            scene.end / num_steps,
-            y0,
-            max_steps=num_steps + 1 if isinstance(num_steps, int) else None,
-        )
+        max_steps = num_steps + 1 if is_known else None
+        step = scene.end / num_steps
+        sol = diffrax.diffeqsolve(term, solver, 0.0, scene.end, step, y0, max_steps=max_steps)
     else:
-        term = cfjax.LieTerm(scene.field)
         sol = cfjax.integrate(term, solver, 0.0, scene.end, y0, num_steps=num_steps)
     return jax.tree.map(lambda y: y[-1], sol.ys)
 

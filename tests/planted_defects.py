@@ -186,6 +186,20 @@ DEFECTS = [
         "solvers/test_munthe_kaas.py::test_one_step_is_the_published_formula",
     ),
     Defect(
+        "_solvers/munthe_kaas.py",
+        "b_error: ClassVar[Row] = _sixths(1, -2, 1, -1)",
+        "b_error: ClassVar[Row] = _sixths(1, -2, 1, 0)",
+        "an estimate of RKMK3 without its commutator",
+        "solvers/test_munthe_kaas.py -k embedded_method_says",
+    ),
+    Defect(
+        "_numerics/rotate.py",
+        "excess * twice[i] - once[i] / 2",
+        "excess * twice[i] + once[i] / 2",
+        "a wrong sign in the closed form of dexpinv",
+        "fields/test_contract.py -k inverse_derivative",
+    ),
+    Defect(
         "_solvers/retraction.py",
         "g = v - matmul(q, matmul(q.T, v)) / 2",
         "g = v - matmul(q, matmul(q.T, v))",
@@ -265,8 +279,8 @@ DEFECTS = [
     ),
     Defect(
         "_fields/quaternion.py",
-        'if self.frame == "fixed" else (other, self)',
-        'if self.frame == "body" else (other, self)',
+        'sign = 1 if self.frame == "fixed" else -1',
+        'sign = -1 if self.frame == "fixed" else 1',
         "a bracket of quaternions in the wrong frame",
         "fields/test_contract.py -k Quat",
     ),
