@@ -277,14 +277,16 @@ class RKMK(AbstractMuntheKaas, diffrax.AbstractAdaptiveSolver):
         if not rows:
             return path
         start, elements = path.parts(path.arrays)
+        entered = list(elements)
 
         def along(c: Any, u: PyTree) -> PyTree:
             here = flow(u, start)
-            return enter(field(c, leave(elements[0], here)), here, elements)[0]
+            value, _ = enter(field(c, leave(entered[0], here)), here, entered)
+            entered.append(value)
+            return value
 
-        return Path.of(
-            path.continuous_extension, start, self._stages(elements[:n], rows, times, along)
-        )
+        elements = self._stages(elements[:n], rows, times, along)
+        return Path.of(path.continuous_extension, start, elements)
 
     @property
     def _degree(self) -> int:

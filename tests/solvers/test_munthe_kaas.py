@@ -11,6 +11,7 @@ import jax.numpy as jnp
 import numpy as np
 import problems
 import pytest
+import scipy.integrate
 import scipy.linalg
 
 import cfjax
@@ -582,3 +583,33 @@ def test_equal_solvers_do_not_trace_again():
 def test_a_solver_in_place_of_its_tableau(given, no_shape_hook):
     with pytest.raises(TypeError, match=r"Write diffrax\.Dopri8\.tableau"):
         cfjax.RKMK(given)
+
+
+@pytest.mark.slow
+def test_output_within_steps_in_coordinates_of_the_step():
+    """More stages than the step has, for fields whose span grows with every stage."""
+    a = problems.GENERATORS[0] / 2
+
+    def velocity(xp, t, y):
+        return xp.sin(t) * (a @ y) + xp.cos(2 * t) * a[0]
+
+    def ode(t, y):
+        g = velocity(np, t, y)
+        return g - y * (y @ g)
+
+    y0, ts = np.full(4, 0.5), np.linspace(0, 1, 8)
+    exact = scipy.integrate.solve_ivp(
+        ode, (0, 1), y0, method="DOP853", rtol=2.3e-14, atol=1e-15, t_eval=ts
+    )
+    term = cfjax.LieTerm(lambda t, y, args: cfjax.SphereRotation(velocity(jnp, t, y)))
+    solver = cfjax.RKMK(diffrax.Dopri8.tableau)
+    off = []
+    for h in (0.2, 0.1):
+        sol = diffrax.diffeqsolve(
+            term, solver, 0.0, 1.0, h, jnp.asarray(y0), saveat=diffrax.SaveAt(ts=ts)
+        )
+        assert sol.ys is not None
+        off.append(np.abs(sol.ys - exact.y.T).max())
+    # Halved steps divide the error by 2^8. Order 5 within would leave more than 1e-9.
+    assert off[0] < 1e-7
+    assert off[1] < max(off[0] / 100, 1e-13)
