@@ -86,7 +86,9 @@ def steps_to(scene: Scene, name: str, y0: Any) -> dict[float, tuple[int, float]]
         tried: dict[int, float] = {}
         while n not in tried and len(tried) < 12:
             tried[n] = scene.module.error(program(y0, jnp.asarray(n)), exact)
-            factor = (tried[n] / target) ** (1 / METHODS[name][1])
+            # Far too few steps may overflow in plain space.
+            off = tried[n] / target if np.isfinite(tried[n]) else np.inf
+            factor = off ** (1 / METHODS[name][1])
             n = max(n + (factor > 1), round(n * min(max(1.02 * factor, 0.5), 4)))
             if 1 / 1.08 < factor <= 1:
                 break
