@@ -149,6 +149,21 @@ def richardson() -> str:
 
 
 @table
+def attitude() -> list[list[str]]:
+    rows = load("attitude")["rows"]
+    cases = list(itertools.product(*(values(rows, k) for k in ("scene", "to", "systems"))))
+    head = ["", *(f"{scene}, {power(error)}, {systems(n)}" for scene, error, n in cases)]
+    table = [head]
+    for method in values(rows, "method"):
+        found = [
+            one(rows, method=method, scene=scene, to=error, systems=n) for scene, error, n in cases
+        ]
+        cells = [f"{r['steps']}, {cell(r['over the better in plain space'])}" for r in found]
+        table.append([code(method), *cells])
+    return table
+
+
+@table
 def gradients() -> list[list[str]]:
     rows = load("gradients")["rows"]
     cases = list(itertools.product(values(rows, "state"), values(rows, "systems")))

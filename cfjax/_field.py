@@ -1,8 +1,11 @@
 """Frozen vector fields: the one thing a commutator-free method needs to know of a manifold."""
 
 import abc
+import functools
 import inspect
 from collections.abc import Sequence
+from fractions import Fraction
+from math import factorial
 from typing import Any, ClassVar
 
 import equinox as eqx
@@ -142,6 +145,23 @@ class AbstractAlgebraElement(AbstractFrozenField):
     def bracket(self, other: Any) -> "AbstractAlgebraElement":
         """The bracket `[self, other]` with another element of the same class."""
 
+    def dexpinv(self, other: Any, degree: int) -> "AbstractAlgebraElement":
+        """The inverse derivative of the exponential at u, `self`, of v, `other`: the u' above.
+
+        By default the series `sum_k B_k / k! ad_u^k(v)` with Bernoulli numbers B_k, up to k of
+        `degree`: so many brackets. A class whose algebra has a closed form overrides it, exact,
+        whatever the degree. The map has poles where an eigenvalue of `ad_u` is a multiple of
+        2 pi i, so for rotations at full turns; within the first of them the series converges.
+        """
+        weights, terms, term = [1.0], [other], other
+        # The series has no odd terms but the first.
+        for k in range(1, 1 + (degree if degree < 2 else degree // 2 * 2)):
+            term = self.bracket(term)
+            if k == 1 or k % 2 == 0:
+                weights.append(float(_bernoulli(k) / factorial(k)))
+                terms.append(term)
+        return type(terms[-1]).combine(weights, terms)
+
 
 def is_field(x: Any) -> bool:
     return isinstance(x, AbstractFrozenField)
@@ -271,6 +291,25 @@ def bracket(a: PyTree, b: PyTree) -> PyTree:
         return jnp.zeros_like(x)
 
     return jtu.tree_map(bracket_leaf, a, b, is_leaf=is_field)
+
+
+def dexpinv(a: PyTree, b: PyTree, degree: int) -> PyTree:
+    """The inverse derivative of the exponential at a, of b, part by part; `degree` for series.
+
+    For translations it is the identity. The parts are translations or algebra elements.
+    """
+    return jtu.tree_map(
+        lambda x, y: x.dexpinv(y, degree) if is_field(x) else y, a, b, is_leaf=is_field
+    )
+
+
+@functools.cache
+def _bernoulli(n: int) -> Fraction:
+    """Bernoulli numbers with `B_1 = -1/2`, by the Akiyama-Tanigawa recursion."""
+    row = [Fraction(1, m + 1) for m in range(n + 1)]
+    for k in range(n, 0, -1):
+        row = [(j + 1) * (row[j] - row[j + 1]) for j in range(k)]
+    return -row[0] if n == 1 else row[0]
 
 
 def enter(field: PyTree, point: PyTree, earlier: Sequence[PyTree]) -> tuple[PyTree, ...]:

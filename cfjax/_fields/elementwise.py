@@ -199,3 +199,7 @@ class ElementwiseElement(Elementwise, AbstractAlgebraElement):
     def bracket(self, other: Any) -> Any:
         brackets = self._each(lambda a, b: a.bracket(b))(self.field, other.field)
         return elementwise(brackets, self.num_axes)
+
+    def dexpinv(self, other: Any, degree: int) -> Any:
+        images = self._each(lambda a, b: a.dexpinv(b, degree))(self.field, other.field)
+        return elementwise(images, self.num_axes)

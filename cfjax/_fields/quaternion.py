@@ -10,7 +10,7 @@ from jaxtyping import Array, Float
 
 from .._field import AbstractAlgebraElement, describe
 from .._numerics.quaternion import Frame, Order, check_choice, increment, times, turn
-from .._numerics.rotate import cross
+from .._numerics.rotate import cross, dexpinv
 from .elementwise import check_point, each
 
 
@@ -67,15 +67,22 @@ class QuaternionRotation(AbstractAlgebraElement):
         return self._each(times, point)
 
     def bracket(self, other: Any) -> "QuaternionRotation":
+        return self._with(cross, other)
+
+    def dexpinv(self, other: Any, degree: int) -> "QuaternionRotation":
+        """Exact, whatever the degree. Poles where `omega` makes full turns."""
+        return self._with(dexpinv, other)
+
+    def _with(self, fun: Any, other: Any) -> "QuaternionRotation":
         kinds = jtu.tree_structure(self), jtu.tree_structure(other)
         if kinds[0] != kinds[1]:
             raise TypeError(
                 "QuaternionRotation has a bracket with another QuaternionRotation of the same "
                 f"frame and order only, got {describe(self)} and {describe(other)}."
             )
-        # Flows from the right compose the other way round.
-        a, b = (self, other) if self.frame == "fixed" else (other, self)
-        omega = each(cross, self._num_axes)(a.omega, b.omega)
+        # Flows from the right compose the other way round, as if all turned backwards.
+        sign = 1 if self.frame == "fixed" else -1
+        omega = each(fun, self._num_axes)(sign * self.omega, other.omega)
         return QuaternionRotation(omega, frame=self.frame, order=self.order)
 
     def defect(self, point: Float[Array, "*batch 4"]) -> tuple[Float[Array, ""], str]:

@@ -27,7 +27,7 @@ class AbstractMotion(AbstractAlgebraElement):
     # A pose in one vector is a unit number of so many entries, and a position.
     number: ClassVar[str]
     number_size: ClassVar[int]
-    # The module with its tangent, increment and bracket.
+    # The module with its tangent, increment, bracket and dexpinv.
     numerics: ClassVar[Any]
 
     def __check_init__(self):
@@ -60,6 +60,13 @@ class AbstractMotion(AbstractAlgebraElement):
         return self._each(self.numerics.tangent, point)
 
     def bracket(self, other: Any) -> "AbstractMotion":
+        return self._with(self.numerics.bracket, other)
+
+    def dexpinv(self, other: Any, degree: int) -> "AbstractMotion":
+        """Exact, whatever the degree. Poles where `omega` makes full turns."""
+        return self._with(self.numerics.dexpinv, other)
+
+    def _with(self, fun: Any, other: Any) -> "AbstractMotion":
         name = type(self).__name__
         if type(other) is not type(self):
             raise TypeError(
@@ -70,10 +77,10 @@ class AbstractMotion(AbstractAlgebraElement):
                 f"{name} has a bracket with a motion in the same frame only, got "
                 f"frame={self.frame!r} and frame={other.frame!r}."
             )
-        # In the frame of the body flows compose the other way round, and so does the bracket.
-        a, b = (self, other) if self.frame == "fixed" else (other, self)
-        bracket = each(self.numerics.bracket, self._num_axes)
-        omega, v = bracket(a.omega, a.v, b.omega, b.v)
+        # In the frame of the body flows compose the other way round, as if all moved backwards.
+        sign = 1 if self.frame == "fixed" else -1
+        mapped = each(fun, self._num_axes)
+        omega, v = mapped(sign * self.omega, sign * self.v, other.omega, other.v)
         return type(self)(omega=omega, v=v, frame=self.frame)
 
     def defect(self, point: Float[Array, "..."]) -> tuple[Real[Array, ""], str] | None:

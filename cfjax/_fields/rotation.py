@@ -7,7 +7,7 @@ import jax.numpy as jnp
 from jaxtyping import Array, Float
 
 from .._field import AbstractAlgebraElement
-from .._numerics.rotate import cross, increment, rotate
+from .._numerics.rotate import cross, dexpinv, increment, rotate
 from .elementwise import check_point, each
 
 
@@ -52,11 +52,18 @@ class Rotation(AbstractAlgebraElement):
         return each(cross, self._num_axes)(self.omega, point)
 
     def bracket(self, other: Any) -> "Rotation":
+        return self._with(cross, other)
+
+    def dexpinv(self, other: Any, degree: int) -> "Rotation":
+        """Exact, whatever the degree. Poles where `omega` makes full turns."""
+        return self._with(dexpinv, other)
+
+    def _with(self, fun: Any, other: Any) -> "Rotation":
         if not isinstance(other, Rotation):
             raise TypeError(
                 f"Rotation has a bracket with another Rotation only, got {type(other).__name__}."
             )
-        return type(self)(each(cross, self._num_axes)(self.omega, other.omega))
+        return type(self)(each(fun, self._num_axes)(self.omega, other.omega))
 
     @property
     def _num_axes(self) -> int:

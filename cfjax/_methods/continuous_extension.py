@@ -2,8 +2,9 @@
 
 from collections.abc import Iterator
 from functools import lru_cache
+from itertools import islice
 from math import factorial
-from typing import TypeAlias
+from typing import NamedTuple, TypeAlias
 
 import numpy as np
 
@@ -11,6 +12,7 @@ from .order_conditions import (
     exact_tree_weight,
     exact_weight,
     order,
+    runge_kutta_order,
     trees,
     word_weights,
     words,
@@ -49,17 +51,61 @@ def continuous_extension(tableau: Tableau) -> ContinuousExtension:
     return found
 
 
+class RungeKuttaExtension(NamedTuple):
+    """Weights of the stages, and the rows and times of those that the method itself has not."""
+
+    weights: ContinuousExtension
+    rows: tuple[tuple[float, ...], ...]
+    times: tuple[float, ...]
+
+
 @lru_cache
 def runge_kutta_extension(
     a: tuple[tuple[float, ...], ...], b: tuple[float, ...]
-) -> ContinuousExtension:
-    """That of a Runge-Kutta method in a linear space, from its stages alone.
+) -> RungeKuttaExtension:
+    """One of uniform order p - 1 in a linear space, for a Runge-Kutta method of order p.
 
-    `a[i]` and `b[i]` belong to stage i. Of methods of order p up to 5 with as few stages as diffrax
-    has, it is of uniform order p - 1; that of `diffrax.Dopri8` is of order 5.
+    `a[i]` and `b[i]` belong to stage i. The method's own stages suffice up to order 5 with as few
+    as diffrax has. `diffrax.Dopri8` takes 4 more, which evaluate the field at the end of the step
+    and at three points within. These points are where the stages so far reach one order more than
+    elsewhere. Where there are no such points the order is what the stages reach.
     """
-    found, _ = _solve((b,), _tree_conditions(a, len(b)), _MAX_POWER)
-    return found
+    more = []
+    found, reached = _solve((b,), _tree_conditions(a, len(b)), _MAX_POWER)
+    promised = runge_kutta_order(a[1:], b) - 1
+    if reached < promised:
+        more.append((b, 1.0))
+        points = [1.0]
+        while points:
+            stages = (*a, *(row for row, _ in more))
+            padded = (*b, *[0.0] * (len(stages) - len(b)))
+            conditions = list(islice(_tree_conditions(stages, len(stages)), promised))
+            found, reached = _solve((padded,), iter(conditions), _MAX_POWER)
+            if reached >= promised:
+                break
+            points, matrix, values = _points_of_order(conditions[: reached + 1])
+            for c in points:
+                right = values @ c ** np.arange(1, 1 + _MAX_POWER)
+                row = np.linalg.lstsq(matrix, right, rcond=_ROUNDING)[0]
+                more.append((tuple(row.tolist()), c))
+    return RungeKuttaExtension(found, tuple(row for row, _ in more), tuple(c for _, c in more))
+
+
+def _points_of_order(conditions: list[Conditions]) -> tuple[list[float], np.ndarray, np.ndarray]:
+    """Where within a step all conditions can be met, though not everywhere; and the conditions.
+
+    What is left over is a polynomial in theta for each condition. Here all are multiples of one,
+    and that has roots besides the ends of the step.
+    """
+    matrix, values = (np.concatenate(parts) for parts in zip(*conditions, strict=True))
+    left, sizes, _ = np.linalg.svd(matrix)
+    rest = left[:, int(np.sum(sizes > _ROUNDING)) :].T @ values
+    _, sizes, powers = np.linalg.svd(rest)
+    if sizes[1] > _ROUNDING * sizes[0]:
+        return [], matrix, values
+    roots = np.roots([*powers[0, ::-1], 0.0])
+    inside = roots.real[(np.abs(roots.imag) < _ROUNDING) & (np.abs(roots.real - 0.5) < 0.49)]
+    return sorted(inside.tolist()), matrix, values
 
 
 def _solve(

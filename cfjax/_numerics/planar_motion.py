@@ -14,7 +14,7 @@ import jax.numpy as jnp
 from jaxtyping import Array, Float
 
 from .._xla import pack
-from .stumpff import stumpff_1_2_apart
+from .stumpff import cotangent_excess, stumpff_1_2_apart
 
 # The two entries of a vector: numbers, or the rows or columns of a matrix.
 _Vector = Sequence[Any]
@@ -51,6 +51,18 @@ def bracket(
     """`ab - ba` for the matrices a and b of two motions."""
     v = _plus(_times_i(w1, [v2[0], v2[1]]), _times_i(-w2, [v1[0], v1[1]]))
     return jnp.zeros_like(w1), pack(v, sums=True)
+
+
+@jax.jit
+def dexpinv(
+    w1: Float[Array, ""], v1: Float[Array, "2"], w2: Float[Array, ""], v2: Float[Array, "2"]
+) -> tuple[Float[Array, ""], Float[Array, "2"]]:
+    """The inverse derivative of the exponential at the first motion, of the second."""
+    excess = cotangent_excess(w1 * w1)
+    # Of two motions the bracket has no rotation: a translation, u, which the first one turns.
+    u = _plus(_times_i(w1, [v2[0], v2[1]]), _times_i(-w2, [v1[0], v1[1]]))
+    bent = [excess * b - a / 2 for a, b in zip(u, _times_i(w1, u), strict=True)]
+    return w2, pack(_plus([v2[0], v2[1]], bent), sums=True)
 
 
 def _moved(

@@ -14,6 +14,7 @@ import jax.numpy as jnp
 from jaxtyping import Array, Float
 
 from .._xla import pack
+from . import rotate
 from .stumpff import stumpff_1_to_3_apart
 
 # The entries of a vector: numbers, or the rows or columns of a matrix.
@@ -67,6 +68,18 @@ def bracket(
     a, b = map(_entries, (w1, w2))
     v = [x - y for x, y in zip(_cross(a, _entries(v2)), _cross(b, _entries(v1)), strict=True)]
     return pack(_cross(a, b), sums=True), pack(v, sums=True)
+
+
+@jax.jit
+def dexpinv(
+    w1: Float[Array, "3"], v1: Float[Array, "3"], w2: Float[Array, "3"], v2: Float[Array, "3"]
+) -> tuple[Float[Array, "3"], Float[Array, "3"]]:
+    """The inverse derivative of the exponential at the first motion, of the second.
+
+    The algebra of rigid motions is the tangent bundle of that of rotations: (w, v) is the point w
+    and its rate v, and so every natural map of the one is that of the other with its derivative.
+    """
+    return jax.jvp(rotate.dexpinv, (w1, w2), (v1, v2))
 
 
 def _increment_of_quaternion(w: _Vector, v: _Vector, x: _Vector, frame: str) -> Array:

@@ -4,7 +4,7 @@ import jax
 from jaxtyping import Array, Float
 
 from .._xla import pack
-from .stumpff import stumpff_1_2_apart
+from .stumpff import cotangent_excess, stumpff_1_2_apart
 
 
 def cross(a: Float[Array, "3"], x: Float[Array, "3 *k"]) -> Float[Array, "3 *k"]:
@@ -39,6 +39,16 @@ def increment(a: Float[Array, "3"], x: Float[Array, "3 *k"]) -> Float[Array, "3 
         [near * (once[i] + twice[i] / 2) + (d1 * once[i] + d2 * twice[i]) for i in range(3)],
         sums=True,
     )
+
+
+@jax.jit
+def dexpinv(a: Float[Array, "3"], x: Float[Array, "3"]) -> Float[Array, "3"]:
+    """The inverse derivative of the exponential at `a`, `x - a*x/2 + a*(a*x)/12 - ...`."""
+    a0, a1, a2 = a[0], a[1], a[2]
+    excess = cotangent_excess(a0 * a0 + a1 * a1 + a2 * a2)
+    once = _cross((a0, a1, a2), (x[0], x[1], x[2]))
+    twice = _cross((a0, a1, a2), once)
+    return pack([x[i] + (excess * twice[i] - once[i] / 2) for i in range(3)], sums=True)
 
 
 def _cross(a, x):

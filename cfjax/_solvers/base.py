@@ -60,6 +60,13 @@ class AbstractLieSolver(diffrax.AbstractSolver):
     def move(self, field: Callable[[Any, PyTree], PyTree], y0: PyTree) -> "Move":
         """A step from `y0`; `field(c, y)` is `h f(t + c h, y)`, a frozen field."""
 
+    def extended(self, path: Path, field: Callable[[Any, PyTree], PyTree]) -> Path:
+        """The way of a step with what only output within it takes; `field` as in `move`.
+
+        Apart from `move`, which is compiled whether anybody asks for that or not.
+        """
+        return path
+
     def init(self, terms, t0, t1, y0, args) -> "State":
         """Checks the times and the start, and makes the state of the solver.
 
@@ -92,19 +99,22 @@ class AbstractLieSolver(diffrax.AbstractSolver):
         if first is not None and made_jump is not False:
             first = _select(made_jump, lambda: terms.vf(t0, y0, args), first)
 
+        def evaluate(c: float | Real[Array, ""], y: PyTree) -> PyTree:
+            # The end of the step exactly, not up to rounding: the field may jump there.
+            if isinstance(c, float):
+                t = t1 if c == 1 else t0 + c * (t1 - t0)
+            else:
+                c = jnp.asarray(c, jnp.result_type(t0))
+                t = jnp.where(c == 1, t1, t0 + c * (t1 - t0))
+            return once_in_rows(terms.vf(t, value(y), args))
+
         def move(y0):
             control = terms.contr(t0, t1)
             values = []
 
             def field(c: float | Real[Array, ""], y: PyTree) -> PyTree:
                 if values or first is None:
-                    # The end of the step exactly, not up to rounding: the field may jump there.
-                    if isinstance(c, float):
-                        t = t1 if c == 1 else t0 + c * (t1 - t0)
-                    else:
-                        c = jnp.asarray(c, jnp.result_type(t0))
-                        t = jnp.where(c == 1, t1, t0 + c * (t1 - t0))
-                    values.append(once_in_rows(terms.vf(t, value(y), args)))
+                    values.append(evaluate(c, y))
                 else:
                     values.append(first)
                 return product(terms, values[-1], control)
@@ -117,6 +127,7 @@ class AbstractLieSolver(diffrax.AbstractSolver):
             return (end, None if first is None else values[-1]), (made.error, made.path)
 
         (end, last), (error, path) = by_components(move, y0)
+        path = self.extended(path, lambda c, y: product(terms, evaluate(c, y), terms.contr(t0, t1)))
         sums = jtu.tree_map(
             lambda lost, p: (p, None) if lost is None else lost.up_to(p),
             lost,

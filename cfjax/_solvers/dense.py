@@ -70,12 +70,15 @@ class Path(eqx.Module):
         places = tuple(index[id(leaf)] for leaf in leaves)
         return cls(tuple(arrays.values()), places, structure, continuous_extension, move)
 
+    def parts(self, arrays: tuple[Array | np.ndarray, ...]) -> tuple[PyTree, list[PyTree]]:
+        """The start and the fields that are made of these arrays."""
+        return jtu.tree_unflatten(self.structure, [arrays[i] for i in self.places])
+
     def point(self, theta: Any) -> PyTree:
         """The solution at a part `theta` of the step."""
 
         def end(arrays: tuple[Array | np.ndarray, ...]) -> PyTree:
-            leaves = [arrays[i] for i in self.places]
-            point, fields = jtu.tree_unflatten(self.structure, leaves)
+            point, fields = self.parts(arrays)
             rows = [_polynomials(powers, theta) for powers in self.continuous_extension]
             if self.move is flow and len(rows) > 1 and can_loop(fields[0], point):
                 return along(rows, fields, point)

@@ -2,11 +2,11 @@
 
 import abc
 import contextlib
+import copy
 import functools
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from fractions import Fraction
-from math import factorial
-from typing import Any, ClassVar
+from typing import Any, ClassVar, Literal
 
 import diffrax
 import equinox as eqx
@@ -17,27 +17,56 @@ from .._field import (
     AbstractAlgebraElement,
     bracket,
     combine,
+    dexpinv,
     enter,
     flow,
     is_field,
     leave,
+    tangent,
     without_bracket,
 )
 from .._field import value as value_of
 from .._methods.continuous_extension import runge_kutta_extension
 from .._methods.order_conditions import runge_kutta_order
 from .._methods.tableau import ContinuousExtension, Row
+from .._xla import once
 from .base import AbstractLieSolver, Move
+from .commutator_free import minus
 from .dense import Path
 from .stages import FieldVaries, can_loop, elements
 
+# `f(c, point)` is `h f(t + c h, point)` for a point of the step, in the coordinates of the step.
+_FieldAt = Callable[[Any, PyTree], PyTree]
+
 
 class AbstractMuntheKaas(AbstractLieSolver):
-    """The step `exp(v) y0` with v in the Lie algebra. Fields without a bracket are refused."""
+    """The step `exp(v) y0` with v in the Lie algebra. Fields without a bracket are refused.
+
+    An embedded method is another element of the algebra. The error estimate is the velocity at the
+    end of the step of the difference of the two, which costs no flow, or with `estimate="group"`
+    that of the end points, for 1 flow more. `estimate=None` switches it off.
+
+    **Raises** `ValueError` for another `estimate`.
+    """
 
     b: eqx.AbstractVar[Row]
+    # The weights less those of an embedded method.
+    b_error: eqx.AbstractVar[Row | None]
     # Of the flow of v, so that it leads to points within the step.
     continuous_extension: eqx.AbstractVar[ContinuousExtension]
+    estimate: Literal["algebra", "group"] | None = eqx.field(
+        static=True, default="algebra", kw_only=True
+    )
+
+    def __check_init__(self):
+        if self.estimate not in ("group", "algebra", None):
+            raise ValueError(f"estimate must be 'group', 'algebra' or None, got {self.estimate!r}.")
+
+    def without_estimate(self) -> "AbstractMuntheKaas":
+        made = copy.copy(self)
+        # As dataclasses do; `RKMK` is not made from its fields.
+        object.__setattr__(made, "estimate", None)
+        return made
 
     @abc.abstractmethod
     def elements(self, field: Callable[[Any, PyTree], PyTree]) -> list[PyTree]:
@@ -46,22 +75,41 @@ class AbstractMuntheKaas(AbstractLieSolver):
         `field(c, u)` is `h f(t + c h, exp(u) y0)`, and `u = None` means zero.
         """
 
+    def estimating(
+        self, elements: list[PyTree], v: PyTree, end: PyTree, start: PyTree, field: _FieldAt
+    ) -> list[PyTree]:
+        """These and what else the estimate takes; v leads from the start to the end."""
+        return elements
+
     def move(self, field, y0):
-        v, elements, start = self.logarithm(field, y0)
-        path = Path.of(self.continuous_extension, value_of(start), elements)
-        return Move(leave(v, flow(v, start)), path)
+        v, elements, start, field_at = self.logarithm(field, y0)
+        end = flow(v, start)
+        if self.first_same_as_last:
+            # Two results of the step, the state and the last field, need its end.
+            end = once(end)
+        left, error = leave(v, end), None
+        # All that follows is for error control and output within the step. It is dead code, left
+        # out by the compiler, where nobody asks for them.
+        if self.estimate is not None and self.b_error is not None:
+            elements = self.estimating(elements, v, end, start, field_at)
+            off = _combine_nonzero(self.b_error, elements)
+            if self.estimate == "algebra":
+                error = tangent(off, value_of(left))
+            else:
+                error = minus(left, leave(v, flow(combine((1.0, -1.0), (v, off)), start)))
+        return Move(left, Path.of(self.continuous_extension, value_of(start), elements), error)
 
     def logarithm(self, field: Callable[[Any, PyTree], PyTree], y0: PyTree) -> Any:
-        """The element v with the end of the step `exp(v) y0`, what it is a combination of, and y0.
+        """The element v with the end of the step `exp(v) y0`, what it is a combination of, y0, and
+        the field at other points of the step.
 
         They are in the step's coordinates.
         """
         fields: list[PyTree] = []
         start = y0
 
-        def field_at(c: float | Real[Array, ""], u: PyTree) -> PyTree:
+        def field_at(c: float | Real[Array, ""], here: PyTree) -> PyTree:
             nonlocal start
-            here = start if u is None else flow(u, start)
             value = field(c, leave(fields[0], here) if fields else here)
             value, here = enter(value, here, fields)
             for part in jtu.tree_leaves(value, is_leaf=is_field):
@@ -72,24 +120,28 @@ class AbstractMuntheKaas(AbstractLieSolver):
             fields.append(value)
             return value
 
-        elements = self.elements(field_at)
-        return _combine_nonzero(self.b, elements), elements, start
+        def field_along(c: float | Real[Array, ""], u: PyTree) -> PyTree:
+            return field_at(c, start if u is None else flow(u, start))
+
+        elements = self.elements(field_along)
+        return _combine_nonzero(self.b, elements), elements, start, field_at
 
 
 def _sixths(*numerators: int | Fraction) -> Row:
     return tuple(Fraction(n) / 6 for n in numerators)
 
 
-class RKMK3(AbstractMuntheKaas):
+class RKMK3(AbstractMuntheKaas, diffrax.AbstractAdaptiveSolver):
     """Munthe-Kaas method of order 3 with one commutator: 3 evaluations, 3 flows.
 
-    Dense output of order 2.
+    The estimate, with the midpoint rule as embedded method, costs nothing. Dense output of order 2.
 
     Source: Munthe-Kaas & Owren, Computations in a free Lie algebra, Phil. Trans. R. Soc. A 357
     (1999), doi:10.1098/rsta.1999.0361.
     """
 
     b: ClassVar[Row] = _sixths(1, 4, 1, -1)
+    b_error: ClassVar[Row] = _sixths(1, -2, 1, -1)
     continuous_extension: ClassVar[ContinuousExtension] = (
         (_sixths(6, 0, 0, 0), _sixths(-5, 4, 1, 0), _sixths(0, 0, 0, -1)),
     )
@@ -115,6 +167,7 @@ class RKMK4(AbstractMuntheKaas):
     """
 
     b: ClassVar[Row] = _sixths(1, 2, 2, 1, Fraction(-1, 2))
+    b_error: ClassVar[None] = None
     continuous_extension: ClassVar[ContinuousExtension] = (
         (
             _sixths(6, 0, 0, 0, 0),
@@ -134,29 +187,42 @@ class RKMK4(AbstractMuntheKaas):
         return [k1, k2, k3, k4, bracket(k1, k4)]
 
 
-class RKMK(AbstractMuntheKaas):
-    """The Munthe-Kaas method of any explicit Runge-Kutta method.
+class RKMK(AbstractMuntheKaas, diffrax.AbstractAdaptiveSolver):
+    """The Munthe-Kaas method of any explicit Runge-Kutta method, with its order and its estimate.
 
-    Each stage takes the inverse derivative of the exponential as a series, with all its
-    commutators: an s-stage method of order q costs up to `(s - 1)(q - 2)` of them. It has order q.
-    Its stages also make the dense output: of order q - 1 with every tableau of diffrax but that of
-    `Dopri8`, with which it is of order 5.
+    Each stage but the first takes the inverse derivative of the exponential, `dexpinv` of the
+    field: a closed form for `Rotation`, `QuaternionRotation`, `RigidMotion` and `PlanarMotion`,
+    else a series. That of a method of order q has up to q - 2 commutators, q - 3 if q is odd and
+    above 3. A step must not make full turns, where the exponential cannot be inverted.
 
-    **Arguments:** `tableau`, a `diffrax.ButcherTableau`, for example `diffrax.Dopri5.tableau`.
+    The estimate costs nothing, but where the tableau is first same as last: then it needs the field
+    at the end of the step, which is the next one's first. Dense output of order q - 1: from the
+    stages alone, with 4 evaluations more for that of `diffrax.Dopri8`.
 
-    **Raises** `TypeError` if it is something else, `ValueError` if the method is implicit.
+    **Arguments:** `tableau`, a `diffrax.ButcherTableau`, for example `diffrax.Dopri5.tableau`;
+    `estimate`, `"algebra"`, `"group"` or None, as in the other methods.
+
+    **Raises** `TypeError` if the tableau is something else, `ValueError` if the method is implicit,
+    or for another `estimate`.
 
     Source: Munthe-Kaas, High order Runge-Kutta methods on manifolds, Appl. Numer. Math. 29 (1999),
     doi:10.1016/S0168-9274(98)00030-0.
     """
 
-    # Tuples: unlike diffrax's tableau they compare by value, as a static field must.
+    # Tuples: unlike diffrax's tableau they compare by value, as a static field must. Last are
+    # stages without weight that only serve the estimate.
     a: tuple[tuple[float, ...], ...] = eqx.field(static=True)
     b: tuple[float, ...] = eqx.field(static=True)
+    b_error: tuple[float, ...] = eqx.field(static=True)
     # Not the sums of the rows: rounding could put a stage behind the end of the step.
     c: tuple[float, ...] = eqx.field(static=True)
 
-    def __init__(self, tableau: diffrax.ButcherTableau):
+    def __init__(
+        self,
+        tableau: diffrax.ButcherTableau,
+        *,
+        estimate: Literal["algebra", "group"] | None = "algebra",
+    ):
         if not isinstance(tableau, diffrax.ButcherTableau):
             own = getattr(tableau, "tableau", None)
             is_solver = isinstance(own, diffrax.ButcherTableau)
@@ -165,32 +231,85 @@ class RKMK(AbstractMuntheKaas):
             raise TypeError(f"tableau must be a diffrax.ButcherTableau, got {tableau!r}.{advice}")
         if tableau.implicit:
             raise ValueError("tableau must be explicit, got one of an implicit method.")
-        b = tableau.b_sol.tolist()
-        # A last stage without weight only serves an error estimate or the next step.
-        while b[-1] == 0:
-            b.pop()
-        self.a = ((), *(tuple(row.tolist()) for row in tableau.a_lower[: len(b) - 1]))
-        self.b = tuple(b)
-        self.c = (0.0, *tableau.c.tolist()[: len(b) - 1])
+        self.b, self.b_error = (
+            _without_zeros(row.tolist()) for row in (tableau.b_sol, tableau.b_error)
+        )
+        n = max(len(self.b), len(self.b_error))
+        self.a = ((), *(tuple(row.tolist()) for row in tableau.a_lower[: n - 1]))
+        self.c = (0.0, *tableau.c.tolist()[: n - 1])
+        self.estimate = estimate
 
     def order(self, terms) -> int:
-        return _classical_order(self.a[1:], self.b)
+        return _classical_order(self.a[1 : len(self.b)], self.b)
+
+    def error_order(self, terms) -> int:
+        n = len(self.a)
+        embedded = tuple(
+            x - y for x, y in zip(*(_padded(row, n) for row in (self.b, self.b_error)), strict=True)
+        )
+        return _classical_order(self.a[1:], embedded) + 1
+
+    @property
+    def first_same_as_last(self) -> bool:
+        return self.estimate is not None and self.b == self.a[-1]
 
     @property
     def continuous_extension(self) -> ContinuousExtension:
-        return runge_kutta_extension(self.a, self.b)
+        return runge_kutta_extension(self.a[: len(self.b)], self.b).weights
 
     def elements(self, field):
-        degree = self.order(None) - 2
+        n = len(self.b)
+        return self._stages([field(0.0, None)], self.a[1:n], self.c[1:n], field)
+
+    def estimating(self, elements, v, end, start, field):
+        n, elements = len(self.b), list(elements)
+        for c, row in zip(self.c[n:], self.a[n:], strict=True):
+            u, here = v, end
+            if row != self.b:
+                u = _combine_nonzero(row, elements)
+                here = flow(u, start)
+            elements.append(dexpinv(u, field(c, here), self._degree))
+        return elements
+
+    def extended(self, path, field):
+        n = len(self.b)
+        _, rows, times = runge_kutta_extension(self.a[:n], self.b)
+        if not rows:
+            return path
+        start, elements = path.parts(path.arrays)
+        entered = list(elements)
+
+        def along(c: Any, u: PyTree) -> PyTree:
+            here = flow(u, start)
+            value, _ = enter(field(c, leave(entered[0], here)), here, entered)
+            entered.append(value)
+            return value
+
+        elements = self._stages(elements[:n], rows, times, along)
+        return Path.of(path.continuous_extension, start, elements)
+
+    @property
+    def _degree(self) -> int:
+        return self.order(None) - 2
+
+    def _stages(
+        self,
+        known: list[PyTree],
+        rows: Sequence[Row],
+        times: Sequence[float],
+        field: Callable[[Any, PyTree], PyTree],
+    ) -> list[PyTree]:
+        """These, and a stage for each row and time."""
 
         def element(c: Any, u: PyTree) -> PyTree:
-            return _dexpinv(u, field(c, u), degree)
+            return dexpinv(u, field(c, u), self._degree)
 
-        stages = [field(0.0, None)]
-        if all(map(any, self.a[1:])) and can_loop(stages[0], stages[0]):
+        if len(rows) > 1 and all(map(any, rows)) and can_loop(known[0], known[0]):
             with contextlib.suppress(FieldVaries):
-                return elements(stages[0], self.a, self.c, element)
-        for c, row in zip(self.c[1:], self.a[1:], strict=True):
+                return elements(known, rows, times, element)
+        stages = list(known)
+        for c, row in zip(times, rows, strict=True):
+            # Rows may be shorter than what is known.
             u = _combine_nonzero(row, stages) if any(row) else None
             stages.append(field(c, None) if u is None else element(c, u))
         return stages
@@ -199,24 +318,15 @@ class RKMK(AbstractMuntheKaas):
 _classical_order = functools.lru_cache(runge_kutta_order)
 
 
+def _without_zeros(row: Sequence[float]) -> tuple[float, ...]:
+    """Without those at the end."""
+    return tuple(row[: 1 + max(k for k, x in enumerate(row) if x != 0)])
+
+
+def _padded(row: Sequence[float], n: int) -> list[float]:
+    return [*row, *[0.0] * (n - len(row))]
+
+
 def _combine_nonzero(weights: Any, fields: Any) -> PyTree:
-    used = [(float(w), f) for w, f in zip(weights, fields, strict=True) if w != 0]
+    used = [(float(w), f) for w, f in zip(weights, fields, strict=False) if w != 0]
     return combine(*zip(*used, strict=True))
-
-
-def _dexpinv(u: PyTree, v: PyTree, degree: int) -> PyTree:
-    """`sum_k B_k / k! ad_u^k(v)` for k up to `degree`, with the Bernoulli numbers B_k."""
-    weights, terms = [1.0], [v]
-    for k in range(1, degree + 1):
-        v = bracket(u, v)
-        weights.append(float(_bernoulli(k) / factorial(k)))
-        terms.append(v)
-    return _combine_nonzero(weights, terms)
-
-
-def _bernoulli(n: int) -> Fraction:
-    """Bernoulli numbers with `B_1 = -1/2`, by the Akiyama-Tanigawa recursion."""
-    row = [Fraction(1, m + 1) for m in range(n + 1)]
-    for k in range(n, 0, -1):
-        row = [(j + 1) * (row[j] - row[j + 1]) for j in range(k)]
-    return -row[0] if n == 1 else row[0]

@@ -17,7 +17,7 @@ from .dense import Path
 
 _EXTENSION = runge_kutta_extension(
     ((), (0.5,), (0.0, 0.5), (0.0, 0.0, 1.0)), (1 / 6, 1 / 3, 1 / 3, 1 / 6)
-)
+).weights
 
 
 class CayleyRK4(AbstractLieSolver):

@@ -85,25 +85,28 @@ def _is_plain(field: AbstractFrozenField) -> bool:
 
 
 def elements(
-    first: PyTree,
-    rows: Sequence[Sequence[float]],
+    known: Sequence[PyTree],
+    rows: Sequence[Sequence[Any]],
     times: Sequence[float],
     element: Callable[[Real[Array, ""], PyTree], PyTree],
 ) -> list[PyTree]:
-    """The stages `k[i] = element(times[i], sum_j rows[i][j] k[j])`, where `k[0] = first`.
+    """After the known stages k, for each row and time c the stage `element(c, sum_j row[j] k[j])`.
 
     **Raises** `FieldVaries` as `run`.
     """
-    n = len(rows)
+    first, n = known[0], len(known) + len(rows)
 
     def body(stages: PyTree, x: Any) -> Any:
         k, row, c = x
         along = jtu.tree_map(lambda f: _combination(row, f), stages)
         return _put(stages, k, _like(first, element(c, along))), None
 
-    xs = jnp.arange(1, n), _padded(rows[1:], n), jnp.asarray(times[1:])
-    stages, _ = lax.scan(body, _stack(first, n), xs)
-    return [_at(stages, k) for k in range(n)]
+    xs = jnp.arange(len(known), n), _padded(rows, n), jnp.asarray(times)
+    start = _stack(first, n)
+    for k, stage in enumerate(known[1:], 1):
+        start = _put(start, k, _like(first, stage))
+    stages, _ = lax.scan(body, start, xs)
+    return [*known, *(_at(stages, k) for k in range(len(known), n))]
 
 
 def along(

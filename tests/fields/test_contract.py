@@ -11,7 +11,9 @@ from typing import Any, NamedTuple
 import jax
 import jax.numpy as jnp
 import jax.tree_util as jtu
+import mpmath
 import numpy as np
+import problems
 import pytest
 
 import cfjax
@@ -508,6 +510,139 @@ def test_sums_brackets_and_the_group(name):
         there = parts[1].flow(parts[0].flow(point))
         np.testing.assert_allclose(there, a.flow(point), 0, atol)
         np.testing.assert_allclose(cfjax.combine((-1.0,), (a,)).flow(a.flow(point)), point, 0, atol)
+
+
+# Whether `dexpinv` is a closed form: then up to nearly a full turn, where it has a pole.
+WITH_DEXPINV = {
+    "Rotation": True,
+    "QuaternionRotation, body": True,
+    "QuaternionRotation, fixed": True,
+    "RigidMotion of matrices, body": True,
+    "RigidMotion of a point": True,
+    "PlanarMotion of matrices, body": True,
+    "PlanarMotion of a complex number and a position": True,
+    "LeftMatrix": False,
+    "RightMatrix": False,
+    "LinearAffine": False,
+}
+
+
+def structure_constants(case):
+    """`c[k, i, j]`: the bracket of the coordinates i and j, from the generators' commutators."""
+    names = case.draw()
+    shapes = {k: np.shape(x) for k, x in names.items()}
+    ends = np.cumsum([int(np.prod(shape)) for shape in shapes.values()])
+
+    def generator(flat):
+        parts = np.split(flat, ends[:-1])
+        coordinates = {k: x.reshape(shapes[k]) for k, x in zip(shapes, parts, strict=True)}
+        a, b = case.generator(case.point, **coordinates)
+        n = case.point.size
+        m = np.zeros((n + 1, n + 1))
+        m[:n, :n], m[:n, n] = a, b
+        return m
+
+    basis = [generator(e) for e in np.eye(ends[-1])]
+    columns = np.stack([m.ravel() for m in basis], axis=1)
+    brackets = np.array([[(a @ b - b @ a).ravel() for b in basis] for a in basis])
+    constants = np.linalg.lstsq(columns, brackets.reshape(-1, columns.shape[0]).T)[0]
+    constants = constants.reshape(-1, ends[-1], ends[-1])
+    np.testing.assert_allclose(constants, np.rint(constants), atol=1e-12)
+    return np.rint(constants)
+
+
+def exact_dexpinv(constants, u, v):
+    """`phi_1(ad_u)^-1 v`, in the digits of mpmath, with phi_1 by its series."""
+    d = len(u)
+    ad = mpmath.matrix(d, d)
+    for k, i, j in zip(*np.nonzero(constants), strict=True):
+        ad[int(k), int(j)] += mpmath.mpf(constants[k, i, j]) * u[int(i)]
+    total = term = mpmath.eye(d)
+    for k in range(2, 90):
+        term = term * ad / k
+        total = total + term
+    return mpmath.lu_solve(total, mpmath.matrix(v))
+
+
+@pytest.mark.parametrize("dtype", [np.float32, np.float64])
+@pytest.mark.parametrize(
+    "name",
+    [
+        pytest.param(name, marks=[pytest.mark.slow] * (name in ("LeftMatrix", "LinearAffine")))
+        for name in WITH_DEXPINV
+    ],
+)
+def test_the_inverse_derivative_of_the_exponential(name, dtype):
+    """And its first and second derivative, by differences of 50 digits."""
+    case, is_closed = CASES[name], WITH_DEXPINV[name]
+    # The series to degree 12 leaves (2 * 0.1 / 2 pi)^14 of these.
+    sizes = (0.0, 1e-30, 1e-12, 1e-3, 1.0, 3.0, 6.0) if is_closed else (0.0, 1e-12, 1e-3, 0.1)
+    base, *others = (case.draw() for _ in range(4))
+    sets = [
+        {k: np.asarray(np.multiply.outer(sizes, x), dtype) for k, x in base.items()},
+        *({k: np.stack([np.asarray(x, dtype)] * len(sizes)) for k, x in o.items()} for o in others),
+    ]
+
+    def image(u, v):
+        return coordinates_of(case.make(**u).dexpinv(case.make(**v), 12))
+
+    def coordinates_of(field):
+        return {k: getattr(field, k) for k in base}
+
+    def first(u, v, du, dv):
+        return jax.jvp(image, (u, v), (du, dv))
+
+    def second(u, v, du, dv):
+        return jax.jvp(lambda u, v: first(u, v, du, dv)[1], (u, v), (du, dv))[1]
+
+    @jax.jit
+    def everything(u, v, du, dv):
+        arrays = u, v, du, dv
+        two = jtu.tree_map(lambda x: x[:, None], (u, v))
+        together = jtu.tree_map(lambda x: x[:, 0], image(*two))
+        return *jax.vmap(first)(*arrays), jax.vmap(second)(*arrays), together
+
+    found = everything(*sets[:2], sets[2], sets[3])
+    constants = structure_constants(case)
+    flat = [
+        [np.concatenate([np.ravel(x[k]) for x in s.values()]) for k in range(len(sizes))]
+        for s in (*sets, *found)
+    ]
+    with mpmath.workdps(50):
+        for k, size in enumerate(sizes):
+            u, v, du, dv = ([mpmath.mpf(float(x)) for x in s[k]] for s in flat[:4])
+            h = mpmath.mpf(10) ** -12
+
+            def along(t, u=u, v=v, du=du, dv=dv):
+                there = (
+                    [x + t * d for x, d in zip(*pair, strict=True)] for pair in [(u, du), (v, dv)]
+                )
+                return exact_dexpinv(constants, *there)
+
+            low, middle, high = (along(j * h) for j in (-1, 0, 1))
+            wants = middle, (high - low) / (2 * h), (high - 2 * middle + low) / h**2
+            # How near the pole is; each derivative is larger by that, and so is its rounding.
+            near = 2 * np.pi / (2 * np.pi - size * is_closed)
+            for n, (got, want) in enumerate(zip([s[k] for s in flat[4:7]], wants, strict=True)):
+                atol = 32 * (n + 1) * near ** (n + 2) * np.finfo(dtype).eps
+                np.testing.assert_allclose(
+                    got, np.array(want.tolist(), float)[:, 0], 0, atol, err_msg=f"{n} at {size}"
+                )
+            atol = 8 * near**2 * np.finfo(dtype).eps
+            np.testing.assert_allclose(flat[7][k], flat[4][k], 0, atol)
+
+
+@pytest.mark.parametrize("name", [name for name, closed in WITH_DEXPINV.items() if closed])
+def test_a_closed_form_is_the_limit_of_its_series_elementwise_too(name):
+    case = CASES[name]
+    u, v = (
+        {k: jnp.stack([jnp.asarray(0.3 * x)] * 2) for k, x in case.draw().items()} for _ in range(2)
+    )
+    a, b = (cfjax.elementwise(jax.vmap(lambda c: case.make(**c))(c)) for c in (u, v))
+    assert isinstance(a, cfjax.AbstractAlgebraElement)
+    series = cfjax.AbstractAlgebraElement.dexpinv(a, b, 16)
+    # (0.3 * 2 / 2 pi)^18 is 1e-18.
+    problems.assert_close(a.dexpinv(b, 0), series, 1e-15)
 
 
 @pytest.mark.parametrize("name", CASES)

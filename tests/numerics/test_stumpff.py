@@ -8,7 +8,12 @@ import mpmath
 import numpy as np
 import pytest
 
-from cfjax._numerics.stumpff import stumpff, stumpff_1_2, stumpff_1_to_3_apart
+from cfjax._numerics.stumpff import (
+    cotangent_excess,
+    stumpff,
+    stumpff_1_2,
+    stumpff_1_to_3_apart,
+)
 
 ORDERS = 3
 PI2 = math.pi**2
@@ -201,3 +206,47 @@ def test_an_angle_without_digits_is_nan(dtype):
     for big in (1.01 * limit, info.max / 2, np.inf, np.nan):
         for n in range(5):
             assert np.isnan(stumpff(n, jnp.asarray(big, dtype))), (n, big)
+
+
+@DTYPES
+def test_the_excess_of_the_cotangent(dtype):
+    """Against `(1 - x/2 cot(x/2)) / x^2` itself, with 60 digits for what cancels, and its slopes.
+
+    By differences of 60 digits, which leave 20.
+    """
+    x = np.array([0.0, 1e-20, 1e-4, 0.1, 1.0, np.pi, 4.5, 6.0, 6.2])
+    s = jnp.asarray(x * x, dtype)
+    first = jax.grad(cotangent_excess)
+    functions = cotangent_excess, first, jax.grad(first)
+    found = [jax.jit(jax.vmap(f))(s) for f in functions]
+
+    def exact(s):
+        x = mpmath.sqrt(s)
+        return (1 - x / 2 * mpmath.cot(x / 2)) / s
+
+    with mpmath.workdps(60):
+        for k, at in enumerate(s):
+            at = mpmath.mpf(float(at))
+            h = mpmath.mpf(10) ** -12
+            # The series about zero, of which the first term that is left out is below 1e-40.
+            f = exact if at > 1e-10 else lambda s: 1 / mpmath.mpf(12) + s / 720 + s**2 / 30240
+            values = [f(at + j * h) for j in (-1, 0, 1)]
+            wants = (
+                values[1],
+                (values[2] - values[0]) / (2 * h),
+                (values[2] - 2 * values[1] + values[0]) / h**2,
+            )
+            # One unit of s moves the pole by that much, each derivative once more; and a
+            # derivative of the polynomial is ten times as far off as that is.
+            near = float(4 * mpmath.pi**2 / (4 * mpmath.pi**2 - at))
+            for n, (got, want) in enumerate(zip(found, wants, strict=True)):
+                rtol = 8 * 10**n * (n + 1) * near * np.finfo(dtype).eps
+                np.testing.assert_allclose(float(got[k]), float(want), rtol, err_msg=f"{n} at {at}")
+
+
+@DTYPES
+def test_beyond_a_full_turn_the_excess_of_the_cotangent_is_finite(dtype):
+    s = jnp.asarray([4 * PI2 * 1.0001, 100.0, np.finfo(dtype).max, np.inf], dtype)
+    got, slope = jax.vmap(jax.value_and_grad(cotangent_excess))(s)
+    np.testing.assert_allclose(got, 1 / 12, rtol=4 * np.finfo(dtype).eps)
+    np.testing.assert_array_equal(slope, 0)

@@ -15,7 +15,7 @@ import pytest
 from scipy.integrate import solve_ivp
 
 import cfjax
-from cfjax._methods.continuous_extension import continuous_extension
+from cfjax._methods.continuous_extension import continuous_extension, runge_kutta_extension
 
 # The uniform order of each: at most one below that of the method.
 FLOWS: dict[str, Any] = {
@@ -45,7 +45,7 @@ SERIES: dict[str, Any] = {
     "Bosh3": (cfjax.RKMK(diffrax.Bosh3.tableau), 2),
     "Dopri5": (cfjax.RKMK(diffrax.Dopri5.tableau), 4),
     "Tsit5": (cfjax.RKMK(diffrax.Tsit5.tableau), 4),
-    "Dopri8": (cfjax.RKMK(diffrax.Dopri8.tableau), 5),
+    "Dopri8": (cfjax.RKMK(diffrax.Dopri8.tableau), 7),
 }
 EXTENDED = FLOWS | SERIES | {"RKMK3": (cfjax.RKMK3(), 2), "RKMK4": (cfjax.RKMK4(), 3)}
 BODY = problems.driven_body, jnp.asarray(problems.MOMENTUM), jnp.asarray(problems.INERTIA)
@@ -130,13 +130,16 @@ def test_the_order_conditions_of_the_continuous_extension(solver, order):
 @pytest.mark.parametrize("solver, order", SERIES.values(), ids=SERIES)
 def test_the_order_conditions_in_the_algebra(solver, order):
     """Those of continuous Runge-Kutta methods, tree by tree, at every stage by recursion."""
-    (powers,) = solver.continuous_extension
+    a = solver.a[: len(solver.b)]
+    (powers,), more, times = runge_kutta_extension(a, solver.b)
+    rows = (*a, *more)
+    np.testing.assert_allclose([sum(row) for row in more], times, rtol=0, atol=1e-14)
 
     @lru_cache
     def stages(tree):
-        product = np.ones(len(solver.b))
+        product = np.ones(len(rows))
         for child in tree:
-            product *= [np.dot(row, stages(child)[: len(row)]) for row in solver.a]
+            product *= [np.dot(row, stages(child)[: len(row)]) for row in rows]
         return product
 
     def density(tree):
@@ -148,9 +151,9 @@ def test_the_order_conditions_in_the_algebra(solver, order):
 
     for theta in (1 / 7, 1 / 2, 1.0):
         for n in range(1, order + 1):
-            # Coefficients up to 6, Tsit5's up to 66, Dopri8's up to 131, and sums of products.
+            # Coefficients up to 6, Tsit5's up to 66, Dopri8's up to 707, and sums of products.
             assert defect(n, theta) < 1e-12
-    assert defect(order + 1, 1 / 2) > 1e-6
+    assert defect(order + 1, 1 / 3) > 1e-6
 
 
 def test_a_method_that_needs_the_field_at_the_end_of_the_step_evaluates_it():
@@ -177,26 +180,28 @@ def dense(solver, n, field, y0, args, t1=1.0, **kwargs):
     )
 
 
-# The errors of Dopri8 are at rounding after two of these steps.
+# Those of Dopri8 are at rounding after two of these steps, so its own are longer.
 @pytest.mark.parametrize(
     "solver, order",
     [
         pytest.param(*case, id=name, marks=[pytest.mark.slow] * (name not in ("CF4", "RKMK4")))
         for name, case in EXTENDED.items()
-        if name != "Dopri8"
     ],
 )
 def test_the_error_between_the_steps_falls_with_the_order_of_the_solution(solver, order):
     """Within one step like h^(order + 1), so it keeps the order of the solution."""
-    steps = np.array([4, 8, 16, 32])
+    steps = np.array([4, 8, 16, 32]) if order < 7 else np.array([0.5, 0.7, 1.0, 1.4])
     thetas = np.array([0.21, 0.5, 0.83])
     field, y0, args = BODY
 
+    # Apart, as XLA takes minutes for Dopri8 in one piece outside of a loop.
     @jax.jit
-    def point(h, theta):
-        times = jnp.asarray(0.0), h
-        info = problems.first_step(solver, cfjax.LieTerm(field), *times, y0, args)[2]
-        return solver.interpolation_cls(t0=times[0], t1=times[1], **info).evaluate(theta * h)
+    def step(h):
+        return problems.first_step(solver, cfjax.LieTerm(field), 0 * h, h, y0, args)[2]
+
+    @jax.jit
+    def point(info, h, theta):
+        return solver.interpolation_cls(t0=0 * h, t1=h, **info).evaluate(theta * h)
 
     errors = []
     for n in steps:
@@ -210,7 +215,8 @@ def test_the_error_between_the_steps_falls_with_the_order_of_the_solution(solver
             atol=1e-16,
             t_eval=thetas * h,
         ).y.T
-        found = [point(jnp.asarray(h), jnp.asarray(theta)) for theta in thetas]
+        info = step(jnp.asarray(h))
+        found = [point(info, jnp.asarray(h), jnp.asarray(theta)) for theta in thetas]
         errors.append(np.linalg.norm(np.array(found) - answer))
     errors = np.array(errors)
     kept = errors > 3e-15
