@@ -213,7 +213,8 @@ class RKMK(AbstractMuntheKaas, diffrax.AbstractAdaptiveSolver):
     # stages without weight that only serve the estimate.
     a: tuple[tuple[float, ...], ...] = eqx.field(static=True)
     b: tuple[float, ...] = eqx.field(static=True)
-    b_error: tuple[float, ...] = eqx.field(static=True)
+    # None where the tableau has no embedded method.
+    b_error: tuple[float, ...] | None = eqx.field(static=True)
     # Not the sums of the rows: rounding could put a stage behind the end of the step.
     c: tuple[float, ...] = eqx.field(static=True)
 
@@ -231,10 +232,9 @@ class RKMK(AbstractMuntheKaas, diffrax.AbstractAdaptiveSolver):
             raise TypeError(f"tableau must be a diffrax.ButcherTableau, got {tableau!r}.{advice}")
         if tableau.implicit:
             raise ValueError("tableau must be explicit, got one of an implicit method.")
-        self.b, self.b_error = (
-            _without_zeros(row.tolist()) for row in (tableau.b_sol, tableau.b_error)
-        )
-        n = max(len(self.b), len(self.b_error))
+        self.b = _without_zeros(tableau.b_sol.tolist())
+        self.b_error = _without_zeros(tableau.b_error.tolist()) or None
+        n = max(len(self.b), len(self.b_error or ()))
         self.a = ((), *(tuple(row.tolist()) for row in tableau.a_lower[: n - 1]))
         self.c = (0.0, *tableau.c.tolist()[: n - 1])
         self.estimate = estimate
@@ -242,12 +242,12 @@ class RKMK(AbstractMuntheKaas, diffrax.AbstractAdaptiveSolver):
     def order(self, terms) -> int:
         return _classical_order(self.a[1 : len(self.b)], self.b)
 
-    def error_order(self, terms) -> int:
+    def error_order(self, terms) -> int | None:
+        if self.b_error is None:
+            return None
         n = len(self.a)
-        embedded = tuple(
-            x - y for x, y in zip(*(_padded(row, n) for row in (self.b, self.b_error)), strict=True)
-        )
-        return _classical_order(self.a[1:], embedded) + 1
+        pairs = zip(_padded(self.b, n), _padded(self.b_error, n), strict=True)
+        return _classical_order(self.a[1:], tuple(x - y for x, y in pairs)) + 1
 
     @property
     def first_same_as_last(self) -> bool:
@@ -320,7 +320,7 @@ _classical_order = functools.lru_cache(runge_kutta_order)
 
 def _without_zeros(row: Sequence[float]) -> tuple[float, ...]:
     """Without those at the end."""
-    return tuple(row[: 1 + max(k for k, x in enumerate(row) if x != 0)])
+    return tuple(row[: max((k for k, x in enumerate(row, 1) if x != 0), default=0)])
 
 
 def _padded(row: Sequence[float], n: int) -> list[float]:

@@ -549,6 +549,23 @@ for solver in (None, cfjax.CF4):
 # Tracing
 
 
+def test_a_tableau_without_embedded_method_has_no_estimate():
+    midpoint = diffrax.ButcherTableau(
+        a_lower=(np.array([0.5]),),
+        b_sol=np.array([0.0, 1.0]),
+        b_error=np.zeros(2),
+        c=np.array([0.5]),
+    )
+    solver = cfjax.RKMK(midpoint)
+    assert (solver.order(None), solver.error_order(None)) == (2, None)
+    term = cfjax.LieTerm(problems.rigid_body)
+    control = diffrax.PIDController(rtol=0.0, atol=1e-3)
+    with pytest.raises(RuntimeError, match="error estimate"):
+        diffrax.diffeqsolve(
+            term, solver, 0.0, 1.0, 0.1, jnp.ones(3), jnp.ones(3), stepsize_controller=control
+        )
+
+
 def test_equal_tableaus_give_equal_solvers():
     a, b = cfjax.RKMK(diffrax.Dopri5.tableau), cfjax.RKMK(diffrax.Dopri5.tableau)
     assert a == b and hash(a) == hash(b)
