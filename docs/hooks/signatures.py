@@ -6,7 +6,10 @@ import griffe
 
 import cfjax
 
-PUBLIC = {f"{value.__module__}.{name}": value for name, value in inspect.getmembers(cfjax, inspect.isclass)}
+PUBLIC = {
+    f"{value.__module__}.{name}": value
+    for name, value in inspect.getmembers(cfjax, inspect.isclass)
+}
 KINDS = {
     inspect.Parameter.POSITIONAL_OR_KEYWORD: griffe.ParameterKind.positional_or_keyword,
     inspect.Parameter.KEYWORD_ONLY: griffe.ParameterKind.keyword_only,
@@ -21,4 +24,6 @@ class Signatures(griffe.Extension):
         for p in inspect.signature(PUBLIC[cls.path]).parameters.values():
             default = None if p.default is p.empty else repr(p.default)
             parameters.append(griffe.Parameter(p.name, kind=KINDS[p.kind], default=default))
-        cls.set_member("__init__", griffe.Function("__init__", parameters=griffe.Parameters(*parameters)))
+        cls.set_member(
+            "__init__", griffe.Function("__init__", parameters=griffe.Parameters(*parameters))
+        )
