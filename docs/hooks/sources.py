@@ -1,4 +1,4 @@
-"""What the site takes from elsewhere in the repository: notebooks, charts and pages; and its math."""
+"""What the site takes from elsewhere in the repository, its math, and links to the API."""
 
 import html
 import re
@@ -8,6 +8,8 @@ import nbformat
 from latex2mathml.converter import convert
 from mkdocs.structure.files import File
 from nbconvert import MarkdownExporter
+
+import cfjax
 
 ROOT = Path(__file__).parents[2]
 PAGES = {
@@ -57,13 +59,21 @@ def linked(text):
 
 
 def on_page_content(content, **_):
-    """Math as MathML, which browsers draw themselves, without a script."""
+    """Math as MathML, which browsers draw themselves, and names of the package as links."""
 
     def math(match):
         display, source = match[1] == "div", html.unescape(match[2].strip())
-        assert source[:2] in (r"\(", r"\["), source
         inner = convert(source[2:-2], display="block" if display else "inline")
         return f'<{match[1]} class="math">{inner}</{match[1]}>'
 
-    pattern = r'<(span|div) class="arithmatex">(.*?)</\1>'
-    return re.sub(pattern, math, content, flags=re.DOTALL)
+    def link(match):
+        name = match[1].removeprefix("cfjax.")
+        # `flow` alone may be anything, `cfjax.flow` and `CF4` may not.
+        module = getattr(getattr(cfjax, name, None), "__module__", "")
+        known = module.startswith("cfjax") and (name != match[1] or name[0].isupper())
+        call = f"<code>{match[1]}{match[2] or ''}</code>"
+        return f'<autoref identifier="cfjax.{name}">{call}</autoref>' if known else call
+
+    content = re.sub(r'<(span|div) class="arithmatex">(.*?)</\1>', math, content, flags=re.DOTALL)
+    # Not within a link.
+    return re.sub(r'(?<!">)<code>((?:cfjax\.)?[A-Za-z]\w*)(\(.*?\))?</code>', link, content)
