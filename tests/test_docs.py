@@ -85,3 +85,9 @@ def test_every_page_is_in_the_navigation():
     listed = re.findall(r"[\w/]+\.md", navigation)
     for page in PAGES:
         assert str(page.relative_to(ROOT / "docs")) in listed
+
+
+def test_math_is_what_the_converter_knows():
+    # It would show the signs of an environment as they are.
+    for page in PAGES:
+        assert "\\begin{" not in page.read_text()
