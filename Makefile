@@ -5,7 +5,7 @@ PYTEST := -m pytest --numprocesses auto --dist worksteal
 # Each solver and each field once, what the code relies on in jax, equinox and diffrax, and imports.
 QUICK := tests/test_quick.py tests/xla/test_columns.py tests/test_canary.py tests/test_public.py tests/test_architecture.py
 
-.PHONY: paper lint test test-all test-quick test-lowest test-newest coverage defects benchmarks readme clean
+.PHONY: paper lint test test-all test-quick test-lowest test-newest coverage defects benchmarks readme docs clean
 
 # Tables and figures of the paper, in figures/.
 paper: .venv/paper
@@ -50,6 +50,10 @@ benchmarks: .venv/dev
 readme: .venv/dev
 	$(BIN)/python benchmarks/readme.py
 
+# The site, in site/. A warning is an error: a broken link, a page that nothing leads to.
+docs: .venv/docs
+	NO_MKDOCS_2_WARNING=1 $(BIN)/python -m mkdocs build --strict
+
 # The tests of `make test`, with lines and branches of cfjax that they do not reach.
 coverage: .venv/dev
 	$(BIN)/python -m pytest --numprocesses auto --dist worksteal --cov --cov-report=term-missing
@@ -58,7 +62,7 @@ coverage: .venv/dev
 defects: .venv/dev
 	$(BIN)/python tests/planted_defects.py
 
-.venv/paper .venv/dev: pyproject.toml
+.venv/paper .venv/docs .venv/dev: pyproject.toml
 	test -x $(BIN)/python || $(PYTHON) -m venv .venv
 	@echo "Installing into .venv, which takes some minutes the first time."
 	$(BIN)/python -m pip install --quiet --editable '.[$(notdir $@)]'
@@ -74,4 +78,4 @@ defects: .venv/dev
 	touch $@
 
 clean:
-	rm -rf .venv .venv-lowest .venv-newest figures
+	rm -rf .venv .venv-lowest .venv-newest figures site

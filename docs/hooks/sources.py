@@ -1,0 +1,79 @@
+"""What the site takes from elsewhere in the repository, its math, and links to the API."""
+
+import html
+import re
+from pathlib import Path
+
+import nbformat
+from latex2mathml.converter import convert
+from mkdocs.structure.files import File
+from nbconvert import MarkdownExporter
+
+import cfjax
+
+ROOT = Path(__file__).parents[2]
+PAGES = {
+    "architecture.md": "ARCHITECTURE.md",
+    "changelog.md": "CHANGELOG.md",
+    "xla.md": "cfjax/_xla/README.md",
+}
+NOTEBOOKS = sorted((ROOT / "notebooks").glob("*.ipynb"))
+
+
+def on_config(config):
+    titles = [{title(path): f"notebooks/{path.stem}.md"} for path in NOTEBOOKS]
+    if not any("Notebooks" in entry for entry in config.nav):
+        config.nav.insert(-1, {"Notebooks": titles})
+    return config
+
+
+def on_files(files, *, config):
+    def add(place, **source):
+        files.append(File.generated(config, place, **source))
+
+    for chart in [*ROOT.glob("benchmarks/*.png"), *ROOT.glob("benchmarks/charts/*.png")]:
+        add(str(chart.relative_to(ROOT)), abs_src_path=str(chart))
+    for place, source in PAGES.items():
+        add(place, content=linked((ROOT / source).read_text()))
+    for path in NOTEBOOKS:
+        # With the results that are stored: nothing is run here.
+        text, resources = MarkdownExporter().from_notebook_node(nbformat.read(path, as_version=4))
+        for name, picture in resources["outputs"].items():
+            text = text.replace(f"]({name})", f"]({path.stem}/{name})")
+            add(f"notebooks/{path.stem}/{name}", content=picture)
+        add(f"notebooks/{path.stem}.md", content=re.sub("\x1b\\[[0-9;]*m", "", text))
+    return files
+
+
+def title(path):
+    cells = nbformat.read(path, as_version=4).cells
+    return next(c.source for c in cells if c.source.startswith("# ")).splitlines()[0][2:]
+
+
+def linked(text):
+    """Links between files of the repository, to where these are on the site."""
+    for place, source in PAGES.items():
+        text = text.replace(f"]({source})", f"]({place})")
+    # Diagrams would need a script from elsewhere.
+    return re.sub("```mermaid\n.*?```\n", "", text, flags=re.DOTALL)
+
+
+def on_page_content(content, **_):
+    """Math as MathML, which browsers draw themselves, and names of the package as links."""
+
+    def math(match):
+        display, source = match[1] == "div", html.unescape(match[2].strip())
+        inner = convert(source[2:-2], display="block" if display else "inline")
+        return f'<{match[1]} class="math">{inner}</{match[1]}>'
+
+    def link(match):
+        name = match[1].removeprefix("cfjax.")
+        # `flow` alone may be anything, `cfjax.flow` and `CF4` may not.
+        module = getattr(getattr(cfjax, name, None), "__module__", "")
+        known = module.startswith("cfjax") and (name != match[1] or name[0].isupper())
+        call = f"<code>{match[1]}{match[2] or ''}</code>"
+        return f'<autoref identifier="cfjax.{name}">{call}</autoref>' if known else call
+
+    content = re.sub(r'<(span|div) class="arithmatex">(.*?)</\1>', math, content, flags=re.DOTALL)
+    # Not within a link.
+    return re.sub(r'(?<!">)<code>((?:cfjax\.)?[A-Za-z]\w*)(\(.*?\))?</code>', link, content)

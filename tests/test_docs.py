@@ -1,0 +1,96 @@
+"""The site: its code runs when pasted, and it names everything public."""
+
+import json
+import os
+import pkgutil
+import re
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+from test_public import PUBLIC
+
+import cfjax
+
+ROOT = Path(__file__).parents[1]
+PAGES = sorted((ROOT / "docs").rglob("*.md"))
+
+# Each page on its own, in the settings of a reader; a traceback has the page and its line.
+PROGRAM = """
+import json, sys, jax
+
+for page, text in json.load(sys.stdin).items():
+    jax.config.update("jax_enable_x64", False)
+    exec(compile(text, page, "exec"), {"__name__": page})
+    jax.clear_caches()
+"""
+
+
+def code(page):
+    """The blocks of a page, at their lines."""
+    kept, inside = [], False
+    for line in page.read_text().splitlines():
+        if line == "```":
+            inside = False
+        kept.append(line if inside else "")
+        if line == "```python":
+            inside = True
+    return "\n".join(kept)
+
+
+# One process for many pages: most of the time is imports and compilation.
+START = [ROOT / "docs" / "getting_started.md"]
+STATES = [page for page in PAGES if page.parent.name == "state"]
+OTHERS = [page for page in PAGES if page not in START + STATES]
+
+
+@pytest.mark.parametrize(
+    "pages",
+    [
+        pytest.param(START, id="start"),
+        pytest.param(STATES, id="states"),
+        pytest.param(OTHERS, id="others", marks=pytest.mark.slow),
+    ],
+)
+def test_code_runs_when_pasted(pages):
+    texts = {str(page.relative_to(ROOT)): code(page) for page in pages}
+    done = subprocess.run(
+        [sys.executable, "-W", "error", "-c", PROGRAM],
+        input=json.dumps(texts),
+        capture_output=True,
+        text=True,
+        cwd=ROOT,
+        # As in these tests: programs are compiled to run once.
+        env={**os.environ, "JAX_DISABLE_MOST_OPTIMIZATIONS": "1"},
+    )
+    assert done.returncode == 0, done.stderr
+    assert "nan" not in done.stdout
+
+
+def test_every_block_of_code_is_seen():
+    # An indented block, or one with options, would be run by nobody.
+    for page in PAGES:
+        fences = re.findall(r"^.*```.*py.*$", page.read_text(), flags=re.MULTILINE)
+        assert set(fences) <= {"```python"}, page
+
+
+def test_every_public_name_is_in_the_api():
+    pages = "\n".join(page.read_text() for page in (ROOT / "docs" / "api").glob("*.md"))
+    named = re.findall(r"^::: cfjax\.(.+)$", pages, flags=re.MULTILINE)
+    scenes = {f"scenes.{module.name}" for module in pkgutil.iter_modules(cfjax.scenes.__path__)}
+    assert len(named) == len(set(named))
+    assert set(named) == {*PUBLIC, *scenes}
+
+
+def test_every_page_is_in_the_navigation():
+    navigation = (ROOT / "mkdocs.yml").read_text().partition("\nnav:\n")[2]
+    listed = re.findall(r"[\w/]+\.md", navigation)
+    for page in PAGES:
+        assert str(page.relative_to(ROOT / "docs")) in listed
+
+
+def test_math_is_what_the_converter_knows():
+    # It would show the signs of an environment as they are.
+    for page in PAGES:
+        assert "\\begin{" not in page.read_text()
