@@ -251,6 +251,9 @@ def _dtype(operator: Any) -> Any:
     if _shape(operator) is None:
         return None
     is_lineax = isinstance(operator, lx.AbstractLinearOperator)
+    if isinstance(operator, np.ndarray):
+        # Its doubles are single where JAX has no doubles.
+        return jnp.result_type(operator)
     return operator.in_structure().dtype if is_lineax else operator.dtype
 
 

@@ -104,6 +104,15 @@ def test_complex_coefficients_and_single_precision():
     np.testing.assert_allclose(found, expected, rtol=0, atol=20 * 2.0**-23)
 
 
+def test_doubles_of_numpy_where_jax_has_none():
+    jax.config.update("jax_enable_x64", False)
+    try:
+        field = OperatorSum([-1j, -1j * jnp.sin(0.3)], [a + 0j for a in OPERATORS[:2]])
+        assert field.tangent(jnp.asarray(X)).dtype == np.complex64
+    finally:
+        jax.config.update("jax_enable_x64", True)
+
+
 @functools.partial(jax.jit, static_argnums=0)
 def pulled_back(flow, c, a, x, w):
     return jax.vjp(flow, c, a, x)[1](w)
