@@ -55,15 +55,15 @@ def test_files_and_table(short, tmp_path, capsys):
 
 
 def test_every_chart_says_what_it_shows():
-    assert "rigid_body" in __main__._SCENES
-    for name, chart in __main__._SCENES.items():
+    assert "rigid_body" in __main__._CHARTS
+    for name, chart in __main__._CHARTS.items():
         assert chart.__doc__ and len(chart.__doc__.splitlines()[0]) > 10, name
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("name", [name for name in __main__._SCENES if name != "rigid_body"])
+@pytest.mark.parametrize("name", [name for name in __main__._CHARTS if name != "rigid_body"])
 def test_charts_of_the_other_scenes(name, monkeypatch):
-    module = sys.modules[__main__._SCENES[name].__module__]
+    module = sys.modules[__main__._CHARTS[name].__module__]
     original = module.work_precision
 
     def work_precision(*args, methods, num_steps=None, tolerances=None, **options):
@@ -74,7 +74,7 @@ def test_charts_of_the_other_scenes(name, monkeypatch):
         return original(*args, methods=some, **(options | settings))
 
     monkeypatch.setattr(module, "work_precision", work_precision)
-    work = __main__._SCENES[name](budget=0.1)
+    work = __main__._CHARTS[name](budget=0.1)
     # One halving of the step divides the error by 16 at order 4. With tolerances the estimate is of
     # order 3, so the step goes with their third root and the error with their power 4/3: divided by
     # 464 for two powers of ten, and by less where the order is not reached.
