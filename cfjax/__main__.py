@@ -15,7 +15,9 @@ from . import scenes
 from ._measure.extra import paper_extra
 
 _SCENES = {
-    name: module for name, module in vars(scenes).items() if isinstance(module, types.ModuleType)
+    name: module
+    for name, module in vars(scenes).items()
+    if isinstance(module, types.ModuleType) and module.__name__ == f"{scenes.__name__}.{name}"
 }
 # A scene may have several charts: `scenes.stiefel.chart_first` is that of stiefel_first.
 _CHARTS = {

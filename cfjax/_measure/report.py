@@ -15,6 +15,7 @@ import jax.tree_util as jtu
 import numpy as np
 from jaxtyping import Array, Float
 from matplotlib.figure import Figure
+from matplotlib.ticker import EngFormatter
 from rich import box
 from rich.console import Console, RenderableType
 from rich.progress import Progress
@@ -121,11 +122,12 @@ def scene(
             problem["term"], CF4(), t0, t1, y0, args, num_steps=num_steps, save_every=save_every
         )
 
-    with progress_bar(progress, "Compiling", 1) as update:
-        program, compile_seconds = compiled(solve, *arrays)
-        update(advance=1)
     y0, args = arrays[2:]
-    ys = program(arrays).ys  # type: ignore
+    with progress_bar(progress, "Compiling", 2) as update:
+        program, compile_seconds = compiled(solve, *arrays)
+        update(advance=1, description="Running")
+        ys = jax.block_until_ready(program(arrays).ys)  # type: ignore
+        update(advance=1)
     (seconds,) = take_turns(
         [lambda: program(arrays)], repeats=100, budget=budget, progress=progress
     )
@@ -141,21 +143,21 @@ def scene(
     start = module.invariants(y0, args)
     found = jax.vmap(lambda y: module.invariants(y, args))(ys)
     for label, value in start.items():
-        values = np.asarray(found[label])
-        change = np.max(np.abs(values - np.asarray(value)))
-        table.add_row(label, _span(value), _span(values[-1]), f"{change:.1e}")
+        change = np.max(np.abs(np.asarray(found[label]) - np.asarray(value)))
+        table.add_row(label, _span(value), _span(found[label][-1]), f"{change:.1e}")
     fastest = float(np.min(seconds))
+    show = EngFormatter("s", places=1)
     times = (
-        f"Compiled in {compile_seconds:.2g} s. Ran in {1e3 * fastest:.3g} ms, the fastest of "
-        f"{len(seconds)} runs on one {jax.default_backend().upper()}: "
-        f"{1e6 * fastest / num_steps:.3g} µs a step."
+        f"Compiled in {show(compile_seconds)}. Ran in {show(fastest)}, {show(fastest / num_steps)} "
+        f"a step: the fastest of {len(seconds)} runs on one {jax.default_backend().upper()}."
     )
-    first_line = (inspect.getdoc(module) or name).splitlines()[0]
-    return Report([first_line, table, times], {f"{name}_picture": figure})
+    subject = (inspect.getdoc(module) or name).splitlines()[0]
+    return Report([subject, table, times], {f"{name}_picture": figure})
 
 
-def _span(values: Float[Array | np.ndarray, "..."]) -> str:
+def _span(values: Float[Array, "..."]) -> str:
     """Up to three numbers, or the smallest and the largest of more."""
-    is_short = np.size(values) <= 3
-    shown = np.ravel(values) if is_short else [np.min(values), np.max(values)]
-    return (", " if is_short else " to ").join(f"{float(x):.5g}" for x in shown)
+    if np.size(values) <= 3:
+        return ", ".join(f"{float(x):.5g}" for x in np.ravel(values))
+    low, high = (f"{float(x):.5g}" for x in (np.min(values), np.max(values)))
+    return low if low == high else f"{low} to {high}"

@@ -155,7 +155,7 @@ def picture(n: int = 40) -> "Figure":
     from matplotlib.figure import Figure
 
     end, steps = 40.0, 400
-    given = problem("first", n) | dict(t1=end)
+    given: dict[str, Any] = problem("first", n) | dict(t1=end)
     d, c = given["args"]
     space = diffrax.ODETerm(lambda t, y, args: tangent(first(t, y, args), y))
     options: Any = dict(num_steps=steps, save_every=1)

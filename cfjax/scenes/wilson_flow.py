@@ -114,7 +114,8 @@ def problem() -> dict[str, Any]:
 
 def invariants(y: Links, args: Any = None) -> dict[str, Array]:
     """What stays, or goes one way, as its name says."""
-    defect = matmul(jnp.conj(jnp.swapaxes(y, -1, -2)), y) - np.eye(3, dtype=y.dtype)
+    eye = np.broadcast_to(np.eye(3, dtype=y.dtype), y.shape)
+    defect = matmul(jnp.conj(jnp.swapaxes(y, -1, -2)), y) - eye
     return {
         "action (falls)": action(y),
         "distance of each link from unitary": jnp.linalg.norm(defect, axis=(-2, -1)),
