@@ -142,7 +142,7 @@ def picture() -> "Figure":
     sphere.plot_wireframe(*ball, color="0.9", linewidth=0.5, zorder=0)
     towards = np.array([1.0, 0.8, 0.7])
     for path in paths:
-        # What is behind the sphere is left out, and the middle axis points to the viewer's right.
+        # What is behind the sphere is left out.
         seen = np.where((path @ towards > 0)[:, None], path, np.nan)
         is_about_the_first = energy(path[0], inertia) < 0.5 / inertia[1]
         sphere.plot(*seen.T, color="#0072B2" if is_about_the_first else "#D55E00", linewidth=1.2)
