@@ -91,7 +91,7 @@ if TYPE_CHECKING:
     from ._measure.work_precision import WorkPrecision as WorkPrecision
     from ._measure.work_precision import work_precision as work_precision
 
-__version__ = "0.1.0"
+__version__ = "0.2.0"
 
 # What measures, and the problems to measure on: nobody who solves should wait for their import.
 _LATER = {

@@ -1,6 +1,7 @@
 """The command line: `python -m cfjax`."""
 
 import argparse
+import inspect
 import math
 import sys
 import types
@@ -13,11 +14,15 @@ import jax
 from . import scenes
 from ._measure.extra import paper_extra
 
-# A scene may have several charts: `scenes.stiefel.chart_first` is that of stiefel_first.
 _SCENES = {
+    name: module
+    for name, module in vars(scenes).items()
+    if isinstance(module, types.ModuleType) and module.__name__ == f"{scenes.__name__}.{name}"
+}
+# A scene may have several charts: `scenes.stiefel.chart_first` is that of stiefel_first.
+_CHARTS = {
     scene + name.removeprefix("chart"): function
-    for scene, module in vars(scenes).items()
-    if isinstance(module, types.ModuleType)
+    for scene, module in _SCENES.items()
     for name, function in vars(module).items()
     if name == "chart" or name.startswith("chart_")
 }
@@ -25,6 +30,7 @@ _SCENES = {
 # On two cores with nothing else to do.
 _PAPER_TIME = "Takes 2 to 4 minutes, more on a busy machine."
 _CHART_TIME = "Compiles for 10 to 50 seconds, more on a busy machine."
+_SCENE_TIME = "Takes 10 to 60 seconds, more on a busy machine."
 
 
 class _Parser(argparse.ArgumentParser):
@@ -35,7 +41,12 @@ class _Parser(argparse.ArgumentParser):
 
 def main(argv: Sequence[str] | None = None) -> int:
     """Runs one command and returns the exit status. Bad arguments exit with status 2."""
-    parser = _Parser(prog="cfjax", description="Commutator-free Lie group integrators for JAX.")
+    parser = _Parser(
+        prog="cfjax",
+        description="Commutator-free Lie group integrators for JAX.",
+        epilog=_list_of_scenes(),
+        formatter_class=argparse.RawDescriptionHelpFormatter,
+    )
     commands = parser.add_subparsers(dest="command", metavar="COMMAND", title="commands")
     paper = commands.add_parser(
         "paper",
@@ -55,7 +66,7 @@ def main(argv: Sequence[str] | None = None) -> int:
             "CSV, too. In float64. " + _CHART_TIME
         ),
     )
-    chart.add_argument("scene", metavar="SCENE", choices=_SCENES, help=", ".join(_SCENES))
+    chart.add_argument("scene", metavar="SCENE", choices=_CHARTS, help=", ".join(_CHARTS))
     chart.add_argument(
         "--budget",
         metavar="SECONDS",
@@ -63,7 +74,16 @@ def main(argv: Sequence[str] | None = None) -> int:
         default=20.0,
         help="how long to measure, compilation not included (default: %(default)g)",
     )
-    for command in (paper, chart):
+    scene = commands.add_parser(
+        "scene",
+        help="run a scene",
+        description=(
+            "Solves a scene with 1000 steps of CF4, prints what it keeps and how long it takes, "
+            "and draws its picture as PNG and PDF. In float64. " + _SCENE_TIME
+        ),
+    )
+    scene.add_argument("scene", metavar="SCENE", choices=_SCENES, help=", ".join(_SCENES))
+    for command in (paper, chart, scene):
         command.add_argument(
             "--output",
             metavar="DIR",
@@ -75,7 +95,7 @@ def main(argv: Sequence[str] | None = None) -> int:
     if arguments.command is None:
         parser.print_help()
         return 0
-    command = {"paper": paper, "chart": chart}[arguments.command]
+    command = {"paper": paper, "chart": chart, "scene": scene}[arguments.command]
     try:
         with paper_extra():
             from . import _paper
@@ -85,17 +105,29 @@ def main(argv: Sequence[str] | None = None) -> int:
     jax.config.update("jax_enable_x64", True)
     if command is paper:
         experiments, patience = _paper.EXPERIMENTS, _PAPER_TIME
+    elif command is scene:
+        name, patience = arguments.scene, _SCENE_TIME
+        experiments = [lambda progress: _report.scene(name, _SCENES[name], progress)]
     else:
-        scene, budget = arguments.scene, arguments.budget
-        picture = getattr(getattr(scenes, scene, None), "picture", None)
-        measure = _SCENES[scene]
-        experiments = [lambda progress: _report.chart(scene, measure, budget, progress, picture)]
+        name, budget = arguments.scene, arguments.budget
+        picture = getattr(_SCENES.get(name), "picture", None)
+        measure = _CHARTS[name]
+        experiments = [lambda progress: _report.chart(name, measure, budget, progress, picture)]
         patience = f"{_CHART_TIME} Then measures for {budget:g} seconds."
     try:
         _report.run(arguments.output, experiments, patience)
     except OSError as error:
         command.error(f"cannot write to {arguments.output}: {error.strerror or error}")
     return 0
+
+
+def _list_of_scenes() -> str:
+    width = max(map(len, _SCENES))
+    lines = (
+        f"  {name:<{width}}  {(inspect.getdoc(module) or '').splitlines()[0]}"
+        for name, module in _SCENES.items()
+    )
+    return "\n".join(["scenes:", *lines])
 
 
 def _folder(text: str) -> Path:

@@ -1,14 +1,20 @@
-"""The command `cfjax chart`. The command `cfjax paper` is tested with the paper."""
+"""The commands `cfjax chart` and `cfjax scene`. `cfjax paper` is tested with the paper."""
 
 import csv
 import os
 import signal
 import subprocess
 import sys
+from typing import Any
 
+import jax
+import jax.tree_util as jtu
+import numpy as np
 import pytest
+from matplotlib.figure import Figure
 from rich.progress import Progress
 
+import cfjax
 from cfjax import __main__, scenes
 from cfjax.__main__ import main
 from cfjax._measure import report as _report
@@ -26,12 +32,20 @@ def short(monkeypatch):
     monkeypatch.setattr(scenes.rigid_body, "work_precision", work_precision)
 
 
-def test_files_and_table(short, tmp_path, capsys):
+@pytest.fixture
+def blank(monkeypatch):
+    """A picture that takes no time; those of the scenes have their own tests."""
+    monkeypatch.setattr(scenes.rigid_body, "picture", Figure)
+
+
+def test_files_and_table(short, blank, tmp_path, capsys):
     output = tmp_path / "new" / "folder"
     command = ["chart", "rigid_body", "--output", str(output), "--budget", "0.1"]
     assert main(command) == 0
     out, error = capsys.readouterr()
-    files = ["rigid_body.csv", "rigid_body.pdf", "rigid_body.png"]
+    # The picture is that of `cfjax scene`.
+    pictures = ["rigid_body_picture.pdf", "rigid_body_picture.png"]
+    files = ["rigid_body.csv", "rigid_body.pdf", "rigid_body.png", *pictures]
     assert sorted(os.listdir(output)) == files
     assert error.startswith("Compiles") and error.count("\n") == 1
     for name in files:
@@ -55,15 +69,15 @@ def test_files_and_table(short, tmp_path, capsys):
 
 
 def test_every_chart_says_what_it_shows():
-    assert "rigid_body" in __main__._SCENES
-    for name, chart in __main__._SCENES.items():
+    assert "rigid_body" in __main__._CHARTS
+    for name, chart in __main__._CHARTS.items():
         assert chart.__doc__ and len(chart.__doc__.splitlines()[0]) > 10, name
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("name", [name for name in __main__._SCENES if name != "rigid_body"])
+@pytest.mark.parametrize("name", [name for name in __main__._CHARTS if name != "rigid_body"])
 def test_charts_of_the_other_scenes(name, monkeypatch):
-    module = sys.modules[__main__._SCENES[name].__module__]
+    module = sys.modules[__main__._CHARTS[name].__module__]
     original = module.work_precision
 
     def work_precision(*args, methods, num_steps=None, tolerances=None, **options):
@@ -74,7 +88,7 @@ def test_charts_of_the_other_scenes(name, monkeypatch):
         return original(*args, methods=some, **(options | settings))
 
     monkeypatch.setattr(module, "work_precision", work_precision)
-    work = __main__._SCENES[name](budget=0.1)
+    work = __main__._CHARTS[name](budget=0.1)
     # One halving of the step divides the error by 16 at order 4. With tolerances the estimate is of
     # order 3, so the step goes with their third root and the error with their power 4/3: divided by
     # 464 for two powers of ten, and by less where the order is not reached.
@@ -104,6 +118,88 @@ main(["chart", "rigid_body"])
     assert done.stderr == "cfjax chart: error: rich is missing: pip install 'cfjax[paper]'\n"
 
 
+def test_the_list_of_scenes(capsys):
+    assert main([]) == 0
+    listed = capsys.readouterr().out.partition("scenes:\n")[2].splitlines()
+    assert [line.split()[0] for line in listed] == list(__main__._SCENES)
+    for line, module in zip(listed, __main__._SCENES.values(), strict=True):
+        assert module.__doc__.startswith(" ".join(line.split()[1:]) + "\n")
+
+
+def test_a_scene(blank, tmp_path, capsys):
+    assert main(["scene", "rigid_body", "--output", str(tmp_path)]) == 0
+    out, error = capsys.readouterr()
+    assert sorted(os.listdir(tmp_path)) == ["rigid_body_picture.pdf", "rigid_body_picture.png"]
+    assert error.startswith("Takes") and error.count("\n") == 1
+    # Lines are as wide as the terminal.
+    text = " ".join(out.split())
+    assert text.startswith(scenes.rigid_body.__doc__.partition("\n")[0])
+    (row,) = (line.split() for line in out.splitlines() if line.split()[:1] == ["energy"])
+    # (8/9)^2 / (7/8) / 2 + (4/9)^2 / (5/8) / 2 + (1/9)^2 / (1/4) / 2 = 1798 / 2835, to five digits.
+    assert row[1] == "0.63422"
+    assert 0 < float(row[3]) < 1e-3
+    assert "Compiled in" in text and "s a step: the fastest of" in text
+
+
+# What CF4 keeps to its order alone: relative to the start, to 1e-3 with the steps below, of which
+# the rigid body's are the longest, h = 1/8.
+TO_ITS_ORDER = {
+    "rigid_body": ["energy"],
+    "heavy_top": ["energy (J)"],
+    "spacecraft": ["energy"],
+    "zeitlin": ["energy", "angular momentum"],
+}
+
+
+@pytest.mark.representatives(4)
+@pytest.mark.parametrize("name", __main__._SCENES)
+def test_every_scene_keeps_its_invariants(name):
+    module = __main__._SCENES[name]
+    problem = module.problem()
+    args = problem.get("args")
+    n = 1600 if name == "heavy_top" else 800 if name == "rigid_body" else 200
+    if name == "wilson_flow":
+        problem, n = problem | {"y0": module.y0(2)}, 20
+    elif name == "zeitlin":
+        problem["y0"], args = module.y0(12), module.inverse_laplacian(12)
+        problem["args"] = args
+    ys = cfjax.integrate(solver=cfjax.CF4(), **problem, num_steps=n, save_every=n // 10).ys
+    start = module.invariants(jtu.tree_map(jax.numpy.asarray, problem["y0"]), args)
+    found = jax.vmap(lambda y: module.invariants(y, args))(ys)
+    assert start.keys() == found.keys()
+    for label, value in start.items():
+        values = np.concatenate([np.asarray(value)[None], found[label]])
+        assert np.all(np.isfinite(values)), label
+        if label.endswith("(falls)"):
+            assert np.all(np.diff(values) < 0), label
+        elif label.endswith("(stays positive)"):
+            assert np.all(values > 0), label
+        else:
+            # Every step rounds a few times; states are of length about one, or these are relative.
+            # Entries and eigenvalues feel rounding by the norm of all, up to 10.
+            scale = max(1.0, np.max(np.abs(value)))
+            bound = 1e-3 if label in TO_ITS_ORDER.get(name, []) else 1e-15 * n
+            assert np.max(np.abs(values - values[0])) < bound * scale, label
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("name", __main__._SCENES)
+def test_every_scene_can_be_run(name, monkeypatch):
+    """With its own numbers, but few steps and no picture."""
+    module = __main__._SCENES[name]
+    assert callable(module.picture)
+    monkeypatch.setattr(module, "picture", Figure)
+    with Progress(disable=True) as progress:
+        # Enough for the steps to be stable.
+        num_steps = 10 if name == "wilson_flow" else 200
+        report = _report.scene(
+            name, module, progress, num_steps=num_steps, num_saves=2, budget=0.01
+        )
+    assert list(report.figures) == [f"{name}_picture"]
+    table: Any = report.printed[1]
+    assert table.row_count > 0
+
+
 @pytest.mark.parametrize(
     "arguments, message",
     [
@@ -121,6 +217,19 @@ main(["chart", "rigid_body"])
 )
 def test_bad_arguments(arguments, message, capsys):
     check_one_line_error(["chart", *arguments], message, capsys)
+
+
+@pytest.mark.parametrize(
+    "arguments, message",
+    [
+        ([], "SCENE"),
+        (["stiefel_first"], "invalid choice: 'stiefel_first' (choose from"),
+        (["stiefel", "--budget", "1"], "--budget"),
+        (["stiefel", "--output", ""], "must name a folder, got ''"),
+    ],
+)
+def test_bad_arguments_of_a_scene(arguments, message, capsys):
+    check_one_line_error(["scene", *arguments], message, capsys)
 
 
 def test_output_that_is_a_file(tmp_path, capsys):

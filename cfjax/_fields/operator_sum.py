@@ -305,7 +305,7 @@ def _coefficients(given: Any, number: int, precision: Any) -> Array:
             jnp.result_type(float),
         )
         is_complex = any(jnp.iscomplexobj(c) for c in values)
-        dtype = jnp.result_type(precision, jnp.complex64) if is_complex else precision
+        dtype = np.result_type(precision, np.complex64) if is_complex else precision
         own = [c for c in given if hasattr(c, "dtype") and jnp.issubdtype(c.dtype, jnp.inexact)]
         wrong = [c.dtype for c in own if jnp.finfo(c.dtype).dtype != precision]
         if wrong:

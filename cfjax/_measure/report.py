@@ -5,17 +5,28 @@ import os
 import tempfile
 from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
-from typing import NamedTuple
+from types import ModuleType
+from typing import Any, NamedTuple
 
+import diffrax
 import jax
+import jax.numpy as jnp
+import jax.tree_util as jtu
+import numpy as np
+from jaxtyping import Array, Float
 from matplotlib.figure import Figure
+from matplotlib.ticker import EngFormatter
+from rich import box
 from rich.console import Console, RenderableType
 from rich.progress import Progress
+from rich.table import Table
 
-from .._integrate.progress import on_terminal
+from .._integrate.integrate import integrate
+from .._integrate.progress import on_terminal, progress_bar
 from .._signals import busy
+from .._solvers.commutator_free import CF4
 from .style import new_figure
-from .work_precision import WorkPrecision
+from .work_precision import WorkPrecision, compiled, take_turns
 
 
 class Report(NamedTuple):
@@ -85,3 +96,68 @@ def chart(
     if picture is not None:
         figures[f"{name}_picture"] = picture()
     return Report([work.table()], figures, {name: work})
+
+
+def scene(
+    name: str,
+    module: ModuleType,
+    progress: Progress,
+    *,
+    num_steps: int = 1000,
+    num_saves: int = 100,
+    budget: float = 2.0,
+) -> Report:
+    """One solve of a scene by CF4: its invariants, what it takes, and its picture.
+
+    The scene has functions `problem`, `invariants` and `picture`. Invariants are looked at in
+    `num_saves` states, and times measured for `budget` seconds.
+    """
+    problem = {"args": None} | module.problem()
+    names = "t0", "t1", "y0", "args"
+    arrays = tuple(jtu.tree_map(jnp.asarray, problem[name]) for name in names)
+
+    def solve(t0: Any, t1: Any, y0: Any, args: Any) -> diffrax.Solution:
+        save_every = num_steps // num_saves
+        return integrate(
+            problem["term"], CF4(), t0, t1, y0, args, num_steps=num_steps, save_every=save_every
+        )
+
+    y0, args = arrays[2:]
+    with progress_bar(progress, "Compiling", 2) as update:
+        program, compile_seconds = compiled(solve, *arrays)
+        update(advance=1, description="Running")
+        ys = jax.block_until_ready(program(arrays).ys)  # type: ignore
+        update(advance=1)
+    (seconds,) = take_turns(
+        [lambda: program(arrays)], repeats=100, budget=budget, progress=progress
+    )
+    with progress_bar(progress, "Drawing", 1) as update:
+        figure = module.picture()
+        update(advance=1)
+
+    title = f"{num_steps} equal steps of CF4, t = {float(arrays[0]):g} to {float(arrays[1]):g}"
+    table = Table(box=box.SIMPLE_HEAD, padding=(0, 1), title=title, title_justify="left")
+    table.add_column("")
+    for heading in ("start", "end", "largest change"):
+        table.add_column(heading, justify="right", no_wrap=True)
+    start = module.invariants(y0, args)
+    found = jax.vmap(lambda y: module.invariants(y, args))(ys)
+    for label, value in start.items():
+        change = np.max(np.abs(np.asarray(found[label]) - np.asarray(value)))
+        table.add_row(label, _span(value), _span(found[label][-1]), f"{change:.1e}")
+    fastest = float(np.min(seconds))
+    show = EngFormatter("s", places=1)
+    times = (
+        f"Compiled in {show(compile_seconds)}. Ran in {show(fastest)}, {show(fastest / num_steps)} "
+        f"a step: the fastest of {len(seconds)} runs on one {jax.default_backend().upper()}."
+    )
+    subject = (inspect.getdoc(module) or name).splitlines()[0]
+    return Report([subject, table, times], {f"{name}_picture": figure})
+
+
+def _span(values: Float[Array, "..."]) -> str:
+    """Up to three numbers, or the smallest and the largest of more."""
+    if np.size(values) <= 3:
+        return ", ".join(f"{float(x):.5g}" for x in np.ravel(values))
+    low, high = (f"{float(x):.5g}" for x in (np.min(values), np.max(values)))
+    return low if low == high else f"{low} to {high}"

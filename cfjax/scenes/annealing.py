@@ -127,14 +127,21 @@ def reference(t: float, num_spins: int = 8) -> Complex[np.ndarray, " size"]:
     return found.y[:, -1]
 
 
+def problem(num_spins: int = 8) -> dict[str, Any]:
+    """What is solved, as arguments of `cfjax.integrate` and `cfjax.work_precision`."""
+    return dict(term=LieTerm(field), t0=t0, t1=t1, y0=y0(num_spins))
+
+
+def invariants(y: State, args: Any = None) -> dict[str, Array]:
+    """What stays, or goes one way, as its name says."""
+    return {"norm": jnp.linalg.norm(y)}
+
+
 def chart(num_spins: int = 10, **options: Any) -> WorkPrecision:
     """Ten spins, 80 to 1280 equal steps; Tsit5 and Dopri8 in plain space with equal operators."""
     space = diffrax.ODETerm(velocity)
     return work_precision(
-        LieTerm(field),
-        t0,
-        t1,
-        y0(num_spins),
+        **problem(num_spins),
         methods={
             "CF4": CF4(),
             "CF54": CF54(),

@@ -114,16 +114,25 @@ def reference(
     return np.stack([found[t] for t in times.flat]).reshape(*times.shape, 4, 4)
 
 
+def problem() -> dict[str, Any]:
+    """What is solved, as arguments of `cfjax.integrate` and `cfjax.work_precision`."""
+    return dict(term=LieTerm(field), t0=t0, t1=t1, y0=y0(1.0), args=Track())
+
+
+def invariants(y: Covariance, args: Any = None) -> dict[str, Array]:
+    """What stays, or goes one way, as its name says."""
+    return {
+        "smallest eigenvalue (stays positive)": smallest(y),
+        "asymmetry": jnp.max(jnp.abs(y - y.T)),
+    }
+
+
 def chart(**options: Any) -> WorkPrecision:
     """A ship comes in sight, 20 to 1280 equal steps; Tsit5, Dopri5 and RK4 in plain space."""
     space = diffrax.ODETerm(velocity)
-    start, args = y0(1.0), Track()
+    given = problem()
     return work_precision(
-        LieTerm(field),
-        t0,
-        t1,
-        start,
-        args,
+        **given,
         methods={
             "CF3": CF3(),
             "CF4": CF4(),
@@ -132,7 +141,7 @@ def chart(**options: Any) -> WorkPrecision:
             "Tsit5": (space, diffrax.Tsit5()),
             "Dopri5": (space, diffrax.Dopri5()),
         },
-        reference=reference(t1, start, args),
+        reference=reference(t1, given["y0"], given["args"]),
         num_steps=[20 * 2**k for k in range(7)],
         **options,
     )

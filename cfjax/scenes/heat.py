@@ -10,9 +10,10 @@ Source: Celledoni, Marthinsen & Owren, Commutator-free Lie group methods, FGCS 1
 Section 3.3, doi:10.1016/S0167-739X(02)00161-9.
 """
 
-from typing import Any, NamedTuple
+from typing import TYPE_CHECKING, Any, NamedTuple
 
 import diffrax
+import jax
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
@@ -26,10 +27,16 @@ from .. import (
     Richardson,
     SineTransform,
     WorkPrecision,
+    integrate,
     work_precision,
 )
 
+if TYPE_CHECKING:
+    from matplotlib.figure import Figure
+
 t0, t1 = 0.0, 0.5
+
+_COLOURS = "#D55E00", "#E69F00", "#009E73", "#0072B2"
 
 
 class Diffusivity(NamedTuple):
@@ -97,19 +104,30 @@ def reference(
     return (np.exp(np.asarray(t, float)[..., None] * rates) * modes) @ vectors.T
 
 
+def problem() -> dict[str, Any]:
+    """What is solved, as arguments of `cfjax.integrate` and `cfjax.work_precision`."""
+    return dict(term=LieTerm(field), t0=t0, t1=t1, y0=y0(), args=diffusivity())
+
+
+def invariants(y: Float[Array, " n"], args: Any = None) -> dict[str, Array]:
+    """What stays, or goes one way, as its name says."""
+    u = to_grid(y)
+    return {
+        "highest temperature (falls)": jnp.max(u),
+        "lowest temperature (stays positive)": jnp.min(u),
+        "asymmetry": jnp.max(jnp.abs(u - u[::-1])),
+    }
+
+
 def chart(**options: Any) -> WorkPrecision:
     """Heat conduction, N = 100, tolerances 1e-2 to 1e-7. CF4, RKMK4 and RK4 double steps."""
-    args = diffusivity()
+    given = problem()
 
     def velocity(t, y, args):
         return from_grid(grid_field(t, to_grid(y), args))
 
     return work_precision(
-        LieTerm(field),
-        t0,
-        t1,
-        y0(),
-        args,
+        **given,
         methods={
             "CF4": Richardson(CF4()),
             "CF43": CF43(),
@@ -119,10 +137,59 @@ def chart(**options: Any) -> WorkPrecision:
             "Tsit5": (diffrax.ODETerm(velocity), diffrax.Tsit5()),
             "Kvaerno5": (diffrax.ODETerm(velocity), diffrax.Kvaerno5()),
         },
-        reference=np.asarray(from_grid(jnp.asarray(reference(t1, np.asarray(args.mu))))),
+        reference=np.asarray(from_grid(jnp.asarray(reference(t1, given["args"].mu)))),
         tolerances=[10.0**-k for k in range(2, 8)],
         **options,
     )
+
+
+def picture(num_intervals: int = 100) -> "Figure":
+    """The temperature as it falls, and the errors of CF4 and of RKMK4, which is not stable here."""
+    from matplotlib.figure import Figure
+
+    n, args = 200, diffusivity(num_intervals)
+    points = np.concatenate([[-1.0], _points(num_intervals), [1.0]])
+
+    def temperatures(ys: Any) -> np.ndarray:
+        u = np.asarray(jax.vmap(to_grid)(jnp.asarray(ys)))
+        return np.pad(u, ((0, 0), (1, 1)))
+
+    found = {
+        name: integrate(
+            LieTerm(field),
+            solver,
+            t0,
+            t1,
+            y0(num_intervals),
+            args,
+            num_steps=n,
+            save_every=1,
+            throw=False,
+        )
+        for name, solver in {"CF4": CF4(), "RKMK4": RKMK4()}.items()
+    }
+    times, ys = np.asarray(found["CF4"].ts), temperatures(found["CF4"].ys)
+    start = temperatures(y0(num_intervals)[None])
+    figure = Figure((10.0, 3.6), layout="constrained")
+    curves, image, errors = figure.subplots(1, 3)
+    curves.plot(points, start[0], color="0.6", linestyle=":", label="t = 0")
+    for t, colour in zip((0.025, 0.1, 0.25, 0.5), _COLOURS, strict=True):
+        k = round(n * t / t1) - 1
+        curves.plot(points, ys[k], color=colour, label=f"t = {times[k]:g}")
+    curves.set(title="Temperature", xlabel="x")
+    curves.legend(frameon=False)
+    box = (-1.0, 1.0, t1, t0)
+    rows = np.concatenate([start, ys])
+    shown = image.imshow(rows, extent=box, aspect="auto", cmap="inferno", vmin=0, vmax=1)
+    figure.colorbar(shown, ax=image)
+    image.set(title="Temperature", xlabel="x", ylabel="t")
+    exact = reference(times, np.asarray(args.mu))
+    for name, colour in (("CF4", "#0072B2"), ("RKMK4", "#D55E00")):
+        off = np.abs(temperatures(found[name].ys)[:, 1:-1] - exact).max(axis=1)
+        errors.semilogy(times, np.where(off < 1, off, np.nan), color=colour, label=name)
+    errors.set(title=f"Error, steps of {t1 / n:g}", xlabel="t")
+    errors.legend(frameon=False)
+    return figure
 
 
 def _points(num_intervals: int) -> Float[np.ndarray, " n"]:

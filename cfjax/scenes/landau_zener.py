@@ -104,15 +104,21 @@ def reference(
     return y
 
 
+def problem() -> dict[str, Any]:
+    """What is solved, as arguments of `cfjax.integrate` and `cfjax.work_precision`."""
+    return dict(term=LieTerm(field), t0=t0, t1=t1, y0=y0(), args=slow)
+
+
+def invariants(y: Complex[Array, "2"], args: Any = None) -> dict[str, Array]:
+    """What stays, or goes one way, as its name says."""
+    return {"norm": jnp.linalg.norm(y)}
+
+
 def chart(**options: Any) -> WorkPrecision:
     """A sweep from t = -10 to 10, 40 to 2560 equal steps; Tsit5 and Dopri8 in plain space."""
     space = diffrax.ODETerm(velocity)
     return work_precision(
-        LieTerm(field),
-        t0,
-        t1,
-        y0(),
-        slow,
+        **problem(),
         methods={
             "CF4": CF4(),
             "CF54": CF54(),

@@ -8,15 +8,30 @@ Source: Celledoni, Marthinsen & Owren, Commutator-free Lie group methods, FGCS 1
 Section 3.1, doi:10.1016/S0167-739X(02)00161-9.
 """
 
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import diffrax
+import jax
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
-from .. import CF3, CF4, CF43, RKMK3, RKMK4, LieTerm, Rotation, WorkPrecision, work_precision
+from .. import (
+    CF3,
+    CF4,
+    CF43,
+    RKMK3,
+    RKMK4,
+    LieTerm,
+    Rotation,
+    WorkPrecision,
+    integrate,
+    work_precision,
+)
 from .._numerics.matmul import matmul
+
+if TYPE_CHECKING:
+    from matplotlib.figure import Figure
 
 t0, t1 = 0.0, 100.0
 y0 = np.array([8 / 9, 4 / 9, 1 / 9])
@@ -72,15 +87,21 @@ def reference(
     return np.stack([y1_max * dn, -y2_max * sn, y3_max * cn], axis=-1)
 
 
+def problem() -> dict[str, Any]:
+    """What is solved, as arguments of `cfjax.integrate` and `cfjax.work_precision`."""
+    return dict(term=LieTerm(field), t0=t0, t1=t1, y0=y0, args=inertia)
+
+
+def invariants(y: Float[Array, "3"], args: Any = None) -> dict[str, Array]:
+    """What stays, or goes one way, as its name says."""
+    return {"energy": energy(y, args), "length of the momentum": jnp.linalg.norm(y)}
+
+
 def chart(**options: Any) -> WorkPrecision:
     """The free rigid body, 500 to 32 000 equal steps to t = 100; Tsit5 and Dopri5 in space."""
     space = diffrax.ODETerm(lambda t, y, args: jnp.cross(y, y / args))
     return work_precision(
-        LieTerm(field),
-        t0,
-        t1,
-        y0,
-        inertia,
+        **problem(),
         methods={
             "CF3": CF3(),
             "RKMK3": RKMK3(),
@@ -94,3 +115,50 @@ def chart(**options: Any) -> WorkPrecision:
         num_steps=[500 * 2**k for k in range(7)],
         **options,
     )
+
+
+def picture() -> "Figure":
+    """The paths of the momentum on its sphere, and the energy, which methods keep to their order.
+
+    About the axes of least and of largest inertia the body turns stably, about the middle one not.
+    """
+    from matplotlib.figure import Figure
+
+    # Through the axes of largest and of least inertia, on both sides of the one between them.
+    angles = np.linspace(0, 2 * np.pi, 24, endpoint=False) + np.pi / 24
+    starts = np.stack([np.cos(angles), 0 * angles, np.sin(angles)], axis=-1)
+
+    def solve(start: Any, solver: Any, n: int) -> Any:
+        return integrate(
+            LieTerm(field), solver, 0.0, 20.0, start, inertia, num_steps=n, save_every=1
+        )
+
+    paths = np.asarray(jax.vmap(lambda start: solve(start, CF4(), 400).ys)(jnp.asarray(starts)))
+    figure = Figure((9.0, 4.2), layout="constrained")
+    sphere: Any = figure.add_subplot(1, 2, 1, projection="3d", computed_zorder=False)
+    longitude, latitude = np.mgrid[0 : 2 * np.pi : 37j, 0 : np.pi : 19j]
+    ring = np.sin(latitude)
+    ball = ring * np.cos(longitude), ring * np.sin(longitude), np.cos(latitude)
+    sphere.plot_wireframe(*ball, color="0.9", linewidth=0.5, zorder=0)
+    towards = np.array([1.0, 0.8, 0.7])
+    for path in paths:
+        # What is behind the sphere is left out.
+        seen = np.where((path @ towards > 0)[:, None], path, np.nan)
+        is_about_the_first = energy(path[0], inertia) < 0.5 / inertia[1]
+        sphere.plot(*seen.T, color="#0072B2" if is_about_the_first else "#D55E00", linewidth=1.2)
+    for name, axis in zip("123", np.eye(3), strict=True):
+        sphere.text(*(1.1 * axis), name, ha="center", va="center")
+    sphere.view_init(elev=29, azim=39)
+    sphere.set(title="The momentum in the body, with its axes")
+    sphere.set_axis_off()
+    sphere.set_box_aspect((1, 1, 1), zoom=1.35)
+
+    drift = figure.add_subplot(1, 2, 2)
+    n, exact = 80, float(energy(y0, inertia))
+    for name, solver, colour in (("CF3", CF3(), "#009E73"), ("CF4", CF4(), "#0072B2")):
+        found = solve(y0, solver, n)
+        off = np.abs(np.asarray(energy(found.ys, inertia)) - exact)
+        drift.semilogy(np.asarray(found.ts), np.maximum(off, 1e-17), color=colour, label=name)
+    drift.set(title=f"Error of the energy, steps of {20 / n:g}", xlabel="t")
+    drift.legend(frameon=False, loc="lower right")
+    return figure

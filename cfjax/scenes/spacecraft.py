@@ -133,15 +133,25 @@ def error(y: State, exact: State) -> float:
     return float(np.hypot(off, np.linalg.norm(np.asarray(y["m"]) - exact["m"])))
 
 
+def problem() -> dict[str, Any]:
+    """What is solved, as arguments of `cfjax.integrate` and `cfjax.work_precision`."""
+    return dict(term=LieTerm(field), t0=t0, t1=t1, y0=y0(), args=Craft())
+
+
+def invariants(y: State, args: Any = None) -> dict[str, Array]:
+    """What stays, or goes one way, as its name says."""
+    return {
+        "energy": energy(y, args),
+        "momentum in the fixed frame": fixed_momentum(y),
+        "length of the quaternion": jnp.linalg.norm(y["q"]),
+    }
+
+
 def chart(**options: Any) -> WorkPrecision:
     """A tumbling spacecraft to t = 40, 100 to 6400 equal steps; Tsit5 and Dopri8 in plain space."""
     space = diffrax.ODETerm(velocity)
     return work_precision(
-        LieTerm(field),
-        t0,
-        t1,
-        y0(),
-        Craft(),
+        **problem(),
         methods={
             "CF3": CF3(),
             "CF4": CF4(),

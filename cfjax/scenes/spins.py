@@ -105,16 +105,22 @@ def reference(
     return found.y[:, -1].reshape(start.shape)
 
 
+def problem() -> dict[str, Any]:
+    """What is solved, as arguments of `cfjax.integrate` and `cfjax.work_precision`."""
+    return dict(term=LieTerm(field), t0=t0, t1=t1, y0=y0(8, 8), args=Magnet())
+
+
+def invariants(y: Spins, args: Any = None) -> dict[str, Array]:
+    """What stays, or goes one way, as its name says."""
+    return {"energy (falls)": energy(y, args), "length of each spin": jnp.linalg.norm(y, axis=-1)}
+
+
 def chart(**options: Any) -> WorkPrecision:
     """An 8 x 8 ferromagnet to t = 4, 20 to 640 equal steps; Tsit5 and Dopri5 in plain space."""
-    start, args = y0(8, 8), Magnet()
+    given = problem()
     space = diffrax.ODETerm(velocity)
     return work_precision(
-        LieTerm(field),
-        t0,
-        t1,
-        start,
-        args,
+        **given,
         methods={
             "CF3": CF3(),
             "CF4": CF4(),
@@ -123,7 +129,7 @@ def chart(**options: Any) -> WorkPrecision:
             "Dopri5": (space, diffrax.Dopri5()),
             "Tsit5": (space, diffrax.Tsit5()),
         },
-        reference=reference(t1, start, args),
+        reference=reference(t1, given["y0"], given["args"]),
         num_steps=[20 * 2**k for k in range(6)],
         **options,
     )

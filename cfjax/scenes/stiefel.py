@@ -8,8 +8,7 @@ Source: Celledoni, Marthinsen & Owren, Commutator-free Lie group methods, FGCS 1
 Section 3.2, doi:10.1016/S0167-739X(02)00161-9.
 """
 
-from collections.abc import Callable
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import diffrax
 import jax.numpy as jnp
@@ -25,9 +24,13 @@ from .. import (
     LieTerm,
     LowRankSkew,
     WorkPrecision,
+    integrate,
     tangent,
     work_precision,
 )
+
+if TYPE_CHECKING:
+    from matplotlib.figure import Figure
 
 t0, t1 = 0.0, 1.0
 
@@ -122,26 +125,77 @@ def reference(problem: str, n: int, p: int = 4) -> Float[np.ndarray, "n p"]:
     return answer.y[:, -1].reshape(n, p)
 
 
+def problem(which: str = "first", n: int = 100) -> dict[str, Any]:
+    """What is solved, as arguments of `cfjax.integrate` and `cfjax.work_precision`."""
+    field, args = {"first": (first, diagonals(n)), "second": (second, None)}[which]
+    return dict(term=LieTerm(field), t0=t0, t1=t1, y0=y0(n), args=args)
+
+
+def invariants(y: Float[Array, "n p"], args: Any = None) -> dict[str, Array]:
+    """What stays, or goes one way, as its name says."""
+    defect = y.T @ y - np.eye(y.shape[1], dtype=y.dtype)
+    return {"distance from orthonormal columns": jnp.linalg.norm(defect)}
+
+
 def chart_first(**options: Any) -> WorkPrecision:
     """Stiefel manifold, first experiment, n = 1000, p = 4, 4 to 256 equal steps to t = 1."""
-    return _chart(first, "first", diagonals(1000), options)
+    return _chart("first", options)
 
 
 def chart_second(**options: Any) -> WorkPrecision:
     """Stiefel manifold, second experiment, n = 1000, p = 4, 4 to 256 equal steps to t = 1."""
-    return _chart(second, "second", None, options)
+    return _chart("second", options)
 
 
-def _chart(
-    field: Callable[..., Any], problem: str, args: Any, options: dict[str, Any]
-) -> WorkPrecision:
+def picture(n: int = 40) -> "Figure":
+    """Columns of the first problem that gather where D is smallest, and two ways to stay there.
+
+    The flow climbs `tr(C Y^T D Y) / 2`, whose maximum has the columns on the first p axes.
+    """
+    from matplotlib.figure import Figure
+
+    end, steps = 40.0, 400
+    given: dict[str, Any] = problem("first", n) | dict(t1=end)
+    d, c = given["args"]
+    space = diffrax.ODETerm(lambda t, y, args: tangent(first(t, y, args), y))
+    options: Any = dict(num_steps=steps, save_every=1)
+    found = {
+        "CF4": integrate(**given, solver=CF4(), **options),
+        "Tsit5 in plain space": integrate(
+            **(given | dict(term=space)), solver=diffrax.Tsit5(), **options
+        ),
+    }
+    times, ys = np.asarray(found["CF4"].ts), np.asarray(found["CF4"].ys)
+    figure = Figure((10.0, 3.6), layout="constrained")
+    columns, climb, drift = figure.subplots(1, 3, width_ratios=(1.2, 1, 1))
+    shots = np.concatenate([np.asarray(given["y0"])[None], ys[[19, 99, -1]]])
+    # One blank column between the matrices.
+    board = np.pad(np.abs(shots), ((0, 0), (0, 0), (0, 1)), constant_values=np.nan)
+    width = board.shape[2]
+    board = np.concatenate(list(board), axis=1)[:, :-1]
+    columns.imshow(board, aspect="auto", cmap="magma_r", vmin=0, vmax=1, interpolation="nearest")
+    labels = [f"t = {t:g}" for t in (0, *times[[19, 99, -1]])]
+    columns.set_xticks([width * k + (width - 2) / 2 for k in range(len(shots))], labels)
+    columns.set(title="Entries of Y, by size", ylabel="row")
+    height = np.einsum("tij,i,j->t", ys**2, d, c) / 2
+    top = np.sum(d[: len(c)] * np.sort(c)) / 2
+    climb.plot(times, height, color="#0072B2")
+    climb.axhline(top, color="0.6", linestyle=":", linewidth=1)
+    climb.set(title="tr(C Y^T D Y) / 2, and its maximum", xlabel="t")
+    for name, sol in found.items():
+        y = np.asarray(sol.ys)
+        off = np.abs(np.swapaxes(y, 1, 2) @ y - np.eye(y.shape[2])).max(axis=(1, 2))
+        drift.semilogy(times, np.maximum(off, 1e-17), label=name)
+    drift.set(title=f"Off orthonormal, steps of {end / steps:g}", xlabel="t")
+    drift.legend(frameon=False)
+    return figure
+
+
+def _chart(which: str, options: dict[str, Any]) -> WorkPrecision:
+    given, field = problem(which, 1000), {"first": first, "second": second}[which]
     space = diffrax.ODETerm(lambda t, y, args: tangent(field(t, y, args), y))
     return work_precision(
-        LieTerm(field),
-        t0,
-        t1,
-        y0(1000),
-        args,
+        **given,
         methods={
             "CF3": CF3(),
             "CF4": CF4(),
@@ -149,7 +203,7 @@ def _chart(
             "RKR-C4": CayleyRK4(),
             "Tsit5": (space, diffrax.Tsit5()),
         },
-        reference=reference(problem, 1000),
+        reference=reference(which, 1000),
         num_steps=[4 * 2**k for k in range(7)],
         **options,
     )

@@ -105,14 +105,21 @@ def particles(
     return q + (np.asarray(center) - q.mean(-1))[..., None]
 
 
+def problem() -> dict[str, Any]:
+    """What is solved, as arguments of `cfjax.integrate` and `cfjax.work_precision`."""
+    return dict(term=LieTerm(field), t0=t0, t1=t1, y0=y0())
+
+
+def invariants(y: Float[Array, "n n"], args: Any = None) -> dict[str, Array]:
+    """What stays, or goes one way, as its name says."""
+    return {"energy": energy(y), "eigenvalues": jnp.linalg.eigvalsh(y)}
+
+
 def chart(**options: Any) -> WorkPrecision:
     """Five particles of a Toda lattice to t = 10, 20 to 1280 equal steps; Tsit5 in plain space."""
     space = diffrax.ODETerm(velocity)
     return work_precision(
-        LieTerm(field),
-        t0,
-        t1,
-        y0(),
+        **problem(),
         methods={
             "CF3": CF3(),
             "CF4": CF4(),

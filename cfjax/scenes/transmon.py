@@ -154,15 +154,23 @@ def reference(args: Pulse, levels: int = 4) -> Complex[np.ndarray, "levels level
     return np.exp(-1j * energies * args.duration)[:, None] * y
 
 
+def problem() -> dict[str, Any]:
+    """What is solved, as arguments of `cfjax.integrate` and `cfjax.work_precision`."""
+    args = corrected()
+    return dict(term=LieTerm(field), t0=t0, t1=args.duration, y0=y0(), args=args)
+
+
+def invariants(y: Columns, args: Any = None) -> dict[str, Array]:
+    """What stays, or goes one way, as its name says."""
+    defect = jnp.conj(y.T) @ y - np.eye(len(y), dtype=y.dtype)
+    return {"distance from unitary": jnp.linalg.norm(defect)}
+
+
 def chart(**options: Any) -> WorkPrecision:
     """The corrected pulse on a propagator, 100 to 3200 equal steps; Tsit5 and Dopri8 beside it."""
-    space, args = diffrax.ODETerm(velocity), corrected()
+    space = diffrax.ODETerm(velocity)
     return work_precision(
-        LieTerm(field),
-        t0,
-        args.duration,
-        y0(),
-        args,
+        **problem(),
         methods={
             "CF4": CF4(),
             "Magnus4": Magnus4(),
@@ -171,7 +179,7 @@ def chart(**options: Any) -> WorkPrecision:
             "Tsit5": (space, diffrax.Tsit5()),
             "Dopri8": (space, diffrax.Dopri8()),
         },
-        reference=reference(args),
+        reference=reference(corrected()),
         num_steps=[100 * 2**k for k in range(6)],
         **options,
     )

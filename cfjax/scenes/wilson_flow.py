@@ -107,14 +107,26 @@ def action(y: Links) -> Float[Array, ""]:
     return jnp.sum(density(y))
 
 
+def problem() -> dict[str, Any]:
+    """What is solved, as arguments of `cfjax.integrate` and `cfjax.work_precision`."""
+    return dict(term=LieTerm(field), t0=t0, t1=t1, y0=y0())
+
+
+def invariants(y: Links, args: Any = None) -> dict[str, Array]:
+    """What stays, or goes one way, as its name says."""
+    eye = np.broadcast_to(np.eye(3, dtype=y.dtype), y.shape)
+    defect = matmul(jnp.conj(jnp.swapaxes(y, -1, -2)), y) - eye
+    return {
+        "action (falls)": action(y),
+        "distance of each link from unitary": jnp.linalg.norm(defect, axis=(-2, -1)),
+    }
+
+
 def chart(**options: Any) -> WorkPrecision:
     """The Wilson flow of 4^4 links of SU(3), 5 to 80 equal steps; Tsit5 in plain space."""
-    start = y0()
+    given = problem()
     return work_precision(
-        LieTerm(field),
-        t0,
-        t1,
-        start,
+        **given,
         methods={
             "CF3": CF3(),
             "CF4": CF4(),
@@ -123,7 +135,7 @@ def chart(**options: Any) -> WorkPrecision:
             "CK54": CK54(),
             "Tsit5": (diffrax.ODETerm(velocity), diffrax.Tsit5()),
         },
-        reference=reference(t1, start),
+        reference=reference(t1, given["y0"]),
         num_steps=[5 * 2**k for k in range(5)],
         **options,
     )

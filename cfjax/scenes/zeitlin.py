@@ -220,16 +220,28 @@ def reference(t: float, start: Complex[np.ndarray, "N N"]) -> Complex[np.ndarray
     return np.ascontiguousarray(found).view(complex).reshape(n, n)
 
 
+def problem() -> dict[str, Any]:
+    """What is solved, as arguments of `cfjax.integrate` and `cfjax.work_precision`."""
+    start = y0()
+    inverse = jnp.asarray(inverse_laplacian(len(start)))
+    return dict(term=LieTerm(field), t0=t0, t1=t1, y0=start, args=inverse)
+
+
+def invariants(y: Complex[Array, "N N"], args: Any = None) -> dict[str, Array]:
+    """What stays, or goes one way, as its name says."""
+    return {
+        "energy": energy(y, args),
+        "angular momentum": angular_momentum(y),
+        "eigenvalues": jnp.linalg.eigvalsh(y),
+    }
+
+
 def chart(**options: Any) -> WorkPrecision:
     """Vorticity on the sphere, N = 32, to t = 4, 10 to 320 equal steps; Tsit5 in plain space."""
-    start = y0()
+    given = problem()
     space = diffrax.ODETerm(velocity)
     return work_precision(
-        LieTerm(field),
-        t0,
-        t1,
-        start,
-        jnp.asarray(inverse_laplacian(len(start))),
+        **given,
         methods={
             "CF3": CF3(),
             "CF4": CF4(),
@@ -238,7 +250,7 @@ def chart(**options: Any) -> WorkPrecision:
             "Dopri5": (space, diffrax.Dopri5()),
             "Tsit5": (space, diffrax.Tsit5()),
         },
-        reference=reference(t1, start),
+        reference=reference(t1, given["y0"]),
         num_steps=[10 * 2**k for k in range(6)],
         **options,
     )

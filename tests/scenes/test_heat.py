@@ -275,3 +275,7 @@ def test_gradient_with_adaptive_steps():
 
 def max_norm(error):
     return jnp.max(jnp.abs(heat.to_grid(error)))
+
+
+def test_the_picture():
+    assert len(heat.picture(num_intervals=16).axes) == 4

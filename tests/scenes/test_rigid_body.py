@@ -131,3 +131,7 @@ def error_at_one(method, num_steps):
         solution = cfjax.integrate(TERM, method, t0, t1, y, inertia, num_steps=16)
         y = jnp.asarray(solution.ys)[-1]
     return np.linalg.norm(y - rigid_body.reference(1.0))
+
+
+def test_the_picture():
+    assert len(rigid_body.picture().axes) == 2

@@ -143,3 +143,7 @@ def test_precision_follows_the_state(dtype):
     args = tuple(jnp.asarray(x, dtype) for x in stiefel.diagonals(6, 2))
     assert stiefel.first(0.0, y, args).g.dtype == dtype
     assert stiefel.second(0.0, y).gamma.dtype == dtype
+
+
+def test_the_picture():
+    assert len(stiefel.picture(n=8).axes) == 3
