@@ -241,7 +241,12 @@ def test_the_excess_of_the_cotangent(dtype):
             near = float(4 * mpmath.pi**2 / (4 * mpmath.pi**2 - at))
             for n, (got, want) in enumerate(zip(found, wants, strict=True)):
                 rtol = 8 * 10**n * (n + 1) * near * np.finfo(dtype).eps
-                np.testing.assert_allclose(float(got[k]), float(want), rtol, err_msg=f"{n} at {at}")
+                # Markov's inequality: what a rounding of the polynomial, of degree 13 on an
+                # interval of length 4 pi^2, can be in its derivatives at an end.
+                atol = np.finfo(dtype).eps / 12 * (2 * 13**2 / (4 * np.pi**2)) ** n
+                np.testing.assert_allclose(
+                    float(got[k]), float(want), rtol, atol, err_msg=f"{n} at {at}"
+                )
 
 
 @DTYPES
