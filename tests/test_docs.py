@@ -49,7 +49,7 @@ OTHERS = [page for page in PAGES if page not in START + STATES]
     "pages",
     [
         pytest.param(START, id="start"),
-        pytest.param(STATES, id="states"),
+        pytest.param(STATES, id="states", marks=pytest.mark.slow),
         pytest.param(OTHERS, id="others", marks=pytest.mark.slow),
     ],
 )
