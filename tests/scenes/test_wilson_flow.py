@@ -66,6 +66,7 @@ def reference():
     return wilson_flow.reference(0.3, START)
 
 
+@pytest.mark.representatives(1)
 @pytest.mark.parametrize(
     ("solver", "order"), [(cfjax.Luscher3(), 3), (cfjax.CF4(), 4), (cfjax.CK54(), 4)]
 )
