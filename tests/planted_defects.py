@@ -405,9 +405,9 @@ DEFECTS = [
         "numerics/test_cayley_hamilton.py -k both",
     ),
     Defect(
-        "_numerics/expm_times.py",
-        "term = product(term) / k",
-        "term = product(term) / (k + 1)",
+        "_numerics/phi_1_times.py",
+        "term = _times(a, term) / k",
+        "term = _times(a, term) / (k + 1)",
         "a wrong factorial in phi_1 times a few columns",
         "numerics/test_phi_1_times.py",
     ),

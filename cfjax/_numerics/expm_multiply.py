@@ -16,8 +16,8 @@ from .squaring import max_over_batch
 # Of Taylor polynomials of growing degree, beginning with these, the largest norm for which they
 # have a backward error below half a unit in the last place; up to where the terms grow and cancel.
 # As in Table 3.1 of Al-Mohy & Higham; tests/numerics/test_expm_multiply.py derives them.
-_FIRST_DEGREE = {"float32": 3, "float64": 5}
-_LONGEST = {
+FIRST_DEGREE = {"float32": 3, "float64": 5}
+LONGEST = {
     "float32": [
         *[0.01123, 0.05116, 0.1308, 0.2495, 0.4014, 0.58, 0.7795],
         *[0.9951, 1.223, 1.461, 1.707, 1.959, 2.217],
@@ -124,8 +124,8 @@ def _by_real(x: Array, scale: Callable[[Array], Array]) -> Array:
 
 @functools.cache
 def _taylor(precision: str) -> _Series:
-    lengths = _LONGEST[precision]
-    counts = _FIRST_DEGREE[precision] + np.arange(len(lengths))
+    lengths = LONGEST[precision]
+    counts = FIRST_DEGREE[precision] + np.arange(len(lengths))
     ks = np.tile(np.arange(1.0, counts[-1] + 1), (len(lengths), 1))
     weights = np.concatenate([np.zeros_like(ks[:, :1]), np.ones_like(ks)], axis=1)
     return _Series(np.array(lengths), counts, ks, weights, before=False)

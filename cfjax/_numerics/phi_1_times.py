@@ -1,6 +1,8 @@
 """phi_1 of a dense matrix, times a vector: the increment of an affine flow."""
 
+import jax
 import jax.numpy as jnp
+from jax import lax
 from jaxtyping import Array, Inexact
 
 from .expm import (
@@ -11,9 +13,12 @@ from .expm import (
     plus_identity,
     taylor_from_second,
 )
-from .expm_times import phi_1_series
+from .expm_multiply import FIRST_DEGREE, LONGEST
 from .matmul import matmul, promoted, small_product
-from .squaring import repeat
+from .squaring import max_over_batch, repeat
+
+# So many terms of Taylor's series.
+_DEGREES = {"float32": (5, 10, 15), "float64": (12, 16, 20, 25)}
 
 # A matrix a and a vector v, for the block matrix `[[a, v], [0, 0]]`.
 _Pair = tuple[Array, Array]
@@ -22,12 +27,45 @@ _Pair = tuple[Array, Array]
 def phi_1_times(a: Inexact[Array, "n n"], v: Inexact[Array, " n"]) -> Inexact[Array, " n"]:
     """`phi_1(a) v = v + a v / 2! + a^2 v / 3! + ...`, with a rounding as small as `v`.
 
-    **Cost:** up to a 1-norm of 2.4, 11 to 24 products with a vector, as in `phi_1_series`. Beyond,
-    5 matrix products (4 in single precision), and one for each squaring.
+    **Cost:** 11, 15, 19 or 24 products with a vector for 1-norms up to 0.3, 0.78, 1.4 and 2.4; in
+    single precision 4, 9 or 14 up to 0.13, 0.99 and 2.2. Beyond, 5 matrix products (4 in single
+    precision), and one for each squaring. Under `jax.vmap` the largest norm decides.
+
+    **Accuracy:** a backward error of a few units in the last place. The number of terms depends on
+    `a` alone and not on `v`, so derivatives are as accurate.
 
     A real `a` may meet a complex `v` of the same precision.
+
+    Source: Al-Mohy & Higham, Computing the action of the matrix exponential, SIAM J. Sci. Comput.
+    33 (2011), doi:10.1137/100788860.
     """
-    return phi_1_series(lambda x: _times(a, x), v, one_norm(a), lambda: _by_squaring(a, v))
+    precision = jnp.finfo(v.dtype).dtype.name
+    degrees = _DEGREES[precision]
+    thetas = [LONGEST[precision][degree - FIRST_DEGREE[precision]] for degree in degrees]
+    norm = max_over_batch(lax.stop_gradient(one_norm(a)))
+
+    # One branch within the other: a loop over all of them has a far slower derivative.
+    def add(term: Array, total: Array, first: int, n: int) -> Array:
+        for k in range(first, degrees[n] + 1):
+            term = _times(a, term) / k
+            total = total + term
+        if n + 1 == len(degrees):
+            return total
+        return lax.cond(
+            norm > thetas[n],
+            lambda term, total: add(term, total, degrees[n] + 1, n + 1),
+            lambda term, total: total,
+            term,
+            total,
+        )
+
+    # Without a checkpoint the branch not taken must still hand out room for what the other saves.
+    return lax.cond(
+        norm > thetas[-1],
+        jax.checkpoint(lambda v: _by_squaring(a, v)),
+        lambda v: add(v, v, 2, 0),
+        v,
+    )
 
 
 def _by_squaring(a: Array, v: Array) -> Array:

@@ -11,8 +11,8 @@ import pytest
 import scipy.linalg
 
 from cfjax._numerics.expm_multiply import (
-    _FIRST_DEGREE,
-    _LONGEST,
+    FIRST_DEGREE,
+    LONGEST,
     _chebyshev,
     expm_minus_one_multiply,
     row_norm,
@@ -45,7 +45,7 @@ def moved(a, x, norm, is_skew):
 @pytest.mark.parametrize("precision", UNIT)
 def test_the_bounds_are_where_the_backward_error_reaches_the_unit_roundoff(precision):
     """With `log(exp(-x) T(x)) = sum_k c_k x^k` it is `sum_k |c_k| theta^(k-1)`."""
-    for degree, theta in enumerate(_LONGEST[precision], _FIRST_DEGREE[precision]):
+    for degree, theta in enumerate(LONGEST[precision], FIRST_DEGREE[precision]):
         length = degree + 20  # Beyond, less than 1e-12 of the first term.
         with mp.workdps(40):
             one = [mp.mpf(1) / math.factorial(k) for k in range(length)]

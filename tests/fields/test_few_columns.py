@@ -1,8 +1,6 @@
 """Flows of matrix fields on few columns: accuracy at every norm, derivatives, batches."""
 
 import functools
-import math
-from fractions import Fraction
 
 import jax
 import jax.numpy as jnp
@@ -12,7 +10,6 @@ import scipy.linalg
 
 from cfjax import LeftMatrix, RightMatrix
 from cfjax._fields.matrix import _is_thin
-from cfjax._numerics.expm_times import _DEGREES
 
 N = 16
 BOTH = pytest.mark.parametrize("cls", [LeftMatrix, RightMatrix])
@@ -51,25 +48,6 @@ def flow(field, point):
 @jax.jit
 def increment(field, point):
     return field.increment(point)
-
-
-@pytest.mark.parametrize(("precision", "unit"), [("float32", 2.0**-24), ("float64", 2.0**-53)])
-def test_the_bounds_are_where_the_backward_error_reaches_the_unit_roundoff(precision, unit):
-    """With `log(exp(-x) T(x)) = sum_k c_k x^k` it is `sum_k |c_k| theta^(k-1)`."""
-    for degree, theta in _DEGREES[precision]:
-        length = degree + 40  # At theta the terms beyond are below 1e-20 of the first.
-        taylor = [Fraction(int(k <= degree), math.factorial(k)) for k in range(length)]
-        inverse = [Fraction((-1) ** k, math.factorial(k)) for k in range(length)]
-        q = [sum(taylor[i] * inverse[k - i] for i in range(k + 1)) for k in range(length)]
-        c = [Fraction(0)] * length
-        for k in range(1, length):
-            c[k] = q[k] - sum((i * c[i] * q[k - i] for i in range(degree, k)), Fraction(0)) / k
-        assert not any(c[: degree + 1])
-
-        def backward(x, c=c):
-            return sum(abs(float(a)) * x ** (k - 1) for k, a in enumerate(c) if a)
-
-        assert backward(theta) <= unit < backward(theta * 1.001)
 
 
 def test_which_points_are_thin():
