@@ -5,7 +5,7 @@ PYTEST := -m pytest --numprocesses auto --dist worksteal
 # Each solver and each field once, what the code relies on in jax, equinox and diffrax, and imports.
 QUICK := tests/test_quick.py tests/xla/test_columns.py tests/test_canary.py tests/test_public.py tests/test_architecture.py
 
-.PHONY: paper lint test test-all test-quick test-lowest test-newest coverage defects benchmarks readme docs clean
+.PHONY: paper lint test test-all test-quick test-lowest test-newest coverage defects benchmarks pages docs clean
 
 # Tables and figures of the paper, in figures/.
 paper: .venv/paper
@@ -39,16 +39,16 @@ test-newest:
 	.venv-newest/bin/python -m pip install --quiet --upgrade --upgrade-strategy eager --editable '.[dev]'
 	.venv-newest/bin/python $(PYTEST)
 
-# Measures everything anew, one after the other, for README. ARGS=--quick is rough, and quicker.
+# Measures everything anew, one after the other, for the pages. ARGS=--quick is rough, and quicker.
 BENCHMARKS := rigid_body tolerances attitude gradients fields leading_axes compile chain expm unitary heat batch charts stability
 benchmarks: .venv/dev
 	@$(BIN)/python benchmarks/results.py
 	for name in $(BENCHMARKS); do $(BIN)/python benchmarks/$$name.py $(ARGS) || exit 1; done
-	$(MAKE) readme
+	$(MAKE) pages
 
-# README's tables, numbers and pictures, from what has been measured.
-readme: .venv/dev
-	$(BIN)/python benchmarks/readme.py
+# The pages' tables, numbers and pictures, from what has been measured.
+pages: .venv/dev
+	$(BIN)/python benchmarks/pages.py
 
 # The site, in site/. A warning is an error: a broken link, a page that nothing leads to.
 docs: .venv/docs

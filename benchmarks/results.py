@@ -33,7 +33,7 @@ def run(file: str, doc: str | None, measure: Measure) -> None:
     parser.add_argument("--quick", action="store_true", help="little time, rough numbers")
     quick = parser.parse_args().quick
 
-    # Not at import: rendering README needs neither.
+    # Not at import: rendering the pages needs neither.
     import jax
     from rich.progress import track
 

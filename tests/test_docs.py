@@ -1,5 +1,6 @@
 """The site: its code runs when pasted, and it names everything public."""
 
+import ast
 import json
 import os
 import pkgutil
@@ -8,7 +9,10 @@ import subprocess
 import sys
 from pathlib import Path
 
+import diffrax
+import optimistix
 import pytest
+from messages import FOLDERS, messages, template
 from test_public import PUBLIC
 
 import cfjax
@@ -94,3 +98,56 @@ def test_math_is_what_the_converter_knows():
     # It would show the signs of an environment as they are.
     for page in PAGES:
         assert "\\begin{" not in page.read_text()
+
+
+def test_measured_tables_and_numbers_are_those_stored():
+    command = [sys.executable, "benchmarks/pages.py", "--check"]
+    done = subprocess.run(command, capture_output=True, text=True, cwd=ROOT)
+    assert done.returncode == 0, done.stderr
+
+
+def test_no_measured_table_is_typed_in():
+    text = (ROOT / "docs" / "speed.md").read_text()
+    assert text.count("<!-- table: ") >= 5
+    typed = re.sub(r"<!-- table: .*?<!-- end -->", "", text, flags=re.DOTALL)
+    assert "| --- |" not in typed
+
+
+def test_every_benchmark_has_stored_results():
+    (names,) = re.findall(r"^BENCHMARKS := (.*)$", (ROOT / "Makefile").read_text(), re.MULTILINE)
+    stored = {path.stem for path in (ROOT / "benchmarks" / "results").glob("*.json")}
+    assert stored == set(names.split())
+    assert all((ROOT / "benchmarks" / f"{name}.py").exists() for name in stored)
+
+
+def strings(paths):
+    """All that these files may say; a word that is inserted is an ellipsis."""
+    trees = (ast.parse(path.read_text()) for path in paths)
+    nodes = (node for tree in trees for node in ast.walk(tree))
+    literal = (ast.JoinedStr, ast.Constant)
+    return "\n".join(template(node) for node in nodes if isinstance(node, literal))
+
+
+def test_messages_that_are_explained_are_those_that_are_raised():
+    folders = [ROOT / "cfjax", *(Path(m.__file__).parent for m in (diffrax, optimistix))]
+    paths = [path for folder in folders for path in folder.rglob("*.py")]
+    # Of JAX and of Python.
+    others = {
+        "can't apply forward-mode autodiff (jvp) to a custom_vjp function",
+        "missing 2 required keyword-only arguments: 'frame' and 'order'",
+        "num_steps",
+    }
+    page = (ROOT / "docs" / "errors.md").read_text()
+    rows = re.findall(r"^\| (.*?) \|", page, flags=re.MULTILINE)[2:]
+    explained = re.findall("`(.*?)`", "\n".join(rows))
+    raised = strings(paths).replace("`", "")  # a cell of a table has its own
+    assert len(explained) > 15
+    assert [text for text in explained if text not in raised and text not in others] == []
+
+
+def test_messages_are_listed():
+    listed = [text for paths in FOLDERS for text, _ in messages(paths)]
+    sources = "\n".join(path.read_text() for path in (ROOT / "cfjax").rglob("*.py"))
+    # Less what is raised in several places, and what stands in no folder that a user meets.
+    assert len(listed) > 0.8 * sources.count("raise ")
+    assert all(any(map(str.isalpha, text)) for text in listed)

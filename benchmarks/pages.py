@@ -1,7 +1,7 @@
-"""README's tables, measured numbers and pictures, from what the benchmarks have stored.
+"""The pages' tables, measured numbers and pictures, from what the benchmarks have stored.
 
-Nothing is measured. In README a table or a number stands between `<!-- table: NAME -->` or
-`<!-- number: NAME -->` and `<!-- end -->`, where NAME is that of a function below, with hyphens.
+Nothing is measured. In a page of `docs/` a table or a number stands between `<!-- table: NAME -->`
+or `<!-- number: NAME -->` and `<!-- end -->`, where NAME is that of a function below, with hyphens.
 """
 
 import argparse
@@ -15,7 +15,7 @@ import results
 from results import Row, cell, in_units, load, one, pick, two_digits
 
 HERE = Path(__file__).parent
-README = HERE.parent / "README.md"
+PAGES = sorted((HERE.parent / "docs").rglob("*.md"))
 MARKED = re.compile(r"(<!-- (table|number): ([\w-]+) -->)(.*?)(<!-- end -->)", flags=re.DOTALL)
 # Those that draw, and how fine.
 PICTURES = {"batch": 120, "chain": 120, "charts": 200, "stability": 100, "tolerances": 120}
@@ -23,13 +23,15 @@ PICTURES = {"batch": 120, "chain": 120, "charts": 200, "stability": 100, "tolera
 
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__)
-    parser.add_argument("--check", action="store_true", help="only tell whether it changes README")
+    parser.add_argument("--check", action="store_true", help="only tell what it would change")
     is_check = parser.parse_args().check
-    text = README.read_text(encoding="utf-8")
-    new = render(text)
+    texts = {page: page.read_text(encoding="utf-8") for page in PAGES}
+    new = {page: rendered for page, text in texts.items() if (rendered := render(text)) != text}
     if is_check:
-        sys.exit("README is not of the stored results: run `make readme`." if new != text else 0)
-    README.write_text(new, encoding="utf-8")
+        names = ", ".join(str(page.relative_to(HERE.parent)) for page in new)
+        sys.exit(f"Not of the stored results: {names}. Run `make pages`." if new else 0)
+    for page, text in new.items():
+        page.write_text(text, encoding="utf-8")
     for path in draw():
         print(f"Wrote {path.relative_to(HERE.parent)}")
 
@@ -38,7 +40,7 @@ def render(text: str) -> str:
     def renewed(match: re.Match[str]) -> str:
         begin, kind, name, _, end = match.groups()
         lines = RENDERED[kind, name]()
-        return begin + (f"\n{lines}\n" if kind == "table" else lines) + end
+        return begin + (f"\n\n{lines}\n\n" if kind == "table" else lines) + end
 
     return MARKED.sub(renewed, text)
 
