@@ -22,8 +22,8 @@ NOTEBOOKS = sorted((ROOT / "notebooks").glob("*.ipynb"))
 
 def on_config(config):
     titles = [{title(path): f"notebooks/{path.stem}.md"} for path in NOTEBOOKS]
-    if not any("Notebooks" in entry for entry in config.nav):
-        config.nav.insert(-1, {"Notebooks": titles})
+    (gallery,) = (entry["Gallery"] for entry in config.nav if "Gallery" in entry)
+    gallery.extend(title for title in titles if title not in gallery)
     return config
 
 
