@@ -227,7 +227,7 @@ PAIRS = [
 PLACES = jnp.asarray([(1.0, 0.2, 0.9), (0.0, 0.2, 0.9), (1.0, 0.2, 0.2), (0.0, 0.2, 0.2)])
 
 
-@pytest.mark.representatives(4)
+@pytest.mark.representatives(2)
 @pytest.mark.parametrize("kind, method", PAIRS)
 def test_finite_and_right_for_every_field_and_method(kind, method):
     """In the field's scale, both times, the start and args (a spectrum in them) at once.
@@ -623,7 +623,7 @@ def test_turning_the_frame_turns_its_solution():
 
 
 def tangential(y, g):
-    """The formula of the README."""
+    """The formula of the page on gradients."""
     if y.ndim == 1:
         return g - (y @ g) * y
     return g - y @ (y.T @ g + g.T @ y) / 2

@@ -151,7 +151,7 @@ TO_ITS_ORDER = {
 }
 
 
-@pytest.mark.representatives(2)
+@pytest.mark.representatives(1)
 @pytest.mark.parametrize("name", __main__._SCENES)
 def test_every_scene_keeps_its_invariants(name):
     module = __main__._SCENES[name]

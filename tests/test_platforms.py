@@ -113,7 +113,7 @@ def test_programs_lower_for_cuda_and_tpu():
 
 @pytest.mark.parametrize("throw", [True, False])
 def test_an_error_for_the_host_to_raise_keeps_a_program_on_its_platform(throw):
-    """The limit that the README names. An error is a call of Python, which jax ties to a backend.
+    """The limit that the site names. An error is a call of Python, which jax ties to a backend.
 
     The start and the times are checked whether or not failures of the solve are errors.
     """

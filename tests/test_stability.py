@@ -214,7 +214,7 @@ START, INERTIA = jnp.asarray(rigid_body.y0), jnp.asarray(rigid_body.inertia)
 LENGTH = np.linalg.norm(rigid_body.y0)
 
 
-@pytest.mark.representatives(2)
+@pytest.mark.representatives(1)
 @pytest.mark.parametrize("solver", [cfjax.CF3(), cfjax.CF4(), cfjax.RKMK4()])
 @pytest.mark.parametrize("dtype", [np.float32, np.float64])
 def test_large_steps_stay_on_the_sphere(solver, dtype):
@@ -335,7 +335,7 @@ def test_weights_grow_and_the_error_constant_does_not(family, singular, residue)
     np.testing.assert_allclose(constants, constants[-1], rtol=2e-3)
 
 
-@pytest.mark.representatives(1)
+@pytest.mark.slow
 @pytest.mark.parametrize("family, singular, residue", TOGETHER)
 def test_close_stages_magnify_rounding(family, singular, residue, body_answer):
     """The floor is eps over the distance; above it the order is 3 and the error no larger."""

@@ -484,6 +484,7 @@ def test_leading_axes_and_increment(name):
             np.testing.assert_allclose(increments[k, 0], moved, 0, 16 * 2.0**-52 * size * scale)
 
 
+@pytest.mark.representatives(4)
 @pytest.mark.parametrize("name", CASES)
 def test_sums_brackets_and_the_group(name):
     case = CASES[name]

@@ -137,7 +137,7 @@ CASES = [
 ]
 
 
-@pytest.mark.representatives(3)
+@pytest.mark.representatives(2)
 @pytest.mark.parametrize(("name", "solver"), CASES)
 def test_every_element_moves_as_it_does_alone(name, solver):
     y0 = points(name)

@@ -33,7 +33,7 @@ def exact_increment(a, b, x):
         return to_numpy((e * z - z)[:n])[:, 0]
 
 
-@pytest.mark.representatives(4)
+@pytest.mark.representatives(1)
 @pytest.mark.parametrize(
     ("dtype", "point_dtype", "n"),
     [

@@ -237,7 +237,7 @@ def test_leading_axes(n):
 # Derivatives
 
 
-@pytest.mark.representatives(2)
+@pytest.mark.representatives(1)
 @pytest.mark.parametrize("n", SIZES)
 def test_derivatives_at_zero(n):
     """There the flow is `y + v - y (v @ v) / 2 + ..`, where v is the part of g tangent at y."""
@@ -330,6 +330,7 @@ def test_outside_of_a_step_it_has_no_bracket():
         cfjax.bracket(SphereRotation(normal(5)), SphereRotation(normal(5)))
 
 
+@pytest.mark.representatives(1)
 @pytest.mark.parametrize("n", [3, 4])
 def test_a_start_that_is_not_of_length_1_is_refused(n):
     term = cfjax.LieTerm(sphere)

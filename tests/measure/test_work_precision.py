@@ -314,6 +314,7 @@ def blow_up(**settings):
     )
 
 
+@pytest.mark.representatives(1)
 @pytest.mark.parametrize(
     "settings, reason",
     [

@@ -81,7 +81,7 @@ CASES = [
 ]
 
 
-@pytest.mark.representatives(4)
+@pytest.mark.representatives(1)
 @pytest.mark.parametrize("dtype", DTYPES)
 @pytest.mark.parametrize("n", [3, 5, 1, 8])
 def test_accuracy(n, dtype):
@@ -141,6 +141,7 @@ def derivatives():
     return of
 
 
+@pytest.mark.slow
 def test_derivatives():
     cases = [("skew", x) for x in (0.0, 1e-12, 0.5, 3.0, 100.0)] + [("general", 1.0)]
     a = np.stack([of_norm(kind, 3, norm) for kind, norm in cases])

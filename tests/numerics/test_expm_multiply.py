@@ -96,6 +96,7 @@ def test_every_norm(is_skew):
         np.testing.assert_allclose(found, expected, rtol=0, atol=16 * 2.0**-53 * norm + 1e-18)
 
 
+@pytest.mark.representatives(1)
 @both
 def test_derivatives(is_skew):
     direction, x, w = skew(1.0, seed=2), vector(), vector(3)

@@ -50,7 +50,7 @@ CASES = [
 ]
 
 
-@pytest.mark.representatives(4)
+@pytest.mark.representatives(2)
 @pytest.mark.parametrize("dtype", DTYPES)
 @pytest.mark.parametrize("n", [3, 6, 1])
 def test_accuracy(n, dtype):
@@ -96,6 +96,7 @@ def test_semidefinite_stays_semidefinite():
         assert least >= -20 * 2.0**-52 * max(np.linalg.norm(g), np.linalg.norm(q[0]))
 
 
+@pytest.mark.slow
 def test_derivatives():
     w, d, r = random((3, 3, 3), 4)
 

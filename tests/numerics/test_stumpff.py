@@ -109,7 +109,7 @@ def derivatives(n):
     return jax.jit(jax.vmap(one))
 
 
-@pytest.mark.representatives(6)
+@pytest.mark.representatives(2)
 @DTYPES
 @pytest.mark.parametrize("n", range(6))
 def test_values_and_three_derivatives(n, dtype, exact):
@@ -140,6 +140,7 @@ def test_many_turns(dtype):
         assert abs(float(stumpff(n, jnp.asarray(s))) - float(value[n])) <= allowed, n
 
 
+@pytest.mark.representatives(2)
 @pytest.mark.parametrize("n", range(6))
 def test_taylor_coefficients_at_zero(n):
     # d^k c_n(0) = (-1)^k k! / (n + 2k)!, in reverse mode. One rounding for each of two operations
@@ -153,6 +154,7 @@ def test_taylor_coefficients_at_zero(n):
         f = jax.grad(f)
 
 
+@pytest.mark.representatives(1)
 @DTYPES
 @pytest.mark.parametrize("bad", [np.inf, np.nan])
 def test_what_is_not_finite_gives_nan(bad, dtype):
@@ -167,6 +169,7 @@ def three(s):
     return near + d1, near / 2 + d2, c3
 
 
+@pytest.mark.representatives(1)
 @pytest.mark.parametrize("together", [stumpff_1_2, three])
 @DTYPES
 def test_several_together(together, dtype):
@@ -249,6 +252,7 @@ def test_the_excess_of_the_cotangent(dtype):
                 )
 
 
+@pytest.mark.representatives(1)
 @DTYPES
 def test_beyond_a_full_turn_the_excess_of_the_cotangent_is_finite(dtype):
     s = jnp.asarray([4 * PI2 * 1.0001, 100.0, np.finfo(dtype).max, np.inf], dtype)

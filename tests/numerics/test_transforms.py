@@ -205,6 +205,7 @@ def test_grids_against_scipy_and_back(pair, shape):
     close(back, x, max(shape))
 
 
+@pytest.mark.representatives(1)
 @pytest.mark.parametrize(
     "three",
     [

@@ -1,3 +1,4 @@
+import pytest
 from rich.progress import Progress
 from rich.table import Table
 
@@ -5,6 +6,7 @@ from cfjax._paper import complexity
 from cfjax._solvers.commutator_free import AbstractCommutatorFree
 
 
+@pytest.mark.slow
 def test_counts_are_the_papers_but_for_order_five():
     counts = {
         (family, order): complexity.flows_and_brackets(method)
@@ -29,6 +31,7 @@ def test_counts_are_those_of_the_tableaus():
             assert complexity.flows_and_brackets(method) == (method.tableau.num_flows, 0)
 
 
+@pytest.mark.slow
 def test_report():
     (table,) = complexity.report(Progress(disable=True)).printed
     assert isinstance(table, Table)

@@ -112,6 +112,7 @@ def runs():
     }
 
 
+@pytest.mark.slow
 @names
 def test_steps_are_those_expected(name, runs):
     for tol, expected in zip(heat.TOLERANCES, EXPECTED[name], strict=True):
@@ -119,6 +120,7 @@ def test_steps_are_those_expected(name, runs):
         assert abs(runs[name, tol].num_steps - expected) <= slack, tol
 
 
+@pytest.mark.slow
 @names
 def test_steps_are_those_of_the_program(name, runs):
     exact = cfjax.scenes.heat.reference(0.5, MU)
@@ -140,6 +142,7 @@ def test_steps_are_those_of_the_program(name, runs):
             assert abs(run.num_rejected - rejected) <= 5
 
 
+@pytest.mark.slow
 def test_what_the_paper_finds(runs):
     loose, strict = heat.TOLERANCES[0], heat.TOLERANCES[-1]
     # RK4 makes as many steps at every tolerance, RKMK4 down to 1e-5, and CF4 never.
@@ -179,6 +182,7 @@ def test_what_diffrax_makes_of_it(tol):
 # The report
 
 
+@pytest.mark.slow
 def test_table_has_every_number(runs):
     console = Console(width=80, record=True, file=None, quiet=False)
     with console.capture() as capture:
@@ -192,6 +196,7 @@ def test_table_has_every_number(runs):
                 assert f"{row[0]:.1e} {row[1]:>5} {f'({row[2]})':>4}" in text
 
 
+@pytest.mark.slow
 def test_text_in_figures_is_neither_cut_nor_covered(runs):
     stiff = {(name, n): runs[name, 1e-3] for name in heat.METHODS for n in heat.SIZES}
     for figure, count in ((heat.figure_4(runs), 2), (heat.figure_stiffness(stiff), 1)):

@@ -34,12 +34,14 @@ def work():
 # What the paper finds, and what it does not find here.
 
 
+@pytest.mark.slow
 def test_fourth_order_is_far_better_than_third(trajectories):
     for quantity in ("error", "energy_error"):
         last = {name: getattr(run, quantity)[-1] for name, run in trajectories.items()}
         assert 100 * max(last["CF4"], last["RKMK4"]) < min(last["CF3"], last["RKMK3"])
 
 
+@pytest.mark.slow
 def test_cf4_and_rkmk4_are_close(trajectories, work):
     # At h = 0.1 and t = 100 the factor is 2.03; at h = 0.05 and h = 0.025 it is 1.3 at most.
     ratio = trajectories["RKMK4"].error[-1] / trajectories["CF4"].error[-1]

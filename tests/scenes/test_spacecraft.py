@@ -53,6 +53,7 @@ def test_the_reference_at_many_times_is_that_at_each():
     assert spacecraft.error(spacecraft.y0(), spacecraft.reference(0.0)) < 1e-15
 
 
+@pytest.mark.representatives(1)
 @pytest.mark.parametrize(("solver", "order"), [(cfjax.CF4(), 4), (cfjax.CF54(), 5)])
 def test_order(solver, order):
     exact = spacecraft.reference(10.0)
@@ -77,6 +78,7 @@ def test_what_is_kept():
     assert ys["m"][:, 1].min() < -0.99 and ys["m"][:, 1].max() > 0.99
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("jumps", [True, pytest.param(False, marks=pytest.mark.slow)])
 def test_thrusters_that_switch(jumps):
     torque = FIRED.torque

@@ -17,6 +17,7 @@ SOLVERS["CommutatorFree"] = cfjax.CommutatorFree(cfjax.CF3().tableau)
 SOLVERS["RKMK"] = cfjax.RKMK(diffrax.Heun.tableau)
 
 
+@pytest.mark.representatives(1)
 @pytest.mark.parametrize("name", SOLVERS)
 def test_a_solver_with_an_estimate_is_adaptive(name):
     def error(y):

@@ -602,7 +602,7 @@ def test_error_control_without_an_estimate_is_refused(solver):
 @pytest.mark.slow
 @solvers
 def test_step_doubling_gives_an_estimate(answers, solver):
-    """The tolerance governs the error, and the manifold is kept. `atol` alone: see the README."""
+    """The tolerance governs the error. `atol` alone, as it is the same in every frame."""
     found = []
     for atol in (1e-5, 1e-9):
         sol = solve(

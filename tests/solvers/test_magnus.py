@@ -194,7 +194,7 @@ FIELDS = {
 }
 
 
-@pytest.mark.representatives(3)
+@pytest.mark.representatives(1)
 @pytest.mark.parametrize("name", FIELDS)
 def test_every_algebra(name):
     """Against the ambient velocity by SciPy, and `CF4` with two flows instead of five."""

@@ -168,6 +168,7 @@ def by_hand(name, f, t, y, h, weights=None):
     return sum(b * k for b, k in zip(weights, stages, strict=True))
 
 
+@pytest.mark.representatives(1)
 @pytest.mark.parametrize("estimate", ["algebra", "group"])
 @pytest.mark.parametrize(
     "name", ["RKMK3", "Heun", "Bosh3", pytest.param("Tsit5", marks=pytest.mark.slow)]

@@ -221,6 +221,7 @@ SLOW = [
 ]
 
 
+@pytest.mark.representatives(2)
 @pytest.mark.parametrize(
     "name, estimate, problem",
     [

@@ -62,7 +62,7 @@ def close(a, b, atol=1e-14):
 # The estimate
 
 
-@pytest.mark.representatives(3)
+@pytest.mark.representatives(1)
 @cases
 @variants
 def test_estimate_and_result_of_a_step(name, as_in_paper):

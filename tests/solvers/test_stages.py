@@ -58,7 +58,7 @@ def assert_same(found, expected, units):
         np.testing.assert_allclose(a, b, rtol=0, atol=units * 2.0**-52)
 
 
-@pytest.mark.representatives(3)
+@pytest.mark.representatives(2)
 @pytest.mark.parametrize("problem", FIELDS)
 @pytest.mark.parametrize("name", SOLVERS)
 def test_a_step(name, problem):
@@ -69,6 +69,7 @@ def test_a_step(name, problem):
     assert_same(*both(fun, y0, args), 100)
 
 
+@pytest.mark.representatives(1)
 @pytest.mark.parametrize("name", ["CF3", "RKMK(Bosh3)"])
 def test_a_gradient_in_a_batch(name):
     field = lambda t, y, args: cfjax.Rotation(args * y[:, 0] + t * y[:, 1])  # noqa: E731

@@ -321,6 +321,7 @@ def test_branches_and_loops_are_left_alone(fun):
     assert program.trace(jnp.sin, jnp.asarray(Y), "step") is not None
 
 
+@pytest.mark.representatives(1)
 @pytest.mark.parametrize("name", ["arithmetic", "elementary", "constants out", "integers", "loops"])
 def test_values_outside_of_jit(name):
     fun, y = ZOO[name]
@@ -329,7 +330,7 @@ def test_values_outside_of_jit(name):
     assert_same(got, want, VALUE)
 
 
-@pytest.mark.representatives(8)
+@pytest.mark.representatives(4)
 @ALL
 def test_derivatives(name):
     """Value, gradient, forward over reverse and reverse over reverse, in one program."""
@@ -366,7 +367,7 @@ def test_derivatives(name):
     assert_same(got, want, DERIVATIVE, LOW.get(name, np.float64))
 
 
-@pytest.mark.representatives(8)
+@pytest.mark.representatives(3)
 @ALL
 def test_batches(name):
     """vmap, vmap of vmap, vmap of grad and grad of vmap."""
@@ -396,6 +397,7 @@ def test_batches(name):
     assert_same(got[1:], want[1:], DERIVATIVE, LOW.get(name, np.float64))
 
 
+@pytest.mark.representatives(1)
 @pytest.mark.parametrize("n", [1, 3])
 def test_jacobians_and_hessians(n):
     """jacfwd and jacrev put a batch of tangents on functions that are in no batch themselves."""

@@ -59,7 +59,7 @@ def test_values():
     check(whole(X, SCALE), plain(X, SCALE))
 
 
-@pytest.mark.representatives(3)
+@pytest.mark.representatives(1)
 @pytest.mark.parametrize("axes", [(0, None), (None, 0), (0, 0)])
 @pytest.mark.parametrize("count", [2, 40])
 def test_batches(axes, count):
@@ -75,7 +75,7 @@ def test_batches(axes, count):
 MODES = jax.jacfwd, jax.jacrev
 
 
-@pytest.mark.representatives(3)
+@pytest.mark.representatives(1)
 @pytest.mark.parametrize("outer", MODES)
 @pytest.mark.parametrize("inner", MODES)
 @pytest.mark.parametrize("argument", [0, 1])
@@ -92,6 +92,7 @@ def test_third_derivatives():
     check(quick(third(whole))(X, SCALE), third(plain)(X, SCALE))
 
 
+@pytest.mark.representatives(1)
 def test_derivatives_in_batches_are_cut_earlier(monkeypatch):
     monkeypatch.setattr(module, "_PIECE", 12)
     monkeypatch.setattr(module, "_GROUP", 30)
@@ -151,6 +152,7 @@ def test_directions_that_are_zero_are_not_computed():
     assert not any(zero in eqn.outvars for eqn in program.eqns if "cfjax" in eqn.primitive.name)
 
 
+@pytest.mark.representatives(1)
 def test_branches_and_loops_inside():
     def fun(x):
         y = jax.lax.fori_loop(0, 3, lambda k, y: y * x + k, x)
