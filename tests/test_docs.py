@@ -49,12 +49,13 @@ STATES = [page for page in PAGES if page.parent.name == "state"]
 OTHERS = [page for page in PAGES if page not in START + STATES]
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     "pages",
     [
         pytest.param(START, id="start"),
-        pytest.param(STATES, id="states", marks=pytest.mark.slow),
-        pytest.param(OTHERS, id="others", marks=pytest.mark.slow),
+        pytest.param(STATES, id="states"),
+        pytest.param(OTHERS, id="others"),
     ],
 )
 def test_code_runs_when_pasted(pages):

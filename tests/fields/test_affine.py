@@ -404,7 +404,7 @@ def parts(field, point):
     return split, flow
 
 
-@pytest.mark.representatives(4)
+@pytest.mark.representatives(2)
 @cases
 @pytest.mark.parametrize("alpha", [0.7, 0.0])
 def test_derivatives(case, alpha):

@@ -400,6 +400,7 @@ def element(tree, k):
     return jtu.tree_map(lambda x: x[k], tree)
 
 
+@pytest.mark.representatives(3)
 @pytest.mark.parametrize("name", SOME_SLOW)
 def test_flow_and_derivatives(name):
     case = CASES[name]
@@ -444,6 +445,7 @@ def test_flow_and_derivatives(name):
         np.testing.assert_allclose(got[3][k].real, paired.real, 0, 200 * unit, err_msg=where)
 
 
+@pytest.mark.representatives(8)
 @pytest.mark.parametrize("name", CASES)
 def test_flow_in_single_precision(name):
     case = CASES[name]
@@ -456,6 +458,7 @@ def test_flow_in_single_precision(name):
         np.testing.assert_allclose(flows[k], want.astype(flows.dtype), 0, atol, err_msg=str(size))
 
 
+@pytest.mark.representatives(8)
 @pytest.mark.parametrize("name", WITH_AXES)
 def test_leading_axes_and_increment(name):
     case = CASES[name]
@@ -565,6 +568,7 @@ def exact_dexpinv(constants, u, v):
     return mpmath.lu_solve(total, mpmath.matrix(v))
 
 
+@pytest.mark.representatives(6)
 @pytest.mark.parametrize("dtype", [np.float32, np.float64])
 @pytest.mark.parametrize(
     "name",
@@ -646,6 +650,7 @@ def test_a_closed_form_is_the_limit_of_its_series_elementwise_too(name):
     problems.assert_close(a.dexpinv(b, 0), series, 1e-15)
 
 
+@pytest.mark.representatives(10)
 @pytest.mark.parametrize("name", CASES)
 def test_zero_is_the_identity_exactly(name):
     case = CASES[name]

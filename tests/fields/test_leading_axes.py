@@ -137,7 +137,7 @@ CASES = [
 ]
 
 
-@pytest.mark.representatives(2)
+@pytest.mark.representatives(1)
 @pytest.mark.parametrize(("name", "solver"), CASES)
 def test_every_element_moves_as_it_does_alone(name, solver):
     y0 = points(name)
@@ -157,7 +157,7 @@ def test_every_element_moves_as_it_does_alone(name, solver):
         jax.tree.map(partial(np.testing.assert_allclose, rtol=0, atol=1e-13), found, alone)
 
 
-@pytest.mark.representatives(2)
+@pytest.mark.representatives(1)
 @pytest.mark.parametrize("name", [name for name in reversed(FIELDS) if "pair" not in name])
 def test_fields_keep_their_promises_on_two_leading_axes(name):
     y = points(name)

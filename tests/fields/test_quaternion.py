@@ -237,6 +237,7 @@ def test_bracket(frame):
     np.testing.assert_allclose(c, a @ b - b @ a, rtol=0, atol=10 * EPS)
 
 
+@pytest.mark.representatives(1)
 @pytest.mark.parametrize(
     ("frame", "order", "batch"),
     [

@@ -118,7 +118,7 @@ METHODS: dict[str, Any] = {
 }
 
 
-@pytest.mark.representatives(2)
+@pytest.mark.representatives(1)
 @pytest.mark.parametrize("name", METHODS)
 @pytest.mark.parametrize("n", [2, 6])
 def test_a_step_is_the_step_with_full_matrices(n, name):

@@ -412,6 +412,7 @@ def test_the_memory_backwards_grows_with_the_root_of_the_steps_on_request():
     assert 3 * 90 <= states(100) - states(10) <= 3.1 * 90
 
 
+@pytest.mark.representatives(1)
 @pytest.mark.parametrize(
     "checkpoint_every, save_every",
     # One that leaves steps behind the last checkpoint.

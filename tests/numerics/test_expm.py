@@ -96,7 +96,7 @@ def test_theta_is_where_the_backward_error_reaches_the_unit_roundoff(scheme, deg
     assert backward(scheme.theta) <= unit < backward(scheme.theta * 1.001)
 
 
-@pytest.mark.representatives(20)
+@pytest.mark.representatives(8)
 @pytest.mark.parametrize("dtype", DTYPES)
 @pytest.mark.parametrize(
     ("kind", "norm"),
@@ -197,7 +197,7 @@ def test_each_member_of_a_batch_has_its_own_scaling():
         assert error(x, reference(a)) <= 4 * 5 * 2.3e-16 * max(1.0, norm)
 
 
-@pytest.mark.representatives(3)
+@pytest.mark.representatives(1)
 @pytest.mark.parametrize("n", [1, 3, 6, 9])
 @pytest.mark.parametrize("dtype", [np.float32, np.complex128])
 def test_not_finite_gives_nan_and_stays_with_its_member(n, dtype):
@@ -235,6 +235,7 @@ def conditions(f, *args):
     return str(jax.make_jaxpr(f)(*args)).count(" cond[")
 
 
+@pytest.mark.representatives(1)
 @pytest.mark.parametrize("n", [3, 6])
 def test_branches_stay_branches_in_a_batch(n):
     # A batched condition would become a select that squares every time, up to 52 times.

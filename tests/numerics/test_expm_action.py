@@ -90,7 +90,7 @@ def test_infinite_and_nan_give_nan():
         assert np.all(np.isnan(action(a, b, bad)))
 
 
-@pytest.mark.representatives(2)
+@pytest.mark.representatives(1)
 @pytest.mark.parametrize("norm", [0.0, 0.3, 2.0, 12.0])
 def test_derivatives(norm):
     """Against the exponential of the block matrix `[[a, d], [0, a]]`, and between the modes."""

@@ -31,7 +31,7 @@ CASES = [
 ]
 
 
-@pytest.mark.representatives(2)
+@pytest.mark.representatives(1)
 @pytest.mark.parametrize("dtype", DTYPES)
 @pytest.mark.parametrize("n", [3, 6, 1])
 def test_accuracy(n, dtype):

@@ -8,6 +8,7 @@ import pytest
 import cfjax
 
 
+@pytest.mark.representatives(1)
 @pytest.mark.parametrize("n", [0, 1, 3])
 def test_stumpff_takes_arrays_of_numpy_and_a_batch(n):
     s = np.array([[0.0, 0.25], [1.0, 4.0]], np.float32)

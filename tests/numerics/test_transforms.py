@@ -45,7 +45,7 @@ def close(found, wanted, n):
     np.testing.assert_allclose(found, wanted, rtol=0, atol=4 * eps * np.sqrt(n) * np.log2(n + 2))
 
 
-@pytest.mark.representatives(14)
+@pytest.mark.representatives(6)
 @kinds
 @pytest.mark.parametrize("n", SIZES)
 def test_against_scipy_and_back(kind, n):
@@ -192,7 +192,7 @@ def scipy_on_grid(grid_kinds, x: Any):
     return x
 
 
-@pytest.mark.representatives(12)
+@pytest.mark.representatives(4)
 @pytest.mark.parametrize("pair, shape", GRIDS)
 def test_grids_against_scipy_and_back(pair, shape):
     t, x = on_grid(pair, shape)

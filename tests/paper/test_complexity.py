@@ -24,6 +24,7 @@ def test_counts_are_the_papers_but_for_order_five():
     assert counts["this paper", 4] == (5, 0)
 
 
+@pytest.mark.slow
 def test_counts_are_those_of_the_tableaus():
     for methods in (complexity.METHODS["C-G"], complexity.METHODS["this paper"]):
         for _, method in methods.values():

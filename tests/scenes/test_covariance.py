@@ -105,6 +105,7 @@ def test_in_the_end_the_filter_solves_the_algebraic_riccati_equation():
     np.testing.assert_allclose(found, p, rtol=0, atol=1e-12)
 
 
+@pytest.mark.representatives(1)
 @pytest.mark.parametrize(
     ("args", "t1", "num_steps"), [(SEEN, 5.0, 80), (HIDDEN, 20.0, 40)], ids=["Riccati", "Lyapunov"]
 )

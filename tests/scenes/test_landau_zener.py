@@ -56,6 +56,7 @@ def test_the_reference_is_the_closed_form(args, times):
 
 
 # Steps in which the error is well above rounding and the order seen.
+@pytest.mark.representatives(2)
 @pytest.mark.parametrize(
     ("solver", "num_steps", "order"),
     [

@@ -60,6 +60,7 @@ def test_the_reference_against_the_particles():
     np.testing.assert_allclose(toda.particles(found, center), y[:n], rtol=0, atol=1e-9)
 
 
+@pytest.mark.representatives(1)
 @pytest.mark.parametrize(("solver", "order"), [(cfjax.CF4(), 4), (cfjax.CF54(), 5)])
 def test_order(solver, order):
     exact = toda.reference(toda.t1)

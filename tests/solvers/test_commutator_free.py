@@ -333,7 +333,7 @@ class Counting(cfjax.AbstractFrozenField):
         return self.v
 
 
-@pytest.mark.representatives(20)
+@pytest.mark.representatives(6)
 @methods
 @pytest.mark.parametrize("shape", [(3,), (4, 4)])
 @pytest.mark.parametrize("estimate", [False, True])

@@ -78,6 +78,7 @@ def weights_at(continuous_extension, theta):
     ]
 
 
+@pytest.mark.representatives(8)
 @pytest.mark.parametrize("solver, order", FLOWS.values(), ids=FLOWS)
 def test_the_order_conditions_of_the_continuous_extension(solver, order):
     """Its weights must be `theta^n` times those of the exact solution, for words of order n."""

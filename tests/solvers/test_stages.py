@@ -58,7 +58,7 @@ def assert_same(found, expected, units):
         np.testing.assert_allclose(a, b, rtol=0, atol=units * 2.0**-52)
 
 
-@pytest.mark.representatives(2)
+@pytest.mark.representatives(1)
 @pytest.mark.parametrize("problem", FIELDS)
 @pytest.mark.parametrize("name", SOLVERS)
 def test_a_step(name, problem):

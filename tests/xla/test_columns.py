@@ -126,6 +126,7 @@ def leftover(monkeypatch):
     return names
 
 
+@pytest.mark.representatives(6)
 @pytest.mark.parametrize("fun", FUNCTIONS)
 def test_as_the_function_itself(fun, leftover):
     apart = jax.jit(lambda y: by_components(fun, y))(Y)
@@ -134,6 +135,7 @@ def test_as_the_function_itself(fun, leftover):
     assert set(leftover) <= {"iota"}
 
 
+@pytest.mark.representatives(4)
 @pytest.mark.parametrize("fun", FUNCTIONS)
 def test_derivatives(fun):
     def both(fun):

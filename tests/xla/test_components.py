@@ -330,7 +330,7 @@ def test_values_outside_of_jit(name):
     assert_same(got, want, VALUE)
 
 
-@pytest.mark.representatives(4)
+@pytest.mark.representatives(2)
 @ALL
 def test_derivatives(name):
     """Value, gradient, forward over reverse and reverse over reverse, in one program."""
@@ -434,6 +434,7 @@ def test_custom_vmap_rule_is_kept():
     np.testing.assert_allclose(jax.vmap(whole(fun))(batch), 4 * batch, rtol=1e-15)
 
 
+@pytest.mark.representatives(1)
 @pytest.mark.parametrize("bad", [np.nan, np.inf, -0.0])
 def test_special_values_stay_where_they_are(bad):
     y = jnp.asarray([0.5, bad, 2.0])
@@ -448,6 +449,7 @@ def test_special_values_stay_where_they_are(bad):
     assert np.isfinite(gradient[2])
 
 
+@pytest.mark.slow
 def test_closing_over_traced_values():
     y, w, m = map(jnp.asarray, (Y, W, M))
 
@@ -661,6 +663,7 @@ BINARY = [
 ]
 
 
+@pytest.mark.slow
 @hypothesis.given(
     n=st.sampled_from([1, 2, 3, 4, 7, 8]),
     steps=st.lists(

@@ -36,7 +36,7 @@ def weighted(stack):
     return fun
 
 
-@pytest.mark.representatives(3)
+@pytest.mark.representatives(2)
 @pytest.mark.parametrize(
     "transform",
     [
