@@ -32,10 +32,10 @@ def held(
     return held_p.bind(*entries, in_batches=in_batches, alone=alone, now=now)
 
 
-def once(tree: PyTree) -> PyTree:
+def once(tree: PyTree, in_batches: bool = False) -> PyTree:
     """The same; the entries of short vectors are computed once for all that uses them."""
     # One by one: what nobody uses is not computed.
-    return jtu.tree_map(_once, tree)
+    return jtu.tree_map(functools.partial(_once, in_batches=in_batches), tree)
 
 
 def once_for_sums(tree: PyTree) -> PyTree:

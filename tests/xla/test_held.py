@@ -1,5 +1,8 @@
 """What goes through memory. That nothing else changes is in test_pack.py."""
 
+import re
+
+import diffrax
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -8,6 +11,7 @@ import pytest
 import cfjax
 from cfjax._xla.held import held
 from cfjax._xla.pack import pack, unpack
+from cfjax.scenes import spacecraft
 
 
 def test_what_is_held_is_computed_once():
@@ -42,6 +46,25 @@ def test_increments_of_a_step_are_computed_together(rewritten):
     text = str(jax.make_jaxpr(solve)(y0, jnp.array([0.9, 0.6, 0.3])))
     groups = [line.split("=")[0] for line in text.splitlines() if "= cfjax_held[" in line]
     assert 7 in [len(group.split()) for group in groups]
+
+
+def test_the_error_of_a_step_goes_through_memory_before_its_norm(rewritten):
+    """In one function with two sums XLA makes of what they share a tree of calls, which takes a
+    hundred times as long as the step."""
+    given = spacecraft.problem()
+
+    def solve(y0, args):
+        controller = diffrax.PIDController(rtol=0.0, atol=1e-6)
+        return diffrax.diffeqsolve(
+            given["term"], cfjax.CF4(), 0.0, 1.0, 0.1, y0, args, stepsize_controller=controller
+        ).ys
+
+    program = jax.jit(solve).lower(given["y0"], given["args"]).compile().as_text()
+    functions = re.findall(r"^%fused_computation[^\n]*\n(?:  .*\n)*", program, flags=re.MULTILINE)
+    sizes = [(text.count("\n"), text.count(" reduce(")) for text in functions]
+    # A step is more than 500 operations, a norm some tens.
+    assert max(sizes) > (500, 0)
+    assert all(size < 200 for size, sums in sizes if sums > 1)
 
 
 @pytest.mark.parametrize("in_batches", [False, True])
