@@ -103,7 +103,9 @@ def values(rows: Iterable[Row], key: str) -> list:
 def code(program: str) -> str:
     """The name of a program with its code marked up: `"diffrax, CF4"` has two words of code."""
     return re.sub(
-        r"cfjax\.integrate|CF\d+(\([\w=]+\))?|(Richardson|RKMK)\(\w+\)", r"`\g<0>`", program
+        r"cfjax\.integrate|C[FG]\d+(\([\w=]+\))?|Magnus\d+|(Richardson|RKMK)\(\w+\)",
+        r"`\g<0>`",
+        program,
     )
 
 
@@ -333,6 +335,70 @@ def compiling() -> list[list[str]]:
         cells = [between(r["over Tsit5"][2] for r in few) if few else "" for few in found]
         table.append([f"`{method}`", *cells])
     return table
+
+
+_OVER = "over the fastest of others"
+
+
+def _quantum() -> dict[tuple[str, int, float], list[Row]]:
+    """The rows of each case: a problem, a number of systems and an error."""
+    cases: dict[tuple[str, int, float], list[Row]] = {}
+    for row in load("quantum")["rows"]:
+        if "method" in row:
+            cases.setdefault((row["problem"], row["systems"], row["goal"]), []).append(row)
+    return cases
+
+
+@table
+def quantum() -> list[list[str]]:
+    head = ["", "error", "cfjax", "time", "times as fast as", "and as given"]
+    table = [[*head, "norm off by, and theirs"]]
+    for (problem, count, goal), rows in _quantum().items():
+        ours = [row for row in rows if row["method"].startswith("cfjax")]
+        others = [row for row in rows if row not in ours]
+        as_given = [row for row in others if not row["method"].endswith("frame")]
+        best, *fastest = (min(few, key=lambda r: r[_OVER][2]) for few in (ours, others, as_given))
+        table.append(
+            [
+                f"{problem}, {systems(count)}",
+                power(goal),
+                code(best["method"].removeprefix("cfjax, ")),
+                in_units(best["seconds each"][2]),
+                *(f"{r['method']}: {two_digits(r[_OVER][2] / best[_OVER][2])}" for r in fastest),
+                f"{power(best['off norm'])}, {power(fastest[0]['off norm'])}",
+            ]
+        )
+    return table
+
+
+@table
+def quantum_methods() -> list[list[str]]:
+    cases = _quantum()
+    head = ["", *(f"{what}, {power(goal)}, {systems(n)}" for what, n, goal in cases)]
+
+    def text(rows: list[Row], method: str) -> str:
+        found = pick(rows, method=method)
+        if not found:
+            return ""
+        size = found[0]["steps or tolerance"]
+        return f"{size if isinstance(size, int) else power(size)}, {cell(found[0][_OVER])}"
+
+    methods = dict.fromkeys(row["method"] for rows in cases.values() for row in rows)
+    return [head] + [
+        [code(method.removeprefix("cfjax, ")), *(text(rows, method) for rows in cases.values())]
+        for method in methods
+    ]
+
+
+@number
+def quantum_others() -> str:
+    return load("quantum")["rows"][0]["others"]
+
+
+@number
+def quantum_norm() -> str:
+    rows = [row for rows in _quantum().values() for row in rows]
+    return two_digits(max(row["off norm"] for row in rows if row["method"].startswith("cfjax")))
 
 
 def _seconds_of(derivative: str) -> str:

@@ -1,0 +1,412 @@
+"""Quantum systems: time to an error, beside diffrax in plain space, dynamiqs and QuTiP.
+
+- transmon: propagators of four levels under pulses of 8 ns, with a carrier of 5 GHz, as in
+  `cfjax.scenes.transmon`; one pulse, and a batch.
+- two transmons: the propagator of three levels each, at 6 and 5 GHz with anharmonicities of -300
+  MHz and a coupling `g (a + a^T) (b + b^T)` of g = 20 MHz, nothing averaged. A flux pulse of 40 ns
+  lowers the first by 700 MHz and back, as sin^2: a controlled phase. The constant part is large and
+  the drive slow. Energies are counted from the middle, for the sake of methods in plain space.
+- annealing: the state of 12 spins, as in `cfjax.scenes.annealing`. No part is constant.
+
+Each method takes the steps, or the tolerance, with which its ends are as near as the goal: the root
+of the mean square, over a batch, of the largest entry of a propagator, or of the length of a state.
+They were found by trial, of the transmon on a batch, and the error is measured again. Where an
+error goes up and down with the number of steps, as it does where steps are as often as two levels
+beat, it is below the goal for all larger numbers too. `frame` is the frame in which the levels of
+the constant part rest, put in by hand; Magnus methods take more steps there, and are not in it.
+What ends are compared with is Magnus10 with many steps; how near DOP853 of SciPy is to it is a row.
+All take turns. QuTiP takes one system at a time. Left out are packages that are not installed;
+Dopri5 and implicit methods of dynamiqs, its Tsit5 on annealing, and all of QuTiP but vern9, which
+was ahead; and, in the large batch and for the smaller error, methods that take over three times as
+long as the best of their package.
+"""
+
+import functools
+import importlib
+import importlib.metadata
+import importlib.util
+from collections.abc import Callable, Iterator
+from typing import Any, NamedTuple
+
+import diffrax
+import jax
+import jax.numpy as jnp
+import numpy as np
+import scipy.sparse as sparse
+from jaxtyping import Array, Complex, Float
+from scipy.integrate import solve_ivp
+
+import cfjax
+import results
+from cfjax._measure.work_precision import take_turns
+from cfjax.scenes import annealing, transmon
+
+LEVELS, SPINS = 4, 12
+GOALS = (1e-6, 1e-9)
+# What is imported for those that need not be there.
+PEERS = {"dynamiqs": "dynamiqs", "QuTiP": "qutip"}
+# Those that are in a batch, and not for the goals in brackets.
+BATCHED = {
+    "cfjax, Magnus4": (1e-9,),
+    "cfjax, Magnus6": (),
+    "cfjax, Magnus8": (),
+    "diffrax, Dopri8": (1e-9,),
+    "diffrax, Tsit5, frame": (),
+    "diffrax, Dopri8, frame": (),
+    "dynamiqs, Dopri8": (),
+    "dynamiqs, Dopri8, frame": (),
+}
+
+# The end of one system: of its numbers, and of how fine.
+Program = Callable[[Any, Any], Any]
+Matrix = Complex[Array | np.ndarray, "n n"]
+
+
+class Problem(NamedTuple):
+    """`i y' = (sum_k coefficients(t, args, np)[k] parts()[k]) y` from 0 to t1.
+
+    `coefficients` takes numpy or jax.numpy; one that is an `int` is constant. `systems` makes the
+    `args` of so many systems, which take turns `repeats` times, or `quick`. `best` is how many
+    steps the reference takes, and `sizes` has steps or tolerances for the goals. Elsewhere, as in a
+    frame, the Hamiltonian is `matrix(t, args)`, and `leave` brings the end back.
+    """
+
+    t1: float
+    y0: Complex[np.ndarray, "n *columns"]
+    parts: Callable[[], list[Any]]
+    coefficients: Callable[[Any, Any, Any], list[Any]]
+    field: Callable[[Any, Any, Any], Any]
+    velocity: Callable[[Any, Any, Any], Any]
+    systems: Callable[[int], Float[np.ndarray, "systems k"]]
+    repeats: dict[int, int]
+    quick: dict[int, int]
+    best: int
+    sizes: dict[str, tuple[Any, ...]]
+    matrix: Callable[[Any, Any], Matrix] | None = None
+    leave: Callable[[Any], Any] = lambda y: y
+
+
+def pulses(number: int) -> Float[np.ndarray, "systems 2"]:
+    """Stronger and weaker ones, with quadratures of both signs."""
+    best = transmon.corrected()
+    factor = np.random.default_rng(0).uniform([0.7, -1.0], [1.3, 1.0], size=(number, 2))
+    return factor * np.concatenate([best.in_phase, best.quadrature])
+
+
+def levels() -> list[Matrix]:
+    n, one = np.arange(LEVELS), transmon.plain()
+    energies = one.frequency * n + one.anharmonicity * n * (n - 1) / 2
+    lower = np.diag(np.sqrt(n[1:]), 1)
+    return [np.diag(energies) + 0j, lower + lower.T + 0j]
+
+
+def drive(t: Any, args: Any, xp: Any) -> list[Any]:
+    one = transmon.plain()
+    angle, phase = 2 * np.pi / one.duration * t, one.frequency * t
+    first, second = args[0] * (1 - xp.cos(angle)), args[1] * xp.sin(angle)
+    return [1, first * xp.cos(phase) + second * xp.sin(phase)]
+
+
+@functools.cache
+def pair() -> list[Matrix]:
+    """The constant part of two transmons, and the number operator of the first; rad/ns."""
+    n = np.arange(3)
+    hop = np.diag(np.sqrt(n[1:]), 1) + np.diag(np.sqrt(n[1:]), -1)
+    first, second = (2 * np.pi * (f * n - 0.3 * n * (n - 1) / 2) for f in (6.0, 5.0))
+    energies = np.add.outer(first, second).ravel()
+    energies = energies - (energies.max() + energies.min()) / 2
+    constant = np.diag(energies) + 2 * np.pi * 0.02 * np.kron(hop, hop)
+    return [constant + 0j, np.kron(np.diag(n), np.eye(3)) + 0j]
+
+
+def flux(t: Any, args: Any, xp: Any) -> list[Any]:
+    return [1, -args[0] * xp.sin(np.pi * t / 40) ** 2]
+
+
+def pair_hamiltonian(t: Any, args: Any) -> Matrix:
+    constant, number = pair()
+    return constant + flux(t, args, jnp)[1] * number
+
+
+def spins() -> list[Any]:
+    flip = sparse.csr_array([[0.0, 1.0], [1.0, 0.0]])
+    sides = [(sparse.eye_array(2**j), sparse.eye_array(2 ** (SPINS - 1 - j))) for j in range(SPINS)]
+    flips = sum(sparse.kron(sparse.kron(left, flip), right) for left, right in sides)
+    diagonal = sparse.diags_array(annealing.couplings(SPINS))
+    return [sparse.csr_array(-part + 0j) for part in (flips, diagonal)]
+
+
+def ramp(t: Any, args: Any, xp: Any) -> list[Any]:
+    s = xp.sin(np.pi / 2 * t / args[0]) ** 2
+    return [1 - s, s]
+
+
+PROBLEMS = {
+    "transmon": Problem(
+        t1=transmon.plain().duration,
+        y0=transmon.y0(LEVELS),
+        parts=levels,
+        coefficients=drive,
+        field=lambda t, y, args: transmon.field(t, y, transmon.Pulse(args[:1], args[1:])),
+        velocity=lambda t, y, args: transmon.velocity(t, y, transmon.Pulse(args[:1], args[1:])),
+        systems=pulses,
+        repeats={1: 9, 1000: 2},
+        quick={1: 2, 100: 1},
+        best=1600,
+        sizes={
+            "cfjax, CF4": (2000, None),
+            "cfjax, Magnus4": (600, 3400),
+            "cfjax, Magnus6": (160, 600),
+            "cfjax, Magnus8": (170, 407),
+            "diffrax, Tsit5": (5800, None),
+            "diffrax, Dopri8": (1010, 2190),
+            "diffrax, Tsit5, frame": (545, 1740),
+            "diffrax, Dopri8, frame": (220, 490),
+            "dynamiqs, Tsit5": (2e-9, None),
+            "dynamiqs, Dopri8": (4e-9, 8.9e-12),
+            "dynamiqs, Dopri8, frame": (8.9e-8, 1.6e-10),
+            "QuTiP, vern9": (1.9e-8, 1.8e-11),
+        },
+    ),
+    "two transmons": Problem(
+        t1=40.0,
+        y0=np.eye(9, dtype=complex),
+        parts=pair,
+        coefficients=flux,
+        field=lambda t, y, args: cfjax.LeftMatrix(-1j * pair_hamiltonian(t, args)),
+        velocity=lambda t, y, args: -1j * (pair_hamiltonian(t, args) @ y),
+        systems=lambda number: np.linspace(2 * np.pi * 0.7, 2 * np.pi * 0.5, number)[:, None],
+        repeats={1: 7},
+        quick={1: 2},
+        best=4000,
+        sizes={
+            "cfjax, CF4": (465, 620),
+            "cfjax, Magnus4": (445, 490),
+            "cfjax, Magnus6": (230, 470),
+            "cfjax, Magnus8": (230, 470),
+            "diffrax, Tsit5": (28900, None),
+            "diffrax, Dopri8": (4500, 9800),
+            "diffrax, Tsit5, frame": (3062, 9950),
+            "diffrax, Dopri8, frame": (1210, 2800),
+            "dynamiqs, Tsit5": (3.3e-10, None),
+            "dynamiqs, Dopri8": (6.4e-10, 1.2e-12),
+            "dynamiqs, Dopri8, frame": (1.6e-8, 1.6e-11),
+            "QuTiP, vern9": (2.5e-9, 2e-12),
+        },
+    ),
+    "annealing": Problem(
+        t1=annealing.t1,
+        y0=annealing.y0(SPINS),
+        parts=spins,
+        coefficients=ramp,
+        field=lambda t, y, args: annealing.field(t, y, args[0]),
+        velocity=lambda t, y, args: annealing.velocity(t, y, args[0]),
+        systems=lambda number: np.full((number, 1), annealing.t1),
+        repeats={1: 4},
+        quick={1: 1},
+        best=200,
+        sizes={
+            "cfjax, CF4": (112, None),
+            "cfjax, Magnus4": (72, 414),
+            "cfjax, Magnus6": (23, 67),
+            "cfjax, Magnus8": (21, 44),
+            "diffrax, Tsit5": (1450, None),
+            "diffrax, Dopri8": (289, 620),
+            "dynamiqs, Dopri8": (7.8e-10, 1.8e-12),
+            "QuTiP, vern9": (5e-9, 5e-12),
+        },
+    ),
+}
+
+
+def in_frame(problem: Problem) -> Problem:
+    """The same in the frame where the levels of the constant part rest."""
+    constant, *others = problem.parts()
+    energies = np.real(np.diag(constant))
+    rest = constant - np.diag(energies)
+
+    def matrix(t: Any, args: Any) -> Matrix:
+        _, *coefficients = problem.coefficients(t, args, jnp)
+        h = sum((c * part for c, part in zip(coefficients, others, strict=True)), rest)
+        turn = jnp.exp(1j * t * energies)
+        return turn[:, None] * h * turn.conj()
+
+    return problem._replace(
+        matrix=matrix,
+        velocity=lambda t, y, args: -1j * (matrix(t, args) @ y),
+        leave=lambda y: np.exp(-1j * problem.t1 * energies)[:, None] * y,
+    )
+
+
+def by_cfjax(problem: Problem, method: str) -> Program:
+    def end(args, num_steps):
+        term, solver = cfjax.LieTerm(problem.field), getattr(cfjax, method)()
+        t1, y0 = problem.t1, problem.y0
+        sol = cfjax.integrate(term, solver, 0.0, t1, y0, args, num_steps=num_steps)
+        return jax.tree.map(lambda y: y[-1], sol.ys)
+
+    return end
+
+
+def by_diffrax(problem: Problem, method: str) -> Program:
+    def end(args, num_steps):
+        term, solver = diffrax.ODETerm(problem.velocity), getattr(diffrax, method)()
+        t1, step, y0 = problem.t1, problem.t1 / num_steps, jnp.asarray(problem.y0)
+        sol = diffrax.diffeqsolve(term, solver, 0.0, t1, step, y0, args, max_steps=None)
+        return problem.leave(jax.tree.map(lambda y: y[-1], sol.ys))
+
+    return end
+
+
+def by_dynamiqs(problem: Problem, method: str) -> Program:
+    """Operators as their diagonals, or dense if they are of four levels: what is faster."""
+    dq = importlib.import_module("dynamiqs")
+    dq.set_precision("double")
+    dq.set_progress_meter(False)
+    layout = dq.dense if len(problem.y0) == LEVELS else dq.dia
+    parts = [h.toarray() if sparse.issparse(h) else h for h in problem.parts()]
+    parts = [dq.asqarray(h, layout=layout) for h in parts]
+    times = jnp.array([0.0, problem.t1])
+
+    def hamiltonian(args: Any) -> Any:
+        matrix = problem.matrix
+        if matrix is not None:
+            return dq.timecallable(lambda t: dq.asqarray(matrix(t, args)))
+
+        def part(k: int, h: Any) -> Any:
+            if isinstance(problem.coefficients(0.0, args, jnp)[k], int):
+                return dq.constant(h)
+            return dq.modulated(lambda t: problem.coefficients(t, args, jnp)[k], h)
+
+        first, *others = (part(k, h) for k, h in enumerate(parts))
+        return sum(others, first)
+
+    def end(args, tolerance):
+        h = hamiltonian(args)
+        how = getattr(dq.method, method)(rtol=tolerance, atol=tolerance, max_steps=1_000_000)
+        if problem.y0.ndim == 1:
+            start = jnp.asarray(problem.y0)[:, None]
+            return dq.sesolve(h, start, times, method=how).final_state.to_jax()[:, 0]
+        return problem.leave(dq.sepropagator(h, times, method=how).final_propagator.to_jax())
+
+    return end
+
+
+def by_qutip(problem: Problem, method: str) -> Program:
+    qutip = importlib.import_module("qutip")
+    parts = [qutip.Qobj(h) for h in problem.parts()]
+
+    def end(args, tolerance):
+        def part(k: int, h: Any) -> Any:
+            is_constant = isinstance(problem.coefficients(0.0, args, np)[k], int)
+            return h if is_constant else [h, lambda t: problem.coefficients(t, args, np)[k]]
+
+        total = [part(k, h) for k, h in enumerate(parts)]
+        options = dict(method=method, rtol=tolerance, atol=tolerance, nsteps=10**7)
+        if problem.y0.ndim == 2:
+            return qutip.propagator(total, problem.t1, options=options).full()
+        # Or the norm would be mended.
+        options |= dict(normalize_output=False, progress_bar="")
+        found = qutip.sesolve(total, qutip.Qobj(problem.y0), [0.0, problem.t1], options=options)
+        return found.final_state.full()[:, 0]
+
+    return end
+
+
+PACKAGES = {"cfjax": by_cfjax, "diffrax": by_diffrax, "dynamiqs": by_dynamiqs, "QuTiP": by_qutip}
+
+
+class Run(NamedTuple):
+    """Of all systems; the ends are those of the last time."""
+
+    program: Callable[[], Any]
+    ends: list[Any]
+
+    def __call__(self) -> None:
+        self.ends[:] = [jax.block_until_ready(self.program())]
+
+
+def run_of(problem: Problem, name: str, size: Any, data: Any) -> Run:
+    package, method, *frame = name.split(", ")
+    end = PACKAGES[package](in_frame(problem) if frame else problem, method)
+    if package == "QuTiP":
+        return Run(lambda: np.stack([end(args, size) for args in data]), [])
+    return Run(results.compiled(batched(lambda args: end(args, size)), data), [])
+
+
+def batched(end: Callable[[Any], Any]) -> Callable[[Any], Any]:
+    """Of a batch of one, alone: a batch would not be as fast."""
+    return lambda data: jax.vmap(end)(data) if len(data) > 1 else end(data[0])[None]
+
+
+def error(ends: Any, target: Any) -> float:
+    far = np.abs(np.asarray(ends) - target)
+    each = far.max((1, 2)) if far.ndim == 3 else np.linalg.norm(far, axis=1)
+    return float(np.sqrt(np.mean(each**2)))
+
+
+def off_norm(ends: Any) -> float:
+    """The most by which the norm of a state changes."""
+    columns = np.asarray(ends) if ends.ndim == 3 else np.asarray(ends)[..., None]
+    return float(np.abs(np.linalg.svd(columns, compute_uv=False) - 1).max())
+
+
+def by_scipy(problem: Problem, args: Any) -> Any:
+    """By SciPy's DOP853 with a tolerance of 1e-13. The error is from 1e-11 to 1e-10."""
+    parts = problem.parts()
+
+    def rate(t, y):
+        y = y.reshape(problem.y0.shape)
+        pairs = zip(problem.coefficients(t, args, np), parts, strict=True)
+        return np.ravel(-1j * sum(c * (h @ y) for c, h in pairs))
+
+    start = problem.y0.ravel()
+    sol = solve_ivp(rate, (0.0, problem.t1), start, "DOP853", rtol=1e-13, atol=1e-15)
+    return sol.y[:, -1].reshape(problem.y0.shape)
+
+
+def measure(quick: bool) -> Iterator[results.Row]:
+    there = {name: importlib.util.find_spec(module) for name, module in PEERS.items()}
+    missing = {name for name, spec in there.items() if spec is None}
+    others = {"diffrax": "diffrax", **PEERS}
+    versions = {
+        name: importlib.metadata.version(others[name]) for name in others if name not in missing
+    }
+    yield {"others": ", ".join(f"{name} {versions[name]}" for name in others if name in versions)}
+    for label, problem in PROBLEMS.items():
+        reference = by_cfjax(problem, "Magnus10")
+        best = jax.jit(batched(lambda args, end=reference, n=problem.best: end(args, n)))
+        one = problem.systems(1)
+        apart = error(best(one), by_scipy(problem, one[0])[None])
+        yield {"problem": label, "DOP853 less Magnus10": results.digits(apart)}
+        for number, repeats in (problem.quick if quick else problem.repeats).items():
+            data = problem.systems(number)
+            target = np.asarray(best(data))
+            for k, goal in enumerate(GOALS):
+                runs = {
+                    name: run_of(problem, name, sizes[k], data)
+                    for name, sizes in problem.sizes.items()
+                    if sizes[k] is not None and name.partition(",")[0] not in missing
+                    if number == 1 or goal not in BATCHED.get(name, GOALS)
+                }
+                rounds = take_turns(list(runs.values()), repeats=repeats)
+                times = dict(zip(runs, rounds, strict=True))
+                rest = [name for name in runs if not name.startswith("cfjax")]
+                fastest = min(rest, key=lambda name: np.median(times[name]))
+                for name, seconds in times.items():
+                    (ends,) = runs[name].ends
+                    yield {
+                        "problem": label,
+                        "systems": number,
+                        "goal": goal,
+                        "method": name,
+                        "steps or tolerance": problem.sizes[name][k],
+                        "error": results.digits(error(ends, target)),
+                        "off norm": results.digits(off_norm(ends)),
+                        "seconds each": results.spread(seconds / number),
+                        "over the fastest of others": results.ratios(seconds, times[fastest]),
+                    }
+
+
+if __name__ == "__main__":
+    results.run(__file__, __doc__, measure)
