@@ -18,7 +18,14 @@ HERE = Path(__file__).parent
 PAGES = sorted((HERE.parent / "docs").rglob("*.md"))
 MARKED = re.compile(r"(<!-- (table|number): ([\w-]+) -->)(.*?)(<!-- end -->)", flags=re.DOTALL)
 # Those that draw, and how fine.
-PICTURES = {"batch": 120, "chain": 120, "charts": 200, "stability": 100, "tolerances": 120}
+PICTURES = {
+    "batch": 120,
+    "chain": 120,
+    "charts": 200,
+    "peers": 120,
+    "stability": 100,
+    "tolerances": 120,
+}
 
 
 def main() -> None:
@@ -103,7 +110,9 @@ def values(rows: Iterable[Row], key: str) -> list:
 def code(program: str) -> str:
     """The name of a program with its code marked up: `"diffrax, CF4"` has two words of code."""
     return re.sub(
-        r"cfjax\.integrate|CF\d+(\([\w=]+\))?|(Richardson|RKMK)\(\w+\)", r"`\g<0>`", program
+        r"cfjax\.integrate|C[FG]\d+(\([\w=]+\))?|Magnus\d+|(Richardson|RKMK)\(\w+\)",
+        r"`\g<0>`",
+        program,
     )
 
 
@@ -333,6 +342,44 @@ def compiling() -> list[list[str]]:
         cells = [between(r["over Tsit5"][2] for r in few) if few else "" for few in found]
         table.append([f"`{method}`", *cells])
     return table
+
+
+def _peers(scene: str) -> list[list[str]]:
+    rows = [row for row in pick(load("peers")["rows"], scene=scene) if "to" in row]
+    counts = values(rows, "systems")
+    has_group = "distance" in rows[0]
+    over = (f"over the fastest of cfjax, {systems(count)}" for count in counts)
+    head = ["", "steps or tolerance", "error", *["off the group"] * has_group, "time", *over]
+    table = [head]
+    for program in values(rows, "program"):
+        row, *others = pick(rows, program=program)
+        cells = [power(row["tolerance"]) if "tolerance" in row else two_digits(row["steps"])]
+        cells.append(power(row["error"]))
+        if has_group:
+            cells.append(power(row["distance"]) if row["distance"] else "0")
+        cells.append(in_units(row["seconds"][2]))
+        table.append([code(program), *cells, *(cell(r["over cfjax"]) for r in (row, *others))])
+    return table
+
+
+@table
+def peers_spacecraft() -> list[list[str]]:
+    return _peers("spacecraft")
+
+
+@table
+def peers_rotation() -> list[list[str]]:
+    return _peers("given angular velocity")
+
+
+@table
+def peers_kuramoto() -> list[list[str]]:
+    return _peers("Kuramoto-Sivashinsky")
+
+
+@number
+def peers_versions() -> str:
+    return ", ".join(sorted(values(load("peers")["rows"], "package")))
 
 
 def _seconds_of(derivative: str) -> str:

@@ -1,0 +1,486 @@
+"""cfjax beside its peers, on scenes of theirs and ours: error, time, and what is left of the group.
+
+Each program runs with several numbers of steps, or tolerances, and with what it needs for one error
+that all are to reach. There all are compared: time, and the distance of the end from the group.
+
+- A spacecraft, `cfjax.scenes.spacecraft` to t = 40, alone and 1000 times. The reference is exact.
+- An attitude whose angular velocity is given in time, as a matrix, to t = 10: what georax shows its
+  convergence on. The reference is SciPy's DOP853 at its smallest tolerance.
+- The equation of Kuramoto and Sivashinsky to t = 30, with the period, the start and the 128 points
+  of Kassam & Trefethen (doi:10.1137/S1064827502410633), for exponax. The reference is SciPy's
+  DOP853 again, with the same modes in NumPy: the error is that of time alone.
+
+A peer that is not installed is left out, and so are its rows in the stored results:
+`pip install '.[peers]'` before `make benchmarks`. All programs of a scene take turns.
+"""
+
+import importlib
+import importlib.metadata
+import importlib.util
+import math
+from collections.abc import Callable, Iterator, Sequence
+from typing import Any, NamedTuple
+
+import diffrax
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+from matplotlib.figure import Figure
+from scipy.integrate import solve_ivp
+
+import cfjax
+import results
+from cfjax._measure import style as _style
+from cfjax._measure.work_precision import take_turns
+from cfjax.scenes import spacecraft
+
+BATCH = 1000
+# The least that SciPy takes.
+LEAST = 2.3e-14
+
+
+class Program(NamedTuple):
+    """From a start and a setting, which is a number of steps or SciPy's tolerance, to the end."""
+
+    package: str
+    solve: Callable[[Any, Any], Any]
+    settings: Sequence[float]
+
+
+class Scene(NamedTuple):
+    y0: Any
+    error: Callable[[Any], float]
+    # The distance from the group, if there is one.
+    distance: Callable[[Any], float] | None
+    target: float
+    # Of a program in one turn: a single one may be too short for the clock.
+    repeats: int
+    programs: dict[str, Program]
+
+
+def steps(first: int) -> list[int]:
+    return [first * 2**k for k in range(4)]
+
+
+TOLERANCES = [1e-5, 1e-7, 1e-9, 1e-11]
+
+
+def equal_steps(field: Any, solver: Any, t1: float) -> Callable:
+    def solve(y0: Any, num_steps: int) -> Any:
+        sol = cfjax.integrate(cfjax.LieTerm(field), solver, 0.0, t1, y0, num_steps=num_steps)
+        return jax.tree.map(lambda ys: ys[-1], sol.ys)
+
+    return solve
+
+
+def in_plain_space(velocity: Any, solver: diffrax.AbstractSolver, t1: float) -> Callable:
+    term = diffrax.ODETerm(velocity)
+
+    def solve(y0: Any, num_steps: int) -> Any:
+        # Rounding of the times may make a step more.
+        max_steps = num_steps + 1
+        sol = diffrax.diffeqsolve(term, solver, 0.0, t1, t1 / num_steps, y0, max_steps=max_steps)
+        return jax.tree.map(lambda ys: ys[-1], sol.ys)
+
+    return solve
+
+
+class Projected(diffrax.Tsit5):
+    """Tsit5 that returns to the manifold after each step.
+
+    The last stage of a step is the first of the next, as in Tsit5: what it is off is of the order
+    of the error.
+    """
+
+    project: Callable = eqx.field(static=True, kw_only=True)
+
+    def step(
+        self, terms: Any, t0: Any, t1: Any, y0: Any, args: Any, solver_state: Any, made_jump: Any
+    ) -> Any:
+        y1, *rest = super().step(terms, t0, t1, y0, args, solver_state, made_jump)
+        return self.project(y1), *rest
+
+
+def on_host(velocity: Callable, method: Any, t1: float) -> Callable:
+    """SciPy's, of a NumPy array."""
+
+    def solve(y0: np.ndarray, rtol: float) -> np.ndarray:
+        def ode(t: float, y: np.ndarray) -> np.ndarray:
+            return velocity(t, y.reshape(y0.shape)).ravel()
+
+        answer = solve_ivp(ode, (0.0, t1), y0.ravel(), method=method, rtol=rtol, atol=rtol)
+        return answer.y[:, -1].reshape(y0.shape)
+
+    return solve
+
+
+def with_jaxlie(
+    rates: Callable, t1: float, start: Callable, end: Callable, first: int
+) -> dict[str, Program]:
+    """A classical RK4 written by hand around jaxlie's SO3, with a vector m beside the attitude.
+
+    The stages are at `R @ SO3.exp(u)`. As most write it, the four angular velocities are averaged
+    as they are, which is of order two. With `jlog` each is first multiplied by the inverse right
+    Jacobian at its u, which jaxlie has by that name: this is the equation that u solves, and the
+    method of order four of Munthe-Kaas.
+    """
+    if importlib.util.find_spec("jaxlie") is None:
+        return {}
+    # An import statement would be an error to pyright, where the peers are not installed.
+    jaxlie = importlib.import_module("jaxlie")
+
+    def solver(uses_jlog: bool) -> Callable:
+        def derivative(t: Any, r: Any, u: Any, m: Any) -> Any:
+            turn = jaxlie.SO3.exp(u)
+            omega, torque = rates(t, r @ turn, m)
+            return turn.jlog() @ omega if uses_jlog else omega, torque
+
+        def solve(y0: Any, num_steps: int) -> Any:
+            h = t1 / num_steps
+
+            def step(k: Any, y: Any) -> Any:
+                (r, m), t = y, k * h
+                omega1, m1 = rates(t, r, m)
+                omega2, m2 = derivative(t + h / 2, r, h / 2 * omega1, m + h / 2 * m1)
+                omega3, m3 = derivative(t + h / 2, r, h / 2 * omega2, m + h / 2 * m2)
+                omega4, m4 = derivative(t + h, r, h * omega3, m + h * m3)
+                turn = jaxlie.SO3.exp(h / 6 * (omega1 + 2 * omega2 + 2 * omega3 + omega4))
+                return r @ turn, m + h / 6 * (m1 + 2 * m2 + 2 * m3 + m4)
+
+            return end(*jax.lax.fori_loop(0, num_steps, step, start(jaxlie.SO3, y0)))
+
+        return solve
+
+    return {
+        "jaxlie, RK4": Program("jaxlie", solver(False), steps(first)),
+        "jaxlie, RK4, jlog": Program("jaxlie", solver(True), steps(first)),
+    }
+
+
+def of_spacecraft() -> Scene:
+    inertia, t1 = spacecraft.inertia, spacecraft.t1
+    exact = spacecraft.reference(t1)
+
+    def field(t: Any, y: Any, args: Any) -> Any:
+        omega = y["m"] / inertia
+        attitude = cfjax.QuaternionRotation(omega, frame="body", order="wxyz")
+        return {"q": attitude, "m": jnp.cross(y["m"], omega)}
+
+    def velocity(t: Any, y: Any, args: Any) -> Any:
+        return spacecraft.velocity(t, y, spacecraft.Craft())
+
+    def normalised(y: Any) -> Any:
+        return {"q": y["q"] / jnp.linalg.norm(y["q"]), "m": y["m"]}
+
+    def velocity_of_columns(t: float, y: np.ndarray) -> np.ndarray:
+        q0, q1, q2, q3, m1, m2, m3 = y
+        w1, w2, w3 = m1 / inertia[0], m2 / inertia[1], m3 / inertia[2]
+        return np.stack(
+            [
+                -(q1 * w1 + q2 * w2 + q3 * w3) / 2,
+                (q0 * w1 + q2 * w3 - q3 * w2) / 2,
+                (q0 * w2 + q3 * w1 - q1 * w3) / 2,
+                (q0 * w3 + q1 * w2 - q2 * w1) / 2,
+                m2 * w3 - m3 * w2,
+                m3 * w1 - m1 * w3,
+                m1 * w2 - m2 * w1,
+            ]
+        )
+
+    def with_scipy(y0: Any, rtol: float) -> Any:
+        # A batch is one system.
+        columns = np.concatenate([y0["q"].T, y0["m"].T])
+        y = on_host(velocity_of_columns, "DOP853", t1)(columns, rtol).T
+        return {"q": y[..., :4], "m": y[..., 4:]}
+
+    programs = {
+        "CF4": Program("cfjax", equal_steps(field, cfjax.CF4(), t1), steps(100)),
+        "CF54": Program("cfjax", equal_steps(field, cfjax.CF54(), t1), steps(50)),
+        "RKMK(Dopri8)": Program(
+            "cfjax", equal_steps(field, cfjax.RKMK(diffrax.Dopri8.tableau), t1), steps(12)
+        ),
+        "diffrax, Tsit5": Program(
+            "diffrax", in_plain_space(velocity, diffrax.Tsit5(), t1), steps(50)
+        ),
+        "diffrax, Tsit5, projected": Program(
+            "diffrax", in_plain_space(velocity, Projected(project=normalised), t1), steps(50)
+        ),
+        "diffrax, Dopri8": Program(
+            "diffrax", in_plain_space(velocity, diffrax.Dopri8(), t1), steps(12)
+        ),
+        "SciPy, DOP853": Program("scipy", with_scipy, TOLERANCES),
+    }
+    programs |= with_jaxlie(
+        lambda t, r, m: (m / inertia, jnp.cross(m, m / inertia)),
+        t1,
+        start=lambda SO3, y: (SO3(y["q"]), y["m"]),
+        end=lambda r, m: {"q": r.wxyz, "m": m},
+        first=100,
+    )
+    return Scene(
+        jax.tree.map(jnp.asarray, spacecraft.y0()),
+        lambda y: spacecraft.error(y, exact),
+        lambda y: abs(float(np.linalg.norm(y["q"])) - 1),
+        1e-8,
+        10,
+        programs,
+    )
+
+
+def of_given_velocity() -> Scene:
+    t1 = 10.0
+
+    def omega(t: Any, like: Any = jnp) -> Any:
+        return like.array([1 + like.sin(t) / 2, like.cos(1.5 * t) / 2, like.sin(t / 2)])
+
+    def field(t: Any, r: Any, args: Any) -> Any:
+        return cfjax.RightMatrix(jnp.cross(jnp.eye(3), omega(t)))
+
+    def of_quaternion(t: Any, q: Any, args: Any) -> Any:
+        return cfjax.QuaternionRotation(omega(t), frame="body", order="wxyz")
+
+    def as_quaternion(solver: Any) -> Callable:
+        solve = equal_steps(of_quaternion, solver, t1)
+
+        def solve_matrix(r: Any, num_steps: int) -> Any:
+            q = solve(cfjax.quaternion_from_matrix(r, order="wxyz"), num_steps)
+            return cfjax.quaternion_to_matrix(q, order="wxyz")
+
+        return solve_matrix
+
+    def velocity(t: Any, r: Any, args: Any) -> Any:
+        return jnp.cross(r, omega(t))
+
+    def nearer(r: Any) -> Any:
+        """A step of Newton's to the nearest rotation, which squares the distance."""
+        return r @ (3 * jnp.eye(3) - r.T @ r) / 2
+
+    def with_numpy(t: float, r: np.ndarray) -> np.ndarray:
+        x, y, z = omega(t, np)
+        return r @ np.array([[0, -z, y], [z, 0, -x], [-y, x, 0]])
+
+    exact = on_host(with_numpy, "DOP853", t1)(np.eye(3), LEAST)
+    programs = {
+        "CF4": Program("cfjax", equal_steps(field, cfjax.CF4(), t1), steps(25)),
+        "Magnus6": Program("cfjax", equal_steps(field, cfjax.Magnus6(), t1), steps(12)),
+        "CF4, quaternion": Program("cfjax", as_quaternion(cfjax.CF4()), steps(25)),
+        "Magnus6, quaternion": Program("cfjax", as_quaternion(cfjax.Magnus6()), steps(12)),
+        "CG4": Program("cfjax", equal_steps(field, cfjax.CG4(), t1), steps(25)),
+        "diffrax, Tsit5": Program(
+            "diffrax", in_plain_space(velocity, diffrax.Tsit5(), t1), steps(12)
+        ),
+        "diffrax, Tsit5, projected": Program(
+            "diffrax", in_plain_space(velocity, Projected(project=nearer), t1), steps(12)
+        ),
+        "diffrax, Dopri8": Program(
+            "diffrax", in_plain_space(velocity, diffrax.Dopri8(), t1), steps(4)
+        ),
+        "SciPy, DOP853": Program("scipy", on_host(with_numpy, "DOP853", t1), TOLERANCES),
+    }
+    programs |= with_jaxlie(
+        lambda t, r, m: (omega(t), m),
+        t1,
+        # No momentum.
+        start=lambda SO3, r: (SO3.from_matrix(r), jnp.zeros(0)),
+        end=lambda r, m: r.as_matrix(),
+        first=25,
+    )
+    return Scene(
+        jnp.eye(3),
+        lambda r: float(np.linalg.norm(r - exact)),
+        lambda r: float(np.linalg.norm(np.asarray(r).T @ r - np.eye(3))),
+        1e-8,
+        10,
+        programs,
+    )
+
+
+def of_kuramoto() -> Scene:
+    n, period, t1 = 128, 32 * np.pi, 30.0
+    x = period * np.arange(n) / n
+    y0 = np.cos(x / 16) * (1 + np.sin(x / 16))
+    k = np.arange(n // 2 + 1)
+    derivative = 2j * np.pi / period * k
+    spectrum = (-(derivative**2) - derivative**4).real
+    # Those that exponax keeps in the square by default.
+    kept = k <= 2 / 3 * (n // 2) - 1
+
+    def square(c: Any, like: Any) -> Any:
+        u = like.fft.irfft(kept * c, n)
+        return -derivative / 2 * kept * like.fft.rfft(u**2)
+
+    def field(t: Any, c: Any, args: Any) -> Any:
+        return cfjax.Affine(1.0, square(c, jnp), spectrum)
+
+    def velocity(u: Any, like: Any) -> Any:
+        c = like.fft.rfft(u)
+        return like.fft.irfft(spectrum * c + square(c, like), n)
+
+    def coefficients(u: Any, num_steps: int) -> Any:
+        solve = equal_steps(field, cfjax.CF4(), t1)
+        return jnp.fft.irfft(solve(jnp.fft.rfft(u), num_steps), n)
+
+    def in_space(t: Any, u: Any, args: Any) -> Any:
+        return velocity(u, jnp)
+
+    def on_grid(t: float, u: np.ndarray) -> np.ndarray:
+        return velocity(u, np)
+
+    exact = on_host(on_grid, "DOP853", t1)(y0, LEAST)
+    programs = {
+        "CF4": Program("cfjax", coefficients, steps(150)),
+        # With 2000 it overflows.
+        "diffrax, Tsit5": Program("diffrax", in_plain_space(in_space, diffrax.Tsit5(), t1), [2400]),
+        "SciPy, DOP853": Program("scipy", on_host(on_grid, "DOP853", t1), TOLERANCES[::2]),
+        "SciPy, LSODA": Program("scipy", on_host(on_grid, "LSODA", t1), TOLERANCES),
+    }
+    if importlib.util.find_spec("exponax"):
+        exponax = importlib.import_module("exponax")
+
+        def etdrk4(u: Any, num_steps: int) -> Any:
+            stepper = exponax.stepper.KuramotoSivashinskyConservative(
+                1, period, n, t1 / num_steps, order=4
+            )
+            return exponax.RepeatedStepper(stepper, num_steps)(u[None])[0]
+
+        programs["exponax, ETDRK4"] = Program("exponax", etdrk4, steps(150))
+    return Scene(
+        jnp.asarray(y0), lambda u: float(np.max(np.abs(u - exact))), None, 1e-6, 5, programs
+    )
+
+
+SCENES = {
+    "spacecraft": of_spacecraft,
+    "given angular velocity": of_given_velocity,
+    "Kuramoto-Sivashinsky": of_kuramoto,
+}
+
+
+def prepared(scene: Scene, name: str, y0: Any, setting: float) -> Callable[[], Any]:
+    program = scene.programs[name]
+    if program.package == "scipy":
+        start = jax.tree.map(np.asarray, y0)
+        return lambda: program.solve(start, setting)
+
+    def solve(y0: Any) -> Any:
+        return program.solve(y0, setting)
+
+    is_batch = jax.tree.map(jnp.shape, y0) != jax.tree.map(jnp.shape, scene.y0)
+    return results.compiled(jax.vmap(solve) if is_batch else solve, y0, repeats=scene.repeats)
+
+
+def to_target(scene: Scene, name: str, runs: dict[float, Callable]) -> float:
+    """The setting for the scene's error, by the slope between those in `runs`; more go there."""
+    errors = {setting: scene.error(run()) for setting, run in runs.items()}
+    for _ in range(5):
+        met = {s: e for s, e in errors.items() if e <= scene.target}
+        missed = {s: e for s, e in errors.items() if scene.target < e}
+        if not missed or (met and max(met.values()) > 0.8 * scene.target):
+            break
+        near = min(missed, key=missed.__getitem__)
+        other = max(met or {s: missed[s] for s in missed if s != near}, key=errors.__getitem__)
+        slope = math.log(other / near) / math.log(errors[other] / errors[near])
+        setting = near * (0.9 * scene.target / errors[near]) ** slope
+        if scene.programs[name].package != "scipy":
+            setting = math.ceil(setting)
+        runs[setting] = prepared(scene, name, scene.y0, setting)
+        errors[setting] = scene.error(runs[setting]())
+    # Of those that meet it the cheapest is the least exact.
+    met = {s: e for s, e in errors.items() if e <= scene.target}
+    return max(met, key=met.__getitem__)
+
+
+def measure(quick: bool) -> Iterator[results.Row]:
+    for label, make in SCENES.items():
+        scene = make()
+        runs, chosen = {}, {}
+        for name, program in scene.programs.items():
+            settings = program.settings[::2] if quick else program.settings
+            tried = {s: prepared(scene, name, scene.y0, s) for s in settings}
+            chosen[name] = to_target(scene, name, tried)
+            runs |= {(name, s): tried[s] for s in (*settings, chosen[name])}
+        yield from _rows(label, scene, runs, chosen, 1, quick)
+        if label == "spacecraft":
+            many = jax.tree.map(lambda y: jnp.broadcast_to(y, (BATCH, *y.shape)), scene.y0)
+            scene = scene._replace(repeats=1)
+            runs = {(name, s): prepared(scene, name, many, s) for name, s in chosen.items()}
+            yield from _rows(label, scene, runs, chosen, BATCH, quick)
+
+
+def _rows(
+    label: str,
+    scene: Scene,
+    runs: dict[tuple[str, float], Callable],
+    chosen: dict[str, float],
+    systems: int,
+    quick: bool,
+) -> Iterator[results.Row]:
+    """Each program at each setting; where it is the chosen one, over the fastest of cfjax."""
+    rounds, budget = (3, 5.0) if quick else (25, 40.0)
+    seconds = take_turns(list(runs.values()), repeats=rounds, budget=budget)
+    packages = {name: scene.programs[name].package for name in chosen}
+    spent = {
+        (name, setting): times / (1 if packages[name] == "scipy" else scene.repeats)
+        for (name, setting), times in zip(runs, seconds, strict=True)
+    }
+    ours = [spent[name, s] for name, s in chosen.items() if packages[name] == "cfjax"]
+    best = min(ours, key=np.median)
+    for (name, setting), run in runs.items():
+        y = run()
+        if systems > 1:
+            y = jax.tree.map(lambda x: x[0], y)
+        row = {
+            "scene": label,
+            "program": name,
+            "package": f"{packages[name]} {importlib.metadata.version(packages[name])}",
+            "systems": systems,
+            "tolerance" if packages[name] == "scipy" else "steps": setting,
+            "error": results.digits(scene.error(y)),
+            "seconds": results.spread(spent[name, setting] / systems),
+        }
+        if scene.distance is not None:
+            row["distance"] = results.digits(scene.distance(y))
+        if chosen[name] == setting:
+            row |= {"to": scene.target, "over cfjax": results.ratios(spent[name, setting], best)}
+        yield row
+
+
+# A colour for each package, a marker for each of its programs.
+COLORS = {
+    "cfjax": "#0072B2",
+    "diffrax": "#D55E00",
+    "jaxlie": "#009E73",
+    "exponax": "#E69F00",
+    "scipy": "#CC79A7",
+}
+MARKERS = "os^vDPX"
+
+
+def draw() -> dict[str, Figure]:
+    rows = results.pick(results.load("peers")["rows"], systems=1)
+    figure = _style.new_figure((11, 5.5))
+    panels = dict(zip(SCENES, figure.subplots(1, len(SCENES)), strict=True))
+    for package, color in COLORS.items():
+        own = [row for row in rows if row["package"].startswith(package)]
+        names = dict.fromkeys(row["program"] for row in own)
+        for name, marker in zip(names, MARKERS, strict=False):
+            for scene, axes in panels.items():
+                curve = results.pick(own, program=name, scene=scene)
+                curve = sorted(curve, key=lambda row: -row["error"])
+                # The fastest run, which other programs of the machine disturb least.
+                times = [row["seconds"][0] for row in curve]
+                # The first panel has them all in the legend, with or without a curve.
+                label = name if axes is figure.axes[0] else None
+                style = dict(color=color, marker=marker, markersize=4.5, linewidth=1)
+                axes.plot(times, [row["error"] for row in curve], label=label, **style)
+    for scene, axes in panels.items():
+        axes.set(title=scene, yscale="log")
+        _style.logarithmic(axes, "time", unit="s")
+    figure.axes[0].set(ylabel="error at the end")
+    _style.finish(figure, columns=4)
+    return {"peers": figure}
+
+
+if __name__ == "__main__":
+    results.run(__file__, __doc__, measure)
