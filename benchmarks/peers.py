@@ -237,15 +237,19 @@ def of_given_velocity() -> Scene:
     def field(t: Any, r: Any, args: Any) -> Any:
         return cfjax.RightMatrix(jnp.cross(jnp.eye(3), omega(t)))
 
-    def of_quaternion(t: Any, q: Any, args: Any) -> Any:
+    def quaternion_field(t: Any, q: Any, args: Any) -> Any:
         return cfjax.QuaternionRotation(omega(t), frame="body", order="wxyz")
 
-    def as_quaternion(solver: Any) -> Callable:
-        solve = equal_steps(of_quaternion, solver, t1)
+    def quaternion_velocity(t: Any, q: Any, args: Any) -> Any:
+        w = omega(t)
+        return jnp.append(-q[1:] @ w, q[0] * w + jnp.cross(q[1:], w)) / 2
 
+    def as_quaternion(solve: Callable) -> Callable:
         def solve_matrix(r: Any, num_steps: int) -> Any:
             q = solve(cfjax.quaternion_from_matrix(r, order="wxyz"), num_steps)
-            return cfjax.quaternion_to_matrix(q, order="wxyz")
+            # Its length is to be seen in the matrix, which is quadratic in it.
+            length = jnp.linalg.norm(q)
+            return length**2 * cfjax.quaternion_to_matrix(q / length, order="wxyz")
 
         return solve_matrix
 
@@ -264,8 +268,12 @@ def of_given_velocity() -> Scene:
     programs = {
         "CF4": Program("cfjax", equal_steps(field, cfjax.CF4(), t1), steps(25)),
         "Magnus6": Program("cfjax", equal_steps(field, cfjax.Magnus6(), t1), steps(12)),
-        "CF4, quaternion": Program("cfjax", as_quaternion(cfjax.CF4()), steps(25)),
-        "Magnus6, quaternion": Program("cfjax", as_quaternion(cfjax.Magnus6()), steps(12)),
+        "CF4, quaternion": Program(
+            "cfjax", as_quaternion(equal_steps(quaternion_field, cfjax.CF4(), t1)), steps(25)
+        ),
+        "Magnus6, quaternion": Program(
+            "cfjax", as_quaternion(equal_steps(quaternion_field, cfjax.Magnus6(), t1)), steps(12)
+        ),
         "CG4": Program("cfjax", equal_steps(field, cfjax.CG4(), t1), steps(25)),
         "diffrax, Tsit5": Program(
             "diffrax", in_plain_space(velocity, diffrax.Tsit5(), t1), steps(12)
@@ -275,6 +283,11 @@ def of_given_velocity() -> Scene:
         ),
         "diffrax, Dopri8": Program(
             "diffrax", in_plain_space(velocity, diffrax.Dopri8(), t1), steps(4)
+        ),
+        "diffrax, Dopri8, quaternion": Program(
+            "diffrax",
+            as_quaternion(in_plain_space(quaternion_velocity, diffrax.Dopri8(), t1)),
+            steps(4),
         ),
         "SciPy, DOP853": Program("scipy", on_host(with_numpy, "DOP853", t1), TOLERANCES),
     }
