@@ -65,7 +65,8 @@ def measure(quick: bool) -> Iterator[results.Row]:
         scene = make()
         runs, chosen = {}, {}
         for name, program in scene.programs.items():
-            settings = program.settings[::2] if quick else program.settings
+            settings = program.settings
+            settings = (settings[0], settings[-1]) if quick else settings
             tried = {s: prepared(scene, name, scene.y0, s) for s in settings}
             chosen[name] = to_target(scene, name, tried)
             runs |= {(name, s): tried[s] for s in (*settings, chosen[name])}
