@@ -18,7 +18,14 @@ HERE = Path(__file__).parent
 PAGES = sorted((HERE.parent / "docs").rglob("*.md"))
 MARKED = re.compile(r"(<!-- (table|number): ([\w-]+) -->)(.*?)(<!-- end -->)", flags=re.DOTALL)
 # Those that draw, and how fine.
-PICTURES = {"batch": 120, "chain": 120, "charts": 200, "stability": 100, "tolerances": 120}
+PICTURES = {
+    "batch": 120,
+    "chain": 120,
+    "charts": 200,
+    "peers": 120,
+    "stability": 100,
+    "tolerances": 120,
+}
 
 
 def main() -> None:
@@ -150,6 +157,30 @@ def tolerances() -> list[list[str]]:
 def richardson() -> str:
     rows = pick(load("tolerances")["rows"], method="Richardson(CF4)")
     return between(row["error"] / row["tolerance"] for row in rows if "flows" in row)
+
+
+@table
+def scenes() -> list[list[str]]:
+    rows = load("scenes")["rows"]
+    table = [
+        ["", "method", "error over tolerance", "steps over Tsit5's", "time over Tsit5's, at 1e-6"]
+    ]
+    for scene in values(rows, "scene"):
+        found = pick(rows, scene=scene)
+        same = [row for row in found if "Tsit5's steps" in row]
+        (timed,) = (
+            row["over Tsit5"] for row in same if "over Tsit5" in row and row["tolerance"] == 1e-6
+        )
+        table.append(
+            [
+                scene,
+                code(f"`{found[0]['method']}`".replace("`", "")),
+                between(row["error"] / row["tolerance"] for row in found),
+                between(row["steps"] / row["Tsit5's steps"] for row in same),
+                cell(timed),
+            ]
+        )
+    return table
 
 
 @table
@@ -371,6 +402,24 @@ def quantum() -> list[list[str]]:
     return table
 
 
+def _peers(scene: str) -> list[list[str]]:
+    rows = [row for row in pick(load("peers")["rows"], scene=scene) if "to" in row]
+    counts = values(rows, "systems")
+    has_group = "distance" in rows[0]
+    over = (f"over the fastest of cfjax, {systems(count)}" for count in counts)
+    head = ["", "steps or tolerance", "error", *["off the group"] * has_group, "time", *over]
+    table = [head]
+    for program in values(rows, "program"):
+        row, *others = pick(rows, program=program)
+        cells = [power(row["tolerance"]) if "tolerance" in row else two_digits(row["steps"])]
+        cells.append(power(row["error"]))
+        if has_group:
+            cells.append(power(row["distance"]) if row["distance"] else "0")
+        cells.append(in_units(row["seconds"][2]))
+        table.append([code(program), *cells, *(cell(r["over cfjax"]) for r in (row, *others))])
+    return table
+
+
 @table
 def quantum_methods() -> list[list[str]]:
     cases = _quantum()
@@ -399,6 +448,26 @@ def quantum_others() -> str:
 def quantum_norm() -> str:
     rows = [row for rows in _quantum().values() for row in rows]
     return two_digits(max(row["off norm"] for row in rows if row["method"].startswith("cfjax")))
+
+
+@table
+def peers_spacecraft() -> list[list[str]]:
+    return _peers("spacecraft")
+
+
+@table
+def peers_rotation() -> list[list[str]]:
+    return _peers("given angular velocity")
+
+
+@table
+def peers_kuramoto() -> list[list[str]]:
+    return _peers("Kuramoto-Sivashinsky")
+
+
+@number
+def peers_versions() -> str:
+    return ", ".join(sorted(values(load("peers")["rows"], "package")))
 
 
 def _seconds_of(derivative: str) -> str:
