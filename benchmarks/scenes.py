@@ -60,7 +60,7 @@ def scenes() -> dict[str, Scene]:
             attitude, spacecraft.problem(), lambda: spacecraft.reference(spacecraft.t1)
         ),
         "heavy top": Scene(
-            attitude,
+            pose,
             tilted | {"t1": 0.2},
             lambda: heavy_top.reference(0.2),
             1e-12,
