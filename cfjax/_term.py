@@ -94,7 +94,8 @@ def _checked(field: PyTree, y: PyTree) -> PyTree:
     except ValueError as error:
         raise ValueError(
             "The field of a LieTerm must return a pytree whose structure is a prefix of the "
-            f"state's. Got {eqx.tree_pformat(field)} for the state {describe(y)}: {error}"
+            f"state's. Got {eqx.tree_pformat(field)} for the state {describe(y)}: {error} Return "
+            "one field for each part of the state; plain numbers take their velocity as an array."
         ) from error
     return treedef.unflatten(
         checked_part("y" + jtu.keystr(path), part, point)

@@ -78,11 +78,13 @@ def map_batch(
       and without it there is none.
 
     **Raises** `TypeError` or `ValueError` for members that are no arrays or differ in length, for
-    an empty batch, for `chunk_size < 1`, and for a `folder` with a `solve` that calls a function of
-    the host, as `jax.pure_callback` and progress meters do; `OSError` if the folder cannot be made
-    or written to.
+    an empty batch, for `chunk_size < 1`, for a `mesh` that is none, and for a `folder` with a
+    `solve` that calls a function of the host, as `jax.pure_callback` and progress meters do;
+    `OSError` if the folder cannot be made or written to.
     """
     size = _batch_size(members)
+    if not isinstance(mesh, Mesh | None):
+        raise TypeError(f"mesh must be a jax.sharding.Mesh, got {mesh!r}.")
     devices = 1 if mesh is None else mesh.size
     chunk_size = -(-min(count("chunk_size", chunk_size), size) // devices) * devices
     program = _Program(solve, members, chunk_size, mesh)

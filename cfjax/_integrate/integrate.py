@@ -10,6 +10,7 @@ import jax.numpy as jnp
 import jax.tree_util as jtu
 import numpy as np
 from jax import lax
+from jax.core import Tracer
 from jaxtyping import Array, Bool, Int, PyTree, Real
 
 from .._solvers.base import AbstractLieSolver, State
@@ -249,6 +250,11 @@ def _has_numbers(dtype: Any) -> bool:
 
 
 def count(name: str, value: Any) -> int:
+    if isinstance(value, Tracer):
+        raise TypeError(
+            f"{name} must be known when the program is traced, got {value!r}. Close over it, or "
+            f'write jax.jit(..., static_argnames="{name}").'
+        )
     if isinstance(value, bool) or not isinstance(value, int | np.integer) or value < 1:
         raise ValueError(f"{name} must be an integer of at least 1, got {value!r}.")
     return int(value)

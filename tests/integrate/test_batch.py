@@ -737,6 +737,11 @@ def test_wrong_chunk_size(chunk_size, no_shape_hook):
         cfjax.map_batch(solve, members(), chunk_size=chunk_size)
 
 
+def test_wrong_mesh(no_shape_hook):
+    with pytest.raises(TypeError, match=r"mesh must be a jax\.sharding\.Mesh, got 4\."):
+        cfjax.map_batch(solve, members(), mesh=4)
+
+
 def test_a_chunk_size_of_numpy(no_shape_hook):
     values, _ = cfjax.map_batch(lambda x: 2 * x, np.arange(3), chunk_size=np.int64(2))
     np.testing.assert_array_equal(values, [0, 2, 4])

@@ -443,6 +443,15 @@ def test_a_mistaken_number_of_steps(num_steps):
         cfjax.integrate(TERM, cfjax.CF4(), 0.0, 1.0, Y0, ARGS, num_steps=num_steps)
 
 
+def test_a_number_of_steps_that_is_traced(no_shape_hook):
+    def last(n):
+        return cfjax.integrate(TERM, cfjax.CF4(), 0.0, 1.0, Y0, ARGS, num_steps=n).ys[-1]
+
+    with pytest.raises(TypeError, match="num_steps must be known when the program is traced"):
+        jax.jit(last)(3)
+    assert jax.jit(last, static_argnums=0)(3).shape == Y0.shape
+
+
 TIMES = [None, "1", True, 1j, np.ones(1), jnp.arange(3.0), jnp.asarray(1 + 0j)]
 
 
