@@ -174,7 +174,7 @@ def scenes() -> list[list[str]]:
         table.append(
             [
                 scene,
-                code(f"`{found[0]['method']}`".replace("`", "")),
+                code(found[0]["method"]),
                 between(row["error"] / row["tolerance"] for row in found),
                 between(row["steps"] / row["Tsit5's steps"] for row in same),
                 cell(timed),

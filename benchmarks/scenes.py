@@ -86,7 +86,7 @@ def scenes() -> dict[str, Scene]:
         "Stiefel, second": Scene(
             cfjax.CF54(), stiefel.problem("second"), lambda: stiefel.reference("second", 100)
         ),
-        "Toda": Scene(cfjax.CF54(), toda.problem(), lambda: toda.reference(toda.t1), 1e-13),
+        "Toda": Scene(cfjax.CF54(), toda.problem(), lambda: toda.reference(toda.t1)),
         "Zeitlin": Scene(
             cfjax.CF54(),
             fluid,

@@ -38,13 +38,6 @@ class Defect(NamedTuple):
 DEFECTS = [
     # Methods: coefficients and what is made of them.
     Defect(
-        "_solvers/base.py",
-        "error = once(made.error, in_batches=True)",
-        "error = made.error",
-        "an error that XLA computes together with its norm",
-        "xla/test_held.py -k error_of_a_step",
-    ),
-    Defect(
         "_methods/tableau.py",
         "[[_half], [-_half, 0, 1]]]",
         "[[_half], [-_third, 0, Fraction(5, 6)]]]",
@@ -560,6 +553,13 @@ DEFECTS = [
         "scenes/test_wilson_flow.py",
     ),
     # Programs for XLA.
+    Defect(
+        "_solvers/base.py",
+        "error = once(made.error, in_batches=True)",
+        "error = made.error",
+        "an error that XLA computes together with its norm",
+        "xla/test_held.py -k error_of_a_step",
+    ),
     Defect(
         "_xla/operation.py",
         "np.asarray(v.val).tobytes()",

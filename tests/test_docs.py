@@ -1,4 +1,4 @@
-"""The site: its code runs when pasted, and it names everything public."""
+"""The site: its code runs when pasted, it names everything public, and its numbers are measured."""
 
 import ast
 import json

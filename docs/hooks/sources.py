@@ -23,7 +23,7 @@ NOTEBOOKS = sorted((ROOT / "notebooks").glob("*.ipynb"))
 def on_config(config):
     titles = [{title(path): f"notebooks/{path.stem}.md"} for path in NOTEBOOKS]
     (gallery,) = (entry["Gallery"] for entry in config.nav if "Gallery" in entry)
-    gallery.extend(title for title in titles if title not in gallery)
+    gallery.extend(entry for entry in titles if entry not in gallery)
     return config
 
 
