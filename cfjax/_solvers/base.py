@@ -15,7 +15,7 @@ from jaxtyping import Array, Inexact, PyTree, Real
 
 from .._field import Incremented, flow, is_field, is_incremented, value
 from .._term import product
-from .._xla import by_components, once, once_for_sums, once_in_rows
+from .._xla import by_components, is_rewritten, once_in_rows, once_together
 from .dense import Interpolation, Path
 from .failure import result_of
 
@@ -48,6 +48,9 @@ class AbstractLieSolver(diffrax.AbstractSolver):
     term_structure: ClassVar = diffrax.AbstractTerm
     # What diffrax asks a solver for first.
     term_compatible_contr_kwargs = _OfInstances(lambda self: {})
+
+    # Whether it evaluates the field at points of the step.
+    is_of_state: ClassVar[bool] = True
 
     interpolation_cls: ClassVar[Callable[..., diffrax.AbstractLocalInterpolation]] = Interpolation
 
@@ -123,11 +126,16 @@ class AbstractLieSolver(diffrax.AbstractSolver):
                 lambda lost, y: y if lost is None else _at_rest(y), lost, y0, is_leaf=_is_leaf
             )
             made = self.move(field, start)
-            end = _shared(lost, made.end)
-            # Its norm is two sums if the state has two parts. In one function with both, XLA would
-            # compute what they share many times over.
-            error = once(made.error, in_batches=True)
-            return (end, None if first is None else values[-1]), (error, made.path)
+            end, error = _shared(lost, made.end, made.error, is_followed=first is not None)
+            if first is None:
+                last = None
+            elif is_rewritten() and self.is_of_state:
+                # From the end alone: it is one evaluation more, where XLA would else compute the
+                # step for each of its entries.
+                last = evaluate(1.0, end)
+            else:
+                last = values[-1]
+            return (end, last), (error, made.path)
 
         (end, last), (error, path) = by_components(move, y0)
         path = self.extended(path, lambda c, y: product(terms, evaluate(c, y), terms.contr(t0, t1)))
@@ -242,17 +250,24 @@ class _Sum(eqx.Module):
         return total, _Sum(lax.stop_gradient(b - (total - a)))
 
 
-def _shared(lost: PyTree, end: PyTree) -> PyTree:
-    """The end of a step. A compensated sum uses each increment several times."""
+def _shared(lost: PyTree, end: PyTree, error: PyTree, is_followed: bool) -> tuple[PyTree, PyTree]:
+    """The end of a step and its error, which XLA would else compute for each use of an entry.
+
+    A compensated sum uses each increment several times, and so does what follows from the end.
+    """
     leaves, structure = jtu.tree_flatten(lost, is_leaf=_is_leaf)
     ends = structure.flatten_up_to(end)
-    increments = once_for_sums(
-        [p.increment if isinstance(x, _Sum) else None for x, p in zip(leaves, ends, strict=True)]
-    )
-    return structure.unflatten(
-        p if increment is None else Incremented(p.start, increment)
-        for p, increment in zip(ends, increments, strict=True)
-    )
+    is_used = is_followed or error is not None
+    moving = [
+        p.increment if isinstance(x, _Sum) else (p if is_used else None)
+        for x, p in zip(leaves, ends, strict=True)
+    ]
+    moving, error = once_together((moving, error), alone=is_used)
+    ends = [
+        Incremented(p.start, new) if isinstance(x, _Sum) else (p if new is None else new)
+        for x, p, new in zip(leaves, ends, moving, strict=True)
+    ]
+    return structure.unflatten(ends), error
 
 
 def _is_leaf(x: Any) -> bool:

@@ -26,7 +26,7 @@ from .._methods import tableau as _tableau
 from .._methods.continuous_extension import continuous_extension
 from .._methods.order_conditions import order
 from .._methods.tableau import Product, Row, Tableau
-from .._xla import once
+from .._xla import cut
 from .base import AbstractLieSolver, Move
 from .dense import Path
 from .stages import FieldVaries, Flow, can_loop, run
@@ -41,9 +41,8 @@ class AbstractCommutatorFree(AbstractLieSolver):
     costs no flow. That is blind, whatever the commutators do, where these cancel: for fields that
     do not depend on the state and are linear in time, as in the Landau-Zener problem.
 
-    Under a controller of constant steps the estimate costs nothing, with one exception: a method
-    that is first same as last carries the last field to the next step, for which a batch of small
-    systems takes twice as long on CPU. `estimate=None` switches it off. (`cfjax.integrate` does.)
+    Under a controller of constant steps nobody needs it, but small systems take up to twice as long
+    with it on CPU. `estimate=None` switches it off. (`cfjax.integrate` does.)
 
     A class whose tableau has an embedded method is a `diffrax.AbstractAdaptiveSolver`.
 
@@ -121,8 +120,8 @@ class AbstractCommutatorFree(AbstractLieSolver):
             for c, rows in zip(times[1:], stages[1:-1], strict=True):
                 evaluate(c, rows)
         if self.first_same_as_last:
-            # Two results of the step, the state and the last field, need its end.
-            points[stages[-1]] = once(point(stages[-1]))
+            # The end, the last field and the error are made of it.
+            points[stages[-1]] = cut(point(stages[-1]))
         end = leave(fields[0], point(stages[-1]))
         # All that follows is for error control and output within the step. It is dead code, left
         # out by the compiler, where nobody asks for them.

@@ -37,6 +37,7 @@ class AbstractMagnus(AbstractLieSolver):
     it is frozen there as `cfjax.LowRankSkew` is; `ValueError` for another `estimate`.
     """
 
+    is_of_state: ClassVar[bool] = False
     tableau: eqx.AbstractVar[MagnusTableau]
     estimate: Literal["group"] | None = eqx.field(static=True, default="group", kw_only=True)
 

@@ -29,11 +29,14 @@ from .._field import value as value_of
 from .._methods.continuous_extension import runge_kutta_extension
 from .._methods.order_conditions import runge_kutta_order
 from .._methods.tableau import ContinuousExtension, Row
-from .._xla import once
+from .._xla import are_long, is_rewritten
 from .base import AbstractLieSolver, Move
 from .commutator_free import minus
 from .dense import Path
 from .stages import FieldVaries, can_loop, elements
+
+# Of fewer stages none are too long together to be rewritten for XLA.
+_MANY = 8
 
 # `f(c, point)` is `h f(t + c h, point)` for a point of the step, in the coordinates of the step.
 _FieldAt = Callable[[Any, PyTree], PyTree]
@@ -84,9 +87,6 @@ class AbstractMuntheKaas(AbstractLieSolver):
     def move(self, field, y0):
         v, elements, start, field_at = self.logarithm(field, y0)
         end = flow(v, start)
-        if self.first_same_as_last:
-            # Two results of the step, the state and the last field, need its end.
-            end = once(end)
         left, error = leave(v, end), None
         # All that follows is for error control and output within the step. It is dead code, left
         # out by the compiler, where nobody asks for them.
@@ -304,7 +304,10 @@ class RKMK(AbstractMuntheKaas, diffrax.AbstractAdaptiveSolver):
         def element(c: Any, u: PyTree) -> PyTree:
             return dexpinv(u, field(c, u), self._degree)
 
-        if len(rows) > 1 and all(map(any, rows)) and can_loop(known[0], known[0]):
+        # Before all of them are traced, only to find that they are too long together.
+        one = functools.partial(element, times[0])
+        is_long = len(rows) > _MANY and is_rewritten() and are_long(one, known[0], len(rows))
+        if len(rows) > 1 and all(map(any, rows)) and can_loop(known[0], known[0], is_long):
             with contextlib.suppress(FieldVaries):
                 return elements(known, rows, times, element)
         stages = list(known)

@@ -12,7 +12,7 @@ from jaxtyping import Array, PyTree, Real
 
 from .._field import AbstractFrozenField, Incremented, flow, is_field, is_incremented
 from .._fields.elementwise import Elementwise
-from .._xla import is_rewritten, pack
+from .._xla import is_rewritten, pack, table
 
 # A loop copies the fields of all stages in each of its turns. For a dense matrix of more entries
 # that moves a vector, this takes longer than the flow.
@@ -47,16 +47,16 @@ class FieldVaries(Exception):
     """The field has not one structure, shape and dtype at all stages."""
 
 
-def can_loop(field: PyTree, point: PyTree) -> bool:
+def can_loop(field: PyTree, point: PyTree, is_long: bool = False) -> bool:
     """Whether a loop over the stages pays: where there are flows, written for one point as for all.
 
-    A step that is rewritten for XLA is faster written out. So are fields that combine in a way of
-    their own or work in coordinates of the step, whose arrays grow from stage to stage, and fields
-    of far more numbers than the point has.
+    A step that is rewritten for XLA is faster written out, if it is not too long for that. So are
+    fields that combine in a way of their own or work in coordinates of the step, whose arrays grow
+    from stage to stage, and fields of far more numbers than the point has.
     """
     parts = jtu.tree_leaves(field, is_leaf=is_field)
     return (
-        not is_rewritten()
+        (is_long or not is_rewritten())
         and not _is_written_out.get()
         and any(map(is_field, parts))
         and _size(field) <= max(_SMALL, 4 * _size(point))
@@ -95,13 +95,19 @@ def elements(
     **Raises** `FieldVaries` as `run`.
     """
     first, n = known[0], len(known) + len(rows)
+    weights = _padded(rows, n)
+    made = table(
+        lambda c, along: _like(first, element(c, along)), known, weights, jnp.asarray(times)
+    )
+    if made is not None:
+        return made
 
     def body(stages: PyTree, x: Any) -> Any:
         k, row, c = x
         along = jtu.tree_map(lambda f: _combination(row, f), stages)
         return _put(stages, k, _like(first, element(c, along))), None
 
-    xs = jnp.arange(len(known), n), _padded(rows, n), jnp.asarray(times)
+    xs = jnp.arange(len(known), n), weights, jnp.asarray(times)
     start = _stack(first, n)
     for k, stage in enumerate(known[1:], 1):
         start = _put(start, k, _like(first, stage))

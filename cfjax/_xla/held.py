@@ -16,42 +16,49 @@ from jaxtyping import Array, PyTree
 from .pack import pack, unpack
 from .scope import MAX_SIZE, has_rows, is_short, where
 
-# In a batch, what makes more entries at once is not vectorised any more.
-_MAX_TOGETHER = 12
+# XLA takes what more entries are made of apart, and computes all that leads there for each of them.
+_MAX_TOGETHER = 15
 
 
 def held(
-    entries: Sequence[Array], *, in_batches: bool = False, alone: bool = True, now: bool = True
+    entries: Sequence[Array],
+    *,
+    in_batches: bool = False,
+    alone: bool = True,
+    now: bool = True,
+    is_cut: bool = False,
 ) -> list[Array]:
     """The same arrays, through memory.
 
     Else XLA may compute them anew for everything that uses them. In a batch, where memory is what
     takes time, only if asked for, on CPU; outside of batches only if `alone`; and if not `now`,
-    only where this is differentiated.
+    only where this is differentiated; and if `is_cut`, only in a program that is long.
     """
-    return held_p.bind(*entries, in_batches=in_batches, alone=alone, now=now)
+    return held_p.bind(*entries, in_batches=in_batches, alone=alone, now=now, is_cut=is_cut)
 
 
-def once(tree: PyTree, in_batches: bool = False) -> PyTree:
-    """The same; the entries of short vectors are computed once for all that uses them."""
-    # One by one: what nobody uses is not computed.
-    return jtu.tree_map(functools.partial(_once, in_batches=in_batches), tree)
+def cut(tree: PyTree) -> PyTree:
+    """The same, through memory where a step is too long for one of XLA's functions.
+
+    That has some 2000 operations. What needs several entries of the function before calls it for
+    each, and so on to the start: values never as measured took 20 ms a step.
+    """
+    return _once(tree, in_batches=True, is_cut=True)
 
 
-def once_for_sums(tree: PyTree) -> PyTree:
+def once_together(tree: PyTree, alone: bool) -> PyTree:
     """The same arrays, all of which are used several times in what follows.
 
-    Else each use would compute the step of a batch anew. Alone it is fast in our own loop, but
-    makes diffrax's too large to be one function. They go together, as what one is made of others
-    may be made of too.
+    Else each use would compute the step anew: in a batch, in our own loop, and if `alone` also
+    outside of these. They go together, as what one is made of others may be made of too.
     """
     leaves, structure = jtu.tree_flatten(tree)
     groups: list[list[Array]] = [[]]
     for x in leaves:
-        if sum(map(np.size, (*groups[-1], x))) > _MAX_TOGETHER:
+        if groups[-1] and sum(map(np.size, (*groups[-1], x))) > _MAX_TOGETHER:
             groups.append([])
         groups[-1].append(x)
-    alone = where() == "loop"
+    alone = alone or where() == "loop"
     return structure.unflatten(
         x for group in groups for x in _once(group, in_batches=True, alone=alone)
     )
@@ -88,7 +95,7 @@ held_p.multiple_results = True
 
 
 @held_p.def_impl
-def _held_impl(*entries, in_batches, alone, now, has_calls=False):
+def _held_impl(*entries, in_batches, alone, now, is_cut, has_calls=False):
     outs = list(entries)
     if not now:
         return outs
@@ -101,8 +108,11 @@ def _held_impl(*entries, in_batches, alone, now, has_calls=False):
         is_batch = in_batches and shape != ()
         if has_calls if is_batch else alone:
             through = _by_call if is_batch else _by_reduction
-            for k, x in zip(places, through([entries[k] for k in places]), strict=True):
-                outs[k] = x
+            most = len(places) if is_batch else _MAX_TOGETHER
+            for start in range(0, len(places), most):
+                some = places[start : start + most]
+                for k, x in zip(some, through([entries[k] for k in some]), strict=True):
+                    outs[k] = x
     return outs
 
 

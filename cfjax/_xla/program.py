@@ -57,7 +57,11 @@ from .scope import (
 # with it, and more so in derivatives. `README.md` here has what that buys and costs. What a loop
 # carries may have what sums have lost of each entry too, the number of the step and a result.
 _MAX_ENTRIES: dict[Place, int] = {"step": 16, "loop": 34}
-_MAX_OPERATIONS = 3000
+_MAX_OPERATIONS = 4000
+# One that is longer is more than one of XLA's functions, and is cut.
+_SHORT = 2000
+# About as many combine the stages of a long method.
+_COMBINATIONS = 1000
 
 _CALLS = frozenset(("jit", "pjit"))
 _CONTROL = frozenset(("cond", "scan", "while"))
@@ -111,6 +115,12 @@ def by_components(fun: Callable[[PyTree], PyTree], y: PyTree) -> PyTree:
     return jtu.tree_map(lambda x: _whole(_held(x)), out, is_leaf=_is_apart)
 
 
+def are_long(fun: Callable[[PyTree], PyTree], y: PyTree, times: int) -> bool:
+    """Whether so many of `fun(y)`, and what combines them, are too long to be taken apart."""
+    code = without_dead_code(jax.make_jaxpr(fun)(y).jaxpr)
+    return times * _operations(code) > _MAX_OPERATIONS - _COMBINATIONS
+
+
 class Program(NamedTuple):
     """A function that can be taken apart, and what it closes over.
 
@@ -138,7 +148,10 @@ def trace(fun: Callable[[PyTree], PyTree], y: PyTree, place: Place) -> Program |
     consts = [_constant(x) for x in jaxpr.consts]
     try:
         code = without_dead_code(jaxpr.jaxpr)
-        if jaxpr.effects or not _is_readable(code) or _operations(code) > _MAX_OPERATIONS:
+        if jaxpr.effects or not _is_readable(code):
+            return None
+        num_operations = _operations(code)
+        if num_operations > _MAX_OPERATIONS:
             return None
     except Exception as error:
         return unread(error)
@@ -149,7 +162,7 @@ def trace(fun: Callable[[PyTree], PyTree], y: PyTree, place: Place) -> Program |
         moving = jtu.tree_leaves(y, is_leaf=_is_apart)
         fixed = [True] * len(values) + [False] * len(moving)
         try:
-            outs, _ = _evaluate(code, (*values, *moving), fixed, rows)
+            outs, _ = _evaluate(code, (*values, *moving), fixed, rows, num_operations > _SHORT)
         except Exception as error:
             unread(error)
             outs = jaxpr_as_fun(ClosedJaxpr(code, list(map(_whole, values))))(*map(_whole, moving))
@@ -234,7 +247,7 @@ def _entries(shape: tuple[int, ...]) -> int:
 
 
 def _evaluate(
-    jaxpr: Jaxpr, values: Sequence[Any], fixed: Sequence[bool], rows: bool
+    jaxpr: Jaxpr, values: Sequence[Any], fixed: Sequence[bool], rows: bool, is_long: bool
 ) -> tuple[list[Any], list[bool]]:
     """What a program makes of values for its constants and arguments, some of which are fixed.
 
@@ -262,10 +275,10 @@ def _evaluate(
             inner = eqn.params["jaxpr"]
             constants = [True] * len(inner.consts)
             outs, outs_fixed = _evaluate(
-                inner.jaxpr, (*inner.consts, *values), (*constants, *fixed), rows
+                inner.jaxpr, (*inner.consts, *values), (*constants, *fixed), rows, is_long
             )
         else:
-            outs = _apart(jaxpr, eqn, values, fixed, rows)
+            outs = _apart(jaxpr, eqn, values, fixed, rows, is_long)
             if outs is None:
                 outs = map(split, evaluate(jaxpr, eqn, list(map(_whole, values))))
         env.update(zip(eqn.outvars, outs, strict=True))
@@ -274,10 +287,12 @@ def _evaluate(
 
 
 def _apart(
-    jaxpr: Jaxpr, eqn: JaxprEqn, values: list[Any], fixed: Sequence[bool], rows: bool
+    jaxpr: Jaxpr, eqn: JaxprEqn, values: list[Any], fixed: Sequence[bool], rows: bool, is_long: bool
 ) -> Sequence[Any] | None:
     """The results of one operation, taken apart, if there is a rule for it, else None."""
     if eqn.primitive is held_p:
+        if eqn.params["is_cut"] and not is_long:
+            return values
         # What is whole is in memory anyway.
         groups = [jtu.tree_flatten(x) for x in values]
         new = iter(held([x for group, _ in groups for x in group], **eqn.params))

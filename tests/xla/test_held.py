@@ -11,7 +11,7 @@ import pytest
 import cfjax
 from cfjax._xla.held import held
 from cfjax._xla.pack import pack, unpack
-from cfjax.scenes import spacecraft
+from cfjax.scenes import rigid_body, spacecraft
 
 
 def test_what_is_held_is_computed_once():
@@ -51,20 +51,39 @@ def test_increments_of_a_step_are_computed_together(rewritten):
 def test_the_error_of_a_step_goes_through_memory_before_its_norm(rewritten):
     """In one function with two sums XLA makes of what they share a tree of calls, which takes a
     hundred times as long as the step."""
-    given = spacecraft.problem()
+    functions = _functions(spacecraft, cfjax.CF4())
+    # A step is more than 500 operations, a norm some tens.
+    assert max(functions) > (500, 0)
+    assert all(size < 200 for size, sums in functions if sums > 1)
+
+
+def test_a_step_is_computed_once_for_its_end_its_error_and_the_next(rewritten):
+    """It was four times: for each entry of the end and for the error."""
+    functions = _functions(rigid_body, cfjax.RKMK(diffrax.Tsit5.tableau))
+    assert len([size for size, _ in functions if size > 500]) == 1
+
+
+def test_a_long_step_is_cut(rewritten):
+    """One function of its end and its error would be 4800 operations, and take 20 ms."""
+    sizes = sorted(size for size, _ in _functions(spacecraft, cfjax.CF54()))
+    # Its end, and its error with the end known.
+    assert sizes[-2] > 1000
+    assert sizes[-1] < 4000
+
+
+def _functions(scene, solver):
+    """Of XLA's program for controlled steps, how long each function is and how many sums it has."""
+    given = scene.problem()
 
     def solve(y0, args):
         controller = diffrax.PIDController(rtol=0.0, atol=1e-6)
         return diffrax.diffeqsolve(
-            given["term"], cfjax.CF4(), 0.0, 1.0, 0.1, y0, args, stepsize_controller=controller
+            given["term"], solver, 0.0, 1.0, 0.1, y0, args, stepsize_controller=controller
         ).ys
 
     program = jax.jit(solve).lower(given["y0"], given["args"]).compile().as_text()
     functions = re.findall(r"^%fused_computation[^\n]*\n(?:  .*\n)*", program, flags=re.MULTILINE)
-    sizes = [(text.count("\n"), text.count(" reduce(")) for text in functions]
-    # A step is more than 500 operations, a norm some tens.
-    assert max(sizes) > (500, 0)
-    assert all(size < 200 for size, sums in sizes if sums > 1)
+    return [(text.count("\n"), text.count(" reduce(")) for text in functions]
 
 
 @pytest.mark.parametrize("in_batches", [False, True])
