@@ -35,7 +35,7 @@ from cfjax.scenes import (
 
 TOLERANCES = (1e-4, 1e-6, 1e-8, 1e-11)
 # At these tolerances times are taken as well.
-TIMED = (1e-6, 1e-8)
+TIMED = (1e-6, 1e-8, 1e-11)
 
 
 class Scene(NamedTuple):
@@ -49,18 +49,17 @@ class Scene(NamedTuple):
 
 def scenes() -> dict[str, Scene]:
     attitude = cfjax.RKMK(diffrax.Dopri8.tableau)
-    pose = cfjax.RKMK(diffrax.Tsit5.tableau)
     track, turning, flowing = covariance.problem(), spins.problem(), wilson_flow.problem()
     rod, fluid, tilted = heat.problem(), zeitlin.problem(), heavy_top.problem()
     return {
         "rigid body": Scene(
-            cfjax.CF54(), rigid_body.problem() | {"t1": 10.0}, lambda: rigid_body.reference(10.0)
+            attitude, rigid_body.problem() | {"t1": 10.0}, lambda: rigid_body.reference(10.0)
         ),
         "spacecraft": Scene(
             attitude, spacecraft.problem(), lambda: spacecraft.reference(spacecraft.t1)
         ),
         "heavy top": Scene(
-            pose,
+            attitude,
             tilted | {"t1": 0.2},
             lambda: heavy_top.reference(0.2),
             1e-12,

@@ -28,7 +28,7 @@ class AbstractMagnus(AbstractLieSolver):
     For `y' = A(t) y`, and any other field whose coordinates depend on time alone.
 
     Where the method has an embedded one, the end of that is compared with the step's: the error
-    estimate is `y1 - embedded`. Under a controller of constant steps it costs nothing.
+    estimate is `y1 - embedded`. Under a controller of constant steps nobody needs it:
     `estimate=None` switches it off. (`cfjax.integrate` does.)
 
     Where the nodes have both ends of the step, its last evaluation is the first one of the next.
