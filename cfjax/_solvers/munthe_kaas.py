@@ -35,7 +35,7 @@ from .commutator_free import minus
 from .dense import Path
 from .stages import FieldVaries, can_loop, elements
 
-# Of fewer stages none are too long together to be rewritten for XLA.
+# Fewer stages are mostly short enough to be rewritten for XLA; to look costs a trace of one more.
 _MANY = 8
 
 # `f(c, point)` is `h f(t + c h, point)` for a point of the step, in the coordinates of the step.

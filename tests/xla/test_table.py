@@ -45,6 +45,7 @@ def test_values_and_gradients_are_those_of_the_program_as_it_is(rewritten, scene
 
 
 def test_a_batch_is_each_of_its_solves(rewritten):
+    """Up to rounding, of which there are thousands."""
     loss, y0, args = _loss(spacecraft, 4)
     starts = jax.tree.map(lambda y: jnp.stack([y, -y]), y0)
     found = jax.jit(jax.vmap(loss, in_axes=(0, None)))(starts, args)
