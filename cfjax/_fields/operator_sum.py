@@ -2,6 +2,7 @@
 
 from collections.abc import Callable, Sequence
 from functools import partial
+from hashlib import sha256
 from typing import Any
 
 import equinox as eqx
@@ -18,6 +19,7 @@ from .._field import AbstractFrozenField, Weight, combine, describe, struct
 from .._numerics.expm_multiply import expm_minus_one_multiply, row_norm
 from .._numerics.matmul import by_columns, matmul, promoted
 from .._numerics.transforms import DTYPES
+from .matrix import LeftMatrix, exp_minus_one_times, exp_times
 
 # What a declared norm may be too small by, and a linear function off by: half of the digits.
 _SLACK = 1e-3
@@ -103,12 +105,27 @@ class OperatorSum(AbstractFrozenField):
             )
 
     def flow(self, point: Inexact[Array, "n *k"]) -> Inexact[Array, "n *k"]:
-        return point + self.increment(point)
+        return self._moved(point, exp_times, lambda added: point + added)
 
     def increment(self, point: Inexact[Array, "n *k"]) -> Inexact[Array, "n *k"]:
+        return self._moved(point, exp_minus_one_times, lambda added: added)
+
+    def _moved(
+        self, point: Array, of_matrix: Callable[..., Array], of_added: Callable[[Array], Array]
+    ) -> Array:
         self._check(point)
-        product, bound = self._summed()
-        return expm_minus_one_multiply(product, point, bound, is_skew=self.is_skew)
+        matrix, diagonal, others, bound = self._summed()
+        if matrix is not None and not others:
+            a = matrix if diagonal is None else jnp.add(*promoted(matrix, jnp.diag(diagonal)))
+            return of_matrix(LeftMatrix, a, point, bound, self.is_skew or None)
+        products = [] if matrix is None else [by_columns(matrix)]
+        products += [] if diagonal is None else [partial(_apply, diagonal)]
+
+        def product(x: Array) -> Array:
+            terms = [times(x) for times in products]
+            return _sum(terms + [_times(c, _apply(a, x)) for c, a in others])
+
+        return of_added(expm_minus_one_multiply(product, point, bound, is_skew=self.is_skew))
 
     def tangent(self, point: Inexact[Array, "n *k"]) -> Inexact[Array, "n *k"]:
         self._check(point)
@@ -123,27 +140,31 @@ class OperatorSum(AbstractFrozenField):
         coefficients = combine(weights, _of_the_same_operators(fields))
         return eqx.tree_at(lambda field: field.coefficients, fields[0], coefficients)
 
-    def _summed(self) -> tuple[Callable[[Array], Array], Real[Array, ""]]:
-        """The product with the sum of all operators, and a bound on its norm."""
-        arrays: dict[int, list[Array]] = {1: [], 2: []}
-        others = []
+    def _summed(self) -> tuple[Any, Any, list[tuple[Array, Any]], Real[Array, ""]]:
+        """The sums of all matrices and of all diagonals, what else there is with its coefficients,
+        and a bound on the norm of everything.
+        """
+        arrays: dict[int, list[tuple[Array, Any]]] = {1: [], 2: []}
+        others, bounds = [], []
         for c, a, norm in zip(self.coefficients, self.operators, self.norms, strict=True):
+            size = None if norm is None else jnp.abs(lax.stop_gradient(c)) * norm
             entries = _entries(a)
-            if norm is not None or entries is None:
-                others.append((c, a, norm))
+            if entries is None:
+                others.append((c, a))
+                bounds.append(size)
             else:
-                arrays[entries.ndim].append(_times(c, jnp.asarray(entries)))
-        # With the norm of the sum, which may be far below the sum of the norms.
-        summed = [_sum(found) for found in arrays.values() if found]
-        bounds = [row_norm(lax.stop_gradient(a)) for a in summed]
-        bounds += [jnp.abs(c) * norm for c, _, norm in others]
-        products = [by_columns(a) if a.ndim == 2 else partial(_apply, a) for a in summed]
-
-        def product(x: Array) -> Array:
-            terms = [times(x) for times in products]
-            return _sum(terms + [_times(c, _apply(a, x)) for c, a, _ in others])
-
-        return product, _sum(bounds)
+                arrays[entries.ndim].append((_times(c, jnp.asarray(entries)), size))
+        diagonal, matrix = (
+            _sum(a for a, _ in found) if found else None for found in arrays.values()
+        )
+        found = [pair for pairs in arrays.values() for pair in pairs]
+        if found:
+            # The norm of the sum of arrays may be far below the sum of the norms, and that of the
+            # rows may be far above the 2-norm.
+            of_sum = _sum(_row_norm(a) for a in (diagonal, matrix) if a is not None)
+            of_each = _sum(_row_norm(a) if size is None else size for a, size in found)
+            bounds.append(jnp.minimum(of_sum, of_each))
+        return matrix, diagonal, others, _sum(bounds)
 
     def _check(self, point: Array) -> None:
         sizes = {_size(a) for a in self.operators} - {None}
@@ -328,7 +349,7 @@ def _coefficients(given: Any, number: int, precision: Any) -> Array:
 
 
 def _norm(k: int, operator: Any, norm: Any, precision: Any) -> Any:
-    """The norm as an array; None for an array, whose norm is that of the sum of all."""
+    """The norm as an array; None for an array that is not known yet."""
     if norm is not None:
         is_number = isinstance(norm, int | float | np.generic | np.ndarray | jax.Array)
         if not is_number or jnp.shape(norm) or jnp.iscomplexobj(norm):
@@ -341,14 +362,43 @@ def _norm(k: int, operator: Any, norm: Any, precision: Any) -> Any:
         if not 0 <= float(norm) < np.inf:
             raise ValueError(f"The norm of operators[{k}] must be finite and >= 0, got {norm}.")
         return np.asarray(norm, precision)
-    if _entries(operator) is not None:
-        return None
+    if (entries := _entries(operator)) is not None:
+        return _two_norm(entries, precision)
     if _is_bcoo(operator):
         return _bound_of_sparse(operator).astype(precision)
     kind = "A function" if _shape(operator) is None else type(operator).__name__
     raise ValueError(
         f"{kind} needs a bound on its norm: give the pair (operator, norm) for operators[{k}]."
     )
+
+
+# Those of arrays that were seen before, by their contents: a program is traced several times.
+_seen: dict[bytes, float] = {}
+
+
+def _two_norm(a: Any, precision: Any) -> Any:
+    """That of a matrix or diagonal whose entries are known, to a little more than rounding."""
+    if not _is_known(a):
+        return None
+    a = np.asarray(a)
+    key = sha256(np.ascontiguousarray(a).tobytes() + repr((a.shape, a.dtype)).encode()).digest()
+    if key not in _seen:
+        if len(_seen) >= 1000:
+            _seen.clear()
+        wide = a.astype(np.result_type(a, np.float64))
+        norm = np.max(np.abs(wide), initial=0) if a.ndim == 1 else _largest_singular_value(wide)
+        # NaN where an entry is.
+        _seen[key] = float(norm) * (1 + 1e-6)
+    return np.asarray(_seen[key], precision)
+
+
+def _largest_singular_value(a: np.ndarray) -> float:
+    if not np.isfinite(a).all():
+        return np.nan
+    for phase in (1.0, 1j):
+        if np.array_equal(phase * a, (phase * a).conj().T):
+            return float(np.abs(np.linalg.eigvalsh(phase * a)).max(initial=0))
+    return float(np.linalg.norm(a, 2))
 
 
 def _bound_of_sparse(a: Any) -> Any:
@@ -404,6 +454,10 @@ def _sum(terms: Any) -> Array:
     for term in others:
         first = jnp.add(*promoted(first, term))
     return first
+
+
+def _row_norm(a: Array) -> Array:
+    return row_norm(lax.stop_gradient(a))
 
 
 def _cast(x: np.ndarray, dtype: Any) -> np.ndarray:

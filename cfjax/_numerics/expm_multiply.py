@@ -5,10 +5,12 @@ from collections.abc import Callable
 from decimal import Decimal, localcontext
 from typing import Any, NamedTuple
 
+import jax
 import jax.numpy as jnp
+import jax.tree_util as jtu
 import numpy as np
 from jax import lax
-from jaxtyping import Array, Inexact, Real
+from jaxtyping import Array, Bool, Inexact, Real
 
 from .loop import loop
 from .squaring import max_over_batch
@@ -30,10 +32,19 @@ LONGEST = {
 }
 # Half lengths of the intervals for Chebyshev series: few bits, so that a division by them is exact.
 # Below the shortest the error of the derivative at zero, which is relative to it, would show.
-_INTERVALS = tuple(m * 2.0**k for k in range(-6, 2) for m in (8, 10, 12, 14))
+_INTERVALS = tuple(m * 2.0**k for k in range(-6, 4) for m in (8, 10, 12, 14))
+# The square root of what the longest series has, or more.
+_ROOT_OF_LONGEST = 13
 # In so many pieces. What is longer is an accident.
 _ROOT_OF_MOST = 32
 _MOST_PIECES = _ROOT_OF_MOST**2
+
+
+class Dense(NamedTuple):
+    """What is done instead where over `most` products would be needed."""
+
+    most: int
+    result: Callable[[], Array]
 
 
 class _Series(NamedTuple):
@@ -46,7 +57,18 @@ class _Series(NamedTuple):
     counts: np.ndarray
     divisors: np.ndarray
     weights: np.ndarray
-    before: bool
+    before: float
+
+
+class _Chosen(NamedTuple):
+    """One of them, for so many pieces, each of `degree` products."""
+
+    possible: Array
+    pieces: Array
+    degree: Array
+    divisors: Array
+    weights: Array
+    before: Any
 
 
 def expm_minus_one_multiply(
@@ -54,7 +76,8 @@ def expm_minus_one_multiply(
     x: Inexact[Array, "..."],
     norm: Real[Array, ""],
     *,
-    is_skew: bool = False,
+    is_skew: bool | Bool[Array, ""] = False,
+    dense: Dense | None = None,
 ) -> Inexact[Array, "..."]:
     """`(exp(A) - 1) x`, by products with A alone. Added to x, it rounds less than exp(A) x does.
 
@@ -63,51 +86,83 @@ def expm_minus_one_multiply(
     - `product`: multiplies an array like `x` by A. It may close over traced values.
     - `norm`: no less than a consistent norm of A, or its spectral radius if A is skew.
     - `is_skew`: whether A is skew-Hermitian, in some inner product.
+    - `dense`: what else gives the result, where it is cheaper.
 
     **Cost:** in double precision 9, 13, 17 and 25 products for norms of 0.09, 0.4, 0.93 and 2.4,
-    and 10.3 for each unit of larger ones; if A is skew 9, 12, 16, 24, 40 and 64 for norms of
-    0.125, 0.5, 1.25, 4, 12 and 28, and 2.3 for each unit beyond. Reverse mode keeps fewer than
+    and 10.3 for each unit of larger ones; if A is skew 9, 12, 16, 24, 40, 64 and 160 for norms of
+    0.125, 0.5, 1.25, 4, 12, 28 and 112, and 1.4 for each unit beyond. Reverse mode keeps fewer than
     200 vectors, however large the norm is. Under `jax.vmap` the largest norm decides.
 
     **Accuracy:** a backward error of a few units in the last place for each unit of the norm; the
     number of terms depends on A alone and not on `x`, so derivatives are as accurate. NaN for
-    norms beyond 1024 times the largest above.
+    norms beyond 1024 times the largest above, unless they are for `dense`.
 
     Source: Al-Mohy & Higham, Computing the action of the matrix exponential, SIAM J. Sci. Comput.
     33 (2011), doi:10.1137/100788860; for skew operators Tal-Ezer & Kosloff, J. Chem. Phys. 81
     (1984), doi:10.1063/1.448136.
     """
-    precision = jnp.finfo(x.dtype)
-    norm = max_over_batch(lax.stop_gradient(norm).astype(precision.dtype))
-    series = (_chebyshev if is_skew else _taylor)(precision.dtype.name)
-    longest = float(series.lengths[-1])
-    # False for NaN.
-    possible = norm <= _MOST_PIECES * longest
-    pieces = jnp.where(possible, jnp.maximum(jnp.ceil(norm / longest), 1), 1)
-    row = jnp.sum(norm / pieces > series.lengths[:-1].astype(precision.dtype))
-    count = jnp.asarray(series.counts, jnp.int32)[row]
-    divisors = jnp.asarray(series.divisors, precision.dtype)[row] * pieces
-    weights = jnp.asarray(series.weights, precision.dtype)[row]
+    norm = max_over_batch(lax.stop_gradient(norm).astype(jnp.finfo(x.dtype).dtype))
+    chosen = _chosen(norm, is_skew)
+    if dense is None:
+        return _by_products(product, x, chosen)
+    # An infinite norm is for `dense`, and NaN stays NaN.
+    is_long = chosen.degree * chosen.pieces > dense.most
+    return lax.cond(
+        is_long | (norm > 0) & ~chosen.possible,
+        # Without a checkpoint the branch not taken must hand out room for what the other saves.
+        jax.checkpoint(lambda: dense.result()),
+        lambda: _by_products(product, x, chosen),
+    )
+
+
+def _by_products(product: Callable[[Array], Array], x: Array, chosen: _Chosen) -> Array:
+    possible, pieces, degree, divisors, weights, of_before = chosen
+    needs_before = not (isinstance(of_before, float) and of_before == 0)
 
     def series_of(x: Array) -> Array:
         def add(k: Array, carry: Any) -> Any:
             before, last, total = carry
             new = _by_real(product(last), lambda x: x / divisors[k])
-            if series.before:
-                new, before = new + before, last
+            if needs_before:
+                new, before = new + _by_real(before, lambda x: of_before * x), last
             return before, new, total + _by_real(new, lambda x: x * weights[k + 1])
 
-        before = jnp.zeros_like(x) if series.before else None
+        before = jnp.zeros_like(x) if needs_before else None
         total = _by_real(x, lambda x: x * weights[0])
-        return loop(add, (before, x, total), count, root=8)[2]
+        return loop(add, (before, x, total), degree, root=_ROOT_OF_LONGEST)[2]
 
     moved = loop(
         lambda _, moved: moved + series_of(x + moved),
         jnp.zeros_like(x),
-        pieces.astype(jnp.int32),
+        pieces,
         root=_ROOT_OF_MOST,
     )
     return _by_real(moved, lambda x: jnp.where(possible, x, jnp.nan))
+
+
+def _chosen(norm: Array, is_skew: bool | Array) -> _Chosen:
+    if not isinstance(is_skew, bool):
+        skew, other = _chosen(norm, True), _chosen(norm, False)
+        short = len(skew.divisors) - len(other.divisors)
+        other = other._replace(
+            divisors=jnp.pad(other.divisors, (0, short), constant_values=1),
+            weights=jnp.pad(other.weights, (0, short)),
+        )
+        return jtu.tree_map(functools.partial(jnp.where, is_skew), skew, other)
+    series = (_chebyshev if is_skew else _taylor)(norm.dtype.name)
+    longest = float(series.lengths[-1])
+    # False for NaN.
+    possible = norm <= _MOST_PIECES * longest
+    pieces = jnp.where(possible, jnp.maximum(jnp.ceil(norm / longest), 1), 1)
+    row = jnp.sum(norm / pieces > series.lengths[:-1].astype(norm.dtype))
+    return _Chosen(
+        possible,
+        pieces.astype(jnp.int32),
+        jnp.asarray(series.counts, jnp.int32)[row],
+        jnp.asarray(series.divisors, norm.dtype)[row] * pieces,
+        jnp.asarray(series.weights, norm.dtype)[row],
+        series.before,
+    )
 
 
 def row_norm(a: Inexact[Array, "n *n"]) -> Real[Array, ""]:
@@ -128,7 +183,7 @@ def _taylor(precision: str) -> _Series:
     counts = FIRST_DEGREE[precision] + np.arange(len(lengths))
     ks = np.tile(np.arange(1.0, counts[-1] + 1), (len(lengths), 1))
     weights = np.concatenate([np.zeros_like(ks[:, :1]), np.ones_like(ks)], axis=1)
-    return _Series(np.array(lengths), counts, ks, weights, before=False)
+    return _Series(np.array(lengths), counts, ks, weights, before=0.0)
 
 
 @functools.cache
@@ -144,7 +199,7 @@ def _chebyshev(precision: str) -> _Series:
         weights[n, : len(row)] = row
     divisors = np.tile(np.array(_INTERVALS)[:, None] / 2, (1, counts.max()))
     divisors[:, 0] *= 2
-    return _Series(np.array(_INTERVALS), counts, divisors, weights, before=True)
+    return _Series(np.array(_INTERVALS), counts, divisors, weights, before=1.0)
 
 
 def _bessel(length: float, tolerance: float) -> list[float]:

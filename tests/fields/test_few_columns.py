@@ -52,10 +52,8 @@ def increment(field, point):
 
 def test_which_points_are_thin():
     a = jnp.zeros((N, N))
-    assert _is_thin(a, jnp.zeros(N)) and _is_thin(a, jnp.zeros((N, 2)))
-    assert not _is_thin(a, jnp.zeros((N, 3)))
-    assert _is_thin(a, jnp.zeros(N, complex)) and not _is_thin(a, jnp.zeros((N, 2), complex))
-    assert not _is_thin(jnp.zeros((7, 7)), jnp.zeros(7))
+    assert _is_thin(a, jnp.zeros(N)) and not _is_thin(a, jnp.zeros((N, 2)))
+    assert not _is_thin(jnp.zeros((15, 15)), jnp.zeros(15))
 
 
 @pytest.mark.representatives(2)
