@@ -79,7 +79,6 @@ def rows(
             if error > 10 * GOAL * max(1.0, norm):
                 raise RuntimeError(f"{name}, {n}, {norm}: {method} is off by {error}")
         programs[method] = looped(step, y, gradient)
-    programs = {method: program for method, program in programs.items()}
     length = lengths(programs[base], y)
     compiled = {method: program(length) for method, program in programs.items()}
     rounds = take_turns(list(compiled.values()), repeats=3 if quick else 15)
@@ -166,7 +165,7 @@ def spins(norm: float) -> Any:
     # Halfway, each part has half of its weight.
     size = norm / abs(sparse.linalg.eigsh(matrix / 2, k=1)[0][0])
     exact = expm_multiply(-1j * size / 2 * matrix, y)
-    field = annealing.field(0.5, jnp.asarray(y))
+    field = annealing.field(annealing.t1 / 2, jnp.asarray(y))
 
     def scaled(c: Array, y: Array) -> Any:
         return cfjax.combine([c * size], [field])

@@ -13,7 +13,12 @@ T = TypeVar("T", bound=PyTree)
 
 
 def loop(
-    step: Callable[[Int[Array, ""], T], T], carry: T, length: Int[Array, ""], *, root: int
+    step: Callable[[Int[Array, ""], T], T],
+    carry: T,
+    length: Int[Array, ""],
+    *,
+    root: int,
+    is_mostly_one: bool = False,
 ) -> T:
     """Replaces `carry` by `step(k, carry)` for k = 0, 1, .., length - 1; `length <= root^2`.
 
@@ -21,15 +26,16 @@ def loop(
     batch, as `max_over_batch` gives it.
 
     **Cost:** that of `length` steps. Derivatives go through a loop of `root` steps within one.
-    Reverse mode keeps a carry for each of `2 root`, and computes every step twice again.
+    Reverse mode keeps a carry for each of `2 root`, and computes every step twice again; a single
+    step only once, if `is_mostly_one`, in a larger program.
     """
     # What is closed over must be seen by what follows.
     step = eqx.filter_closure_convert(step, length, carry)
-    return _loop((step, carry), length=length, root=root)
+    return _loop((step, carry), length=length, root=root, is_mostly_one=is_mostly_one)
 
 
 @eqx.filter_custom_jvp
-def _loop(moving: PyTree, *, length: Array, root: int) -> PyTree:
+def _loop(moving: PyTree, *, length: Array, root: int, is_mostly_one: bool) -> PyTree:
     step, carry = moving
 
     def body(k: Array, carry: PyTree) -> PyTree:
@@ -40,10 +46,19 @@ def _loop(moving: PyTree, *, length: Array, root: int) -> PyTree:
 
 # A loop of unknown length has no reverse mode.
 @_loop.def_jvp
-def _(primals, tangents, *, length, root):
-    return eqx.filter_jvp(
-        lambda moving: _of_known_length(moving[0], moving[1], length, root), primals, tangents
-    )
+def _(primals, tangents, *, length, root, is_mostly_one):
+    def run(moving: PyTree) -> PyTree:
+        step, carry = moving
+        if not is_mostly_one:
+            return _of_known_length(step, carry, length, root)
+        return lax.cond(
+            length == 1,
+            lambda carry: step(jnp.zeros_like(length), carry),
+            jax.checkpoint(lambda carry: _of_known_length(step, carry, length, root)),
+            carry,
+        )
+
+    return eqx.filter_jvp(run, primals, tangents)
 
 
 def _of_known_length(step: Callable, carry: PyTree, length: Array, root: int) -> PyTree:

@@ -1,5 +1,7 @@
 """A loop of a length found at run time: its result, and derivatives of every order."""
 
+import functools
+
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -8,24 +10,25 @@ import pytest
 from cfjax._numerics.loop import loop
 
 
-def power(a, x, n):
+def power(a, x, n, is_mostly_one=False):
     """`a^n x / n!`, with what is closed over and the number of the step."""
     step = lambda k, x: a * x / (k + 1).astype(x.dtype)  # noqa: E731
-    return loop(step, jnp.asarray(x), n, root=4)
+    return loop(step, jnp.asarray(x), n, root=4, is_mostly_one=is_mostly_one)
 
 
-@jax.jit
-def everything(a, x, n):
-    f = lambda a, x: power(a, x, n)  # noqa: E731
+@functools.partial(jax.jit, static_argnums=3)
+def everything(a, x, n, is_mostly_one):
+    f = lambda a, x: power(a, x, n, is_mostly_one)  # noqa: E731
     forward = jax.jvp(lambda a: f(a, x), (a,), (1.0,))[1]
     return f(a, x), forward, jax.grad(f)(a, x), jax.grad(jax.grad(f))(a, x)
 
 
 @pytest.mark.representatives(2)
+@pytest.mark.parametrize("is_mostly_one", [False, True])
 @pytest.mark.parametrize("n", [0, 1, 3, 4, 5, 16])
-def test_powers_and_their_derivatives(n):
+def test_powers_and_their_derivatives(n, is_mostly_one):
     a, x = 1.5, 0.7
-    found = everything(a, x, jnp.asarray(n, jnp.int32))
+    found = everything(a, x, jnp.asarray(n, jnp.int32), is_mostly_one)
     c = x / float(np.prod(np.arange(1, n + 1.0)))
     first, second = n * c * a ** (n - 1), n * (n - 1) * c * a ** (n - 2)
     # Some roundings for each step.
