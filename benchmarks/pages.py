@@ -290,6 +290,46 @@ def exponentials() -> list[list[str]]:
 
 
 @table
+def operators() -> list[list[str]]:
+    rows = pick(load("operators")["rows"], problem="dense")
+    others = ("LeftMatrix", "dense exponential", "Lanczos", "six products")
+    norms = (5.0, 50.0)
+    table = [
+        ["n", *(f"{name}, {norm:.0f}" for norm in norms for name in ("`OperatorSum`", *others))]
+    ]
+    for n in values(rows, "n"):
+        cells = [str(n)]
+        for norm in norms:
+            here = pick(rows, n=n, norm=norm)
+            cells.append(in_units(here[0]["seconds"][2]))
+            cells += [_over(here, name) for name in others]
+        table.append(cells)
+    return table
+
+
+@table
+def krylov() -> list[list[str]]:
+    rows = [row for row in load("operators")["rows"] if row["problem"] != "dense"]
+    table = [["", "2-norm", "`OperatorSum`", "other", "gradient", "other"]]
+    for problem, norm in dict.fromkeys((row["problem"], row["norm"]) for row in rows):
+        cells = [problem, f"{norm:g}"]
+        for gradient in (False, True):
+            here = pick(rows, problem=problem, norm=norm, gradient=gradient)
+            cells.append(in_units(here[0]["seconds"][2]))
+            cells += [
+                f"{row['program']}: {two_digits(row['over OperatorSum'][2])}" for row in here[1:]
+            ]
+        table.append(cells)
+    return table
+
+
+def _over(rows: list[Row], name: str) -> str:
+    found = [row for row in rows if row["program"].startswith(name)]
+    # The medians alone: the table is wide.
+    return two_digits(found[0]["over OperatorSum"][2]) if found else ""
+
+
+@table
 def heat() -> list[list[str]]:
     rows = pick(load("heat")["rows"], program="cfjax, coefficients")
     keys = [key for key in rows[0] if key.startswith("over")]

@@ -16,6 +16,7 @@ from .._numerics.matmul import by_columns, promoted, small_product
 from .._numerics.squaring import max_over_batch
 from .elementwise import check_point, each
 
+
 class AbstractMatrix(AbstractAlgebraElement):
     """An element of a matrix Lie algebra. A subclass is one of its actions on points."""
 

@@ -41,7 +41,8 @@ class OperatorSum(AbstractFrozenField):
 
     The flow needs products with vectors only. It is the Taylor series of the exponential or, if
     `is_skew`, that of Chebyshev, to rounding. Arrays are added up first, which takes as long as a
-    product with each.
+    product with each; a field of arrays alone then moves as `LeftMatrix` does, by a dense
+    exponential where that is faster.
 
     **Arguments:**
 
@@ -59,9 +60,11 @@ class OperatorSum(AbstractFrozenField):
     and coefficients have together.
 
     **Cost:** of a flow, some 10 to 25 products with each operator for norms up to 2.4 and 10 for
-    each unit beyond. If `is_skew`, 9 to 20, and 64 for a norm of 28. Arrays are
-    added up, and the norm is the largest sum of absolute values in a row. That of each other
-    operator is added to it. Reverse mode keeps fewer than 200 vectors for each flow.
+    each unit beyond. If `is_skew`, 9 to 20, 64 for a norm of 28 and 160 for one of 112. The bound
+    on the norm is the sum of those of the operators or, of arrays, the largest sum of absolute
+    values in a row of their sum, if that is less. The 2-norm of an array that is known when the
+    program is traced is computed then; where it is not, as in `args`, declare it if the matrix is
+    large and full. Reverse mode keeps fewer than 200 vectors for each flow.
 
     **Raises** `TypeError` or `ValueError` for another number of coefficients than of operators,
     operators that differ in shape or precision or are something else, a norm that is missing or no

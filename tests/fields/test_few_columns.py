@@ -161,6 +161,15 @@ def test_a_batch_of_different_norms():
         np.testing.assert_allclose(got, want, rtol=0, atol=1e-12)
 
 
+def test_a_batch_with_one_that_is_not_skew():
+    point = random((N,), 1)
+    batch = np.stack([matrix("skew", 2.0), matrix("any", 2.0)])
+    got = jax.jit(jax.vmap(lambda a: LeftMatrix(a).flow(jnp.asarray(point))))(batch)
+    want = [scipy.linalg.expm(a) @ point for a in batch]
+    # As above, with a growth of at most exp(2).
+    np.testing.assert_allclose(got, want, rtol=0, atol=1e-13)
+
+
 def test_what_is_not_finite_stays_so():
     point = random((N,), 1)
     for bad in (np.nan, np.inf):
