@@ -413,8 +413,8 @@ DEFECTS = [
     ),
     Defect(
         "_numerics/expm_multiply.py",
-        "new, before = new + before, last",
-        "new, before = new - before, last",
+        "new + _by_real(before, lambda x: of_before * x), last",
+        "new - _by_real(before, lambda x: of_before * x), last",
         "Chebyshev's recurrence for a real interval instead of an imaginary one",
         "numerics/test_expm_multiply.py",
     ),
