@@ -104,7 +104,11 @@ def runge_kutta_order(a: Iterable[Iterable[Any]], b: Iterable[Any]) -> int:
 
     Source: Hairer, Norsett & Wanner, Solving Ordinary Differential Equations I, theorem II.2.13.
     """
-    tableau = Tableau([[], *([row] for row in a)], [b])
+    return _runge_kutta_order(Tableau([[], *([row] for row in a)], [b]))
+
+
+@lru_cache
+def _runge_kutta_order(tableau: Tableau) -> int:
     return _largest_order(_defects(_tree_weights(tableau), exact_tree_weight), tableau)
 
 
@@ -234,7 +238,7 @@ def _tree_weights(tableau: Tableau) -> Iterator[Weights]:
         n += 1
         for tree in trees(n):
             for branches, value in zip(grown, values, strict=True):
-                value[tree] = math.prod((branches[child] for child in tree), start=Fraction(1))
+                value[tree] = value[tree[:-1]] * branches[tree[-1]] if tree else Fraction(1)
         yield {tree: _sum(a * values[k][tree] for k, a in end) for tree in trees(n)}
         # Only for the next order, and the most work of all.
         for tree in trees(n):

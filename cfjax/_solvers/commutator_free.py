@@ -26,7 +26,7 @@ from .._methods import tableau as _tableau
 from .._methods.continuous_extension import continuous_extension
 from .._methods.order_conditions import order
 from .._methods.tableau import Product, Row, Tableau
-from .._xla import cut
+from .._xla import cut, once_together
 from .base import AbstractLieSolver, Move
 from .dense import Path
 from .stages import FieldVaries, Flow, can_loop, run
@@ -138,7 +138,10 @@ class AbstractCommutatorFree(AbstractLieSolver):
                 error = minus(end, leave(fields[0], point(trimmed(embedded))))
             if tableau.uses_last(embedded):
                 start, last_stage = (leave(fields[0], point(x)) for x in ((), stages[-2]))
-                error = jtu.tree_map(_seen, error, minus(end, last_stage), minus(end, start))
+                apart = minus(end, last_stage)
+                # A ratio is where a function of XLA's ends, and all of it is needed before.
+                end, error, apart = once_together((end, error, apart), alone=True)
+                error = jtu.tree_map(_seen, error, apart, minus(end, start))
         return Move(end, Path.of(within, value(points[()]), fields), error)
 
 
