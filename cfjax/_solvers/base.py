@@ -11,6 +11,7 @@ import jax.numpy as jnp
 import jax.tree_util as jtu
 import numpy as np
 from jax import lax
+from jax.core import Tracer
 from jaxtyping import Array, Inexact, PyTree, Real
 
 from .._field import Incremented, flow, is_field, is_incremented, value
@@ -96,6 +97,12 @@ class AbstractLieSolver(diffrax.AbstractSolver):
         return self
 
     def step(self, terms, t0, t1, y0, args, solver_state, made_jump):
+        # Not in a loop that is taken apart, which JAX does not know of, nor where times are known.
+        is_usual = isinstance(t0, Tracer) and not is_rewritten()
+        step = _step_once if is_usual else AbstractLieSolver._step
+        return step(self, terms, t0, t1, y0, args, solver_state, made_jump)
+
+    def _step(self, terms, t0, t1, y0, args, solver_state, made_jump):
         lost, first, zero = solver_state.parts()
         if zero is not None:
             t0 = t0 + zero
@@ -276,3 +283,7 @@ def _is_leaf(x: Any) -> bool:
 
 def _at_rest(y: Inexact[Array, "..."]) -> Incremented:
     return Incremented(y, jnp.zeros_like(y))
+
+
+# diffrax traces a step three times, which takes longer than all else that it traces.
+_step_once = eqx.filter_jit(inline=True)(AbstractLieSolver._step)

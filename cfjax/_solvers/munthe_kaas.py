@@ -29,7 +29,7 @@ from .._field import value as value_of
 from .._methods.continuous_extension import runge_kutta_extension
 from .._methods.order_conditions import runge_kutta_order
 from .._methods.tableau import ContinuousExtension, Row
-from .._xla import are_long, is_rewritten
+from .._xla import are_long, is_rewritten, once_together
 from .base import AbstractLieSolver, Move
 from .commutator_free import minus
 from .dense import Path
@@ -97,6 +97,8 @@ class AbstractMuntheKaas(AbstractLieSolver):
                 error = tangent(off, value_of(left))
             else:
                 error = minus(left, leave(v, flow(combine((1.0, -1.0), (v, off)), start)))
+        # All are results then, and XLA would compute those before anew for each.
+        elements = once_together(elements, alone=True)
         return Move(left, Path.of(self.continuous_extension, value_of(start), elements), error)
 
     def logarithm(self, field: Callable[[Any, PyTree], PyTree], y0: PyTree) -> Any:

@@ -1,10 +1,10 @@
 """The stages of a step as one loop, so that a program has the field and its flow once."""
 
 import contextlib
-from collections.abc import Callable, Iterator, Sequence
-from contextvars import ContextVar
+from collections.abc import Callable, Sequence
 from typing import Any, NamedTuple
 
+import jax
 import jax.numpy as jnp
 import jax.tree_util as jtu
 from jax import lax
@@ -18,17 +18,13 @@ from .._xla import is_rewritten, pack, table
 # that moves a vector, this takes longer than the flow.
 _SMALL = 100
 
-_is_written_out: ContextVar[bool] = ContextVar("is_written_out", default=False)
+# JAX traces anew where it changes.
+_is_written_out = jax.make_user_context(False)
 
 
-@contextlib.contextmanager
-def written_out() -> Iterator[None]:
+def written_out() -> contextlib.AbstractContextManager:
     """Within, no stages are traced as a loop: every flow is seen, and counted, on its own."""
-    token = _is_written_out.set(True)
-    try:
-        yield
-    finally:
-        _is_written_out.reset(token)
+    return _is_written_out(True)
 
 
 class Flow(NamedTuple):
@@ -57,7 +53,7 @@ def can_loop(field: PyTree, point: PyTree, is_long: bool = False) -> bool:
     parts = jtu.tree_leaves(field, is_leaf=is_field)
     return (
         (is_long or not is_rewritten())
-        and not _is_written_out.get()
+        and not _is_written_out.value
         and any(map(is_field, parts))
         and _size(field) <= max(_SMALL, 4 * _size(point))
         and is_plain(field)
