@@ -285,5 +285,6 @@ def _at_rest(y: Inexact[Array, "..."]) -> Incremented:
     return Incremented(y, jnp.zeros_like(y))
 
 
-# diffrax traces a step three times, which takes longer than all else that it traces.
-_step_once = eqx.filter_jit(inline=True)(AbstractLieSolver._step)
+# diffrax traces a step three times, which takes longer than all else that it traces. Inline, the
+# program is as if traced anew. (equinox hands on what it does not know to `jax.jit`.)
+_step_once = eqx.filter_jit(AbstractLieSolver._step, inline=True)  # pyright: ignore[reportCallIssue]
