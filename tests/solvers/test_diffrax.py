@@ -543,6 +543,22 @@ def test_one_program_serves_all_values(solver):
         assert abs(float(jnp.linalg.norm(ys[-1])) - scale * float(jnp.linalg.norm(Y0))) < 1e-14
 
 
+def test_a_step_is_traced_once():
+    """diffrax asks three times, of one function of the same shapes."""
+    calls = []
+
+    def field(t, y, args):
+        calls.append(t)
+        return cfjax.Rotation(jnp.cos(t) * y * args)
+
+    controller = diffrax.PIDController(rtol=1e-6, atol=1e-6)
+    diffrax.diffeqsolve(
+        cfjax.LieTerm(field), cfjax.CF4(), 0.0, 1.0, 0.1, Y0, ARGS, stepsize_controller=controller
+    )
+    # Five evaluations, the one at the end among them, and some before the first step.
+    assert 5 < len(calls) < 2 * 5
+
+
 # What does not fit
 
 

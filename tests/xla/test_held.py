@@ -57,9 +57,10 @@ def test_the_error_of_a_step_goes_through_memory_before_its_norm(rewritten):
     assert all(size < 200 for size, sums in functions if sums > 1)
 
 
-def test_a_step_is_computed_once_for_its_end_its_error_and_the_next(rewritten):
-    """It was four times: for each entry of the end and for the error."""
-    functions = _functions(rigid_body, cfjax.RKMK(diffrax.Tsit5.tableau))
+@pytest.mark.parametrize("solver", [cfjax.CF4(), cfjax.RKMK(diffrax.Tsit5.tableau)])
+def test_a_step_is_computed_once_for_its_end_its_error_and_the_next(rewritten, solver):
+    """It was four or five times: for each entry of the end, for the error and for a ratio in it."""
+    functions = _functions(rigid_body, solver)
     assert len([size for size, _ in functions if size > 500]) == 1
 
 
