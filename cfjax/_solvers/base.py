@@ -133,7 +133,9 @@ class AbstractLieSolver(diffrax.AbstractSolver):
                 lambda lost, y: y if lost is None else _at_rest(y), lost, y0, is_leaf=_is_leaf
             )
             made = self.move(field, start)
-            end, error = _shared(lost, made.end, made.error, is_followed=first is not None)
+            end, error = made.end, made.error
+            if not made.is_shared:
+                end, error = _shared(lost, end, error, is_followed=first is not None)
             if first is None:
                 last = None
             elif is_rewritten() and self.is_of_state:
@@ -163,11 +165,15 @@ class AbstractLieSolver(diffrax.AbstractSolver):
 
 
 class Move(eqx.Module):
-    """A step: where it ends, the way there for output within it, and an estimate of its error."""
+    """A step: where it ends, the way there for output within it, and an estimate of its error.
+
+    `is_shared` says that the end has gone through memory, with all that the estimate is made of.
+    """
 
     end: PyTree
     path: Path
     error: PyTree = None
+    is_shared: bool = eqx.field(static=True, default=False)
 
 
 def _select(made_jump: Any, anew: Callable[[], PyTree], kept: PyTree) -> PyTree:

@@ -129,7 +129,7 @@ class AbstractCommutatorFree(AbstractLieSolver):
         within = continuous_extension(tableau)
         if any(map(tableau.uses_last, (embedded or (), *within))):
             evaluate(1.0, stages[-1])
-        error = None
+        error, is_shared = None, False
         if embedded is not None:
             if self.estimate == "algebra":
                 difference = _combined(_difference(embedded, tableau.beta), fields)
@@ -140,9 +140,10 @@ class AbstractCommutatorFree(AbstractLieSolver):
                 start, last_stage = (leave(fields[0], point(x)) for x in ((), stages[-2]))
                 apart = minus(end, last_stage)
                 # A ratio is where a function of XLA's ends, and all of it is needed before.
+                is_shared = True
                 end, error, apart = once_together((end, error, apart), alone=True)
                 error = jtu.tree_map(_seen, error, apart, minus(end, start))
-        return Move(end, Path.of(within, value(points[()]), fields), error)
+        return Move(end, Path.of(within, value(points[()]), fields), error, is_shared)
 
 
 def _products(stages: Sequence[Product]) -> list[Product]:
