@@ -130,20 +130,30 @@ def equal_steps(
     carry = (n, y0, solver_state, diffrax.RESULTS.successful)
 
     def advance(carry, number):
+        # XLA would take apart a loop of one turn, and compute the step anew for each of its uses.
+        if isinstance(number, int) and number == 1:
+            return step(carry)
         if checkpoint_every is None:
-            return repeat(step, carry, number)
+            return repeat(step, carry, number)[0]
         length, rest = checkpoint_every, number % checkpoint_every
-        block = jax.checkpoint(lambda carry, _: (repeat(step, carry, length), None))
+        block = jax.checkpoint(lambda carry, _: (repeat(step, carry, length)[0], None))
         carry, _ = lax.scan(block, carry, length=number // length)
-        return repeat(step, carry, rest)
+        return repeat(step, carry, rest)[0]
 
     def steps_and_save(carry, _):
         carry = advance(carry, num_steps if save_every is None else save_every)
-        n, y, *_ = carry
-        return carry, (time(n), y)
+        return carry, carry[1]
 
     num_saves: Any = 1 if save_every is None else num_steps // save_every
-    carry, (ts, ys) = lax.scan(steps_and_save, carry, length=num_saves)
+    if save_every == 1 and num_saves > 1:
+        carry, ys = repeat(step, carry, num_saves, keep=lambda carry: carry[1])
+    else:
+        carry, ys = lax.scan(steps_and_save, carry, length=num_saves)
+    ts = time(
+        carry[0][None]
+        if save_every is None
+        else n + save_every * jnp.arange(1, num_saves + 1, dtype=n.dtype)
+    )
     result = carry[3]
     # Of the saved states alone, outside the loop: sums and products keep infinity and NaN, so a
     # blow-up shows in what is saved after it.

@@ -11,6 +11,7 @@ import numpy as np
 from jax import lax
 from jaxtyping import Array, Float
 
+from .._xla import smooth
 from .polynomial import polynomial
 
 
@@ -48,6 +49,7 @@ def stumpff(n: int, s: Float[Array | np.ndarray, "*batch"]) -> Float[Array, "*ba
 
 
 @functools.partial(jax.custom_jvp, nondiff_argnums=(0,))
+@smooth
 def _stumpff(n: int, s: Float[Array, "*batch"]) -> Float[Array, "*batch"]:
     if n == 0:
         return 1 - s * _stumpff(2, s)
@@ -105,6 +107,7 @@ def _(primals, tangents):
     return (near, d1, d2, c3), tuple(slope * s_dot for slope in slopes)
 
 
+@smooth
 def _apart(s: Float[Array, "*batch"]) -> tuple[Float[Array, "*batch"], ...]:
     constants = _DOUBLE if s.dtype == jnp.float64 else _SINGLE
     turns, inverse = _turns(s, constants)
@@ -122,6 +125,7 @@ def _apart(s: Float[Array, "*batch"]) -> tuple[Float[Array, "*batch"], ...]:
     return near, d1, d2, c3
 
 
+@smooth
 def cotangent_excess(s: Float[Array, "*batch"]) -> Float[Array, "*batch"]:
     """`(1 - x/2 cot(x/2)) / x^2` with `s = x^2`, which is 1/12 at zero, and smooth there.
 
@@ -155,6 +159,7 @@ def _(primals, tangents):
 
 
 @functools.partial(jax.custom_jvp, nondiff_argnums=(0,))
+@smooth
 def _stumpff_1_to(n: int, s: Float[Array, "*batch"]) -> tuple[Float[Array, "*batch"], ...]:
     """`c_1` to `c_n`, for an even `n >= 4`, without the branches and divisions of `stumpff`.
 

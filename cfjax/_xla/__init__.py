@@ -4,6 +4,7 @@
 - `table`: the stages of a long step, each taken apart; `are_long`: whether they make one.
 - `cut`, `once_together`, `once_in_rows`: values that several results need, computed once.
 - `pack`, `unpack`: `jnp.stack` and `jnp.unstack` in a form that XLA fuses.
+- `smooth`: a mark of functions that compare numbers and yet are smooth up to rounding.
 - `held`, `call`: arrays through memory, and functions that XLA compiles on their own.
 - `rewriting`: the switch that turns it all off; `is_rewritten`: what there is around.
 
@@ -22,4 +23,5 @@ from .program import are_long as are_long
 from .program import by_components as by_components
 from .scope import is_rewritten as is_rewritten
 from .scope import rewriting as rewriting
+from .smooth import smooth as smooth
 from .table import table as table

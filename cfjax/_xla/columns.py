@@ -20,22 +20,20 @@ from jax.extend.core import JaxprEqn
 from jaxtyping import Array
 
 from .components import (
-    ELEMENTWISE,
     MAX_PRODUCT,
-    REDUCTIONS,
     SCATTERS,
     Components,
     components,
+    is_lexicographic,
     known,
     moved,
+    reduction,
     scattered_into,
 )
 from .held import held
 from .pack import pack, pack_p, unpack, unpack_p
-from .scope import MAX_LENGTH, MAX_SIZE, is_rows
-
-_CUMULATIVE = frozenset(("cumprod", "cumsum"))
-_RESHAPES = frozenset(("expand_dims", "reshape", "squeeze"))
+from .scope import MAX_LENGTH, MAX_SIZE, is_numeric, is_rows
+from .understood import ELEMENTWISE, REDUCTIONS, is_understood
 
 
 @jtu.register_pytree_node_class
@@ -97,6 +95,16 @@ def columns(x: Any) -> Columns:
     return _to(flat, x.shape, [*is_short[:-1], True]) if is_rows(x) else flat
 
 
+def conformed(x: Any, like: Columns) -> Columns:
+    """The array apart along the axes of another of its shape, and repeating where that does."""
+    x = _to(columns(x), like.shape, like.is_short)
+    entries = []
+    for e, other in zip(x.entries, like.entries, strict=True):
+        sides = np.broadcast_shapes(jnp.shape(e), jnp.shape(other))
+        entries.append(lax.slice(_spread(e, sides), [0] * len(sides), jnp.shape(other)))
+    return Columns(entries, x.shape, x.is_short)
+
+
 class _Call(NamedTuple):
     """One operation on arrays in columns."""
 
@@ -117,18 +125,16 @@ class _Call(NamedTuple):
 def in_columns(eqn: JaxprEqn, values: Sequence[Any], fixed: Sequence[bool]) -> list[Any] | None:
     """The results of one operation, if there is a rule for it, else None."""
     name = eqn.primitive.name
-    shapes: list[Any] = [getattr(v.aval, "shape", None) for v in eqn.outvars]
-    if any(shape is None or 0 in shape for shape in shapes) or eqn.effects:
+    avals: list[Any] = [v.aval for v in (*eqn.invars, *eqn.outvars)]
+    if eqn.effects or not is_understood(eqn):
         return None
-    call = _Call(eqn, values, fixed, shapes[0])
+    if not all(is_numeric(aval) and 0 not in aval.shape for aval in avals):
+        return None
+    call = _Call(eqn, values, fixed, avals[len(eqn.invars)].shape)
     if eqn.primitive is unpack_p or name == "split":
         outs = _split(call)
     elif eqn.primitive.multiple_results:
         return None
-    elif name == "div" and list(fixed) == [False, True] and _is_real(eqn):
-        # As in components.
-        divisor = jtu.tree_map(lambda entry: lax.integer_pow(entry, -1), values[1])
-        outs = [_elementwise(call._replace(values=[values[0], divisor]), lambda a, b: a * b)]
     elif name in ELEMENTWISE:
         outs = [_elementwise(call, lambda *row: eqn.primitive.bind(*row, **eqn.params))]
     else:
@@ -140,22 +146,11 @@ def in_columns(eqn: JaxprEqn, values: Sequence[Any], fixed: Sequence[bool]) -> l
 
 def _rule(eqn: JaxprEqn) -> Callable[[_Call], Columns | None] | None:
     name = eqn.primitive.name
-    if eqn.primitive is pack_p or name == "stack":
+    if eqn.primitive is pack_p:
         return _stacked
-    if name in _RESHAPES:
-        return _reshaped
     if name in REDUCTIONS:
-        return _reduced
-    if name in _CUMULATIVE:
-        return _cumulative
-    if name in SCATTERS or name == "scatter":
-        return _scattered
+        return None if is_lexicographic(eqn) else _reduced
     return _RULES.get(name)
-
-
-def _is_real(eqn: JaxprEqn) -> bool:
-    aval: Any = eqn.outvars[0].aval
-    return jnp.issubdtype(aval.dtype, jnp.floating)
 
 
 def _settled(x: Columns) -> Any:
@@ -221,6 +216,8 @@ def _common(arrays: Sequence[Columns], shape: Sequence[int]) -> list[bool]:
     """Along which axes arrays that belong together are to be apart."""
 
     def decide(axis: int, n: int) -> bool:
+        if n == 1:
+            return True
         given = [x for x in arrays if x.shape[axis] != 1]
         short = any(x.is_short[axis] for x in given)
         long = any(not x.is_short[axis] and not _repeats(x, axis) for x in given)
@@ -294,8 +291,6 @@ def _broadcast(call: _Call) -> Columns | None:
 
 def _reshaped(call: _Call) -> Columns | None:
     x = columns(call.values[0])
-    if call.eqn.params.get("dimensions") is not None and call.eqn.primitive.name == "reshape":
-        return None
     groups = _groups(x.shape, call.shape)
     is_short = list(x.is_short)
     for old, new in groups:
@@ -511,8 +506,14 @@ def _reduced(call: _Call) -> Columns | None:
     kept = [k for k in range(len(x.shape)) if k not in axes]
     rows = x.places.transpose(*kept, *axes)
     rows = rows.reshape(math.prod(rows.shape[: len(kept)]), -1)
-    combine = REDUCTIONS[call.eqn.primitive.name]
-    outs = [functools.reduce(combine, (entries[k] for k in row)) for row in rows]
+    combine = reduction(call.eqn)
+
+    def reduced(row: np.ndarray) -> Any:
+        parts = [entries[k] for k in row]
+        sides = np.broadcast_shapes(*map(jnp.shape, parts))
+        return combine([_spread(e, sides) for e in parts])
+
+    outs = list(map(reduced, rows))
     return Columns(outs, call.shape, [x.is_short[k] for k in kept])
 
 
@@ -662,11 +663,19 @@ def _product(call: _Call) -> Columns | None:
 _RULES: dict[str, Callable[[_Call], Columns | None]] = {
     "broadcast_in_dim": _broadcast,
     "concatenate": _concatenated,
+    "cumprod": _cumulative,
+    "cumsum": _cumulative,
     "dot_general": _product,
     "fft": _transformed,
     "gather": _gathered,
     "pad": _padded,
+    "reshape": _reshaped,
     "rev": _reversed,
+    "scatter": _scattered,
+    "scatter-add": _scattered,
+    "scatter-mul": _scattered,
     "slice": _sliced,
+    "squeeze": _reshaped,
+    "stack": _stacked,
     "transpose": _transposed,
 }

@@ -17,29 +17,14 @@ from jaxtyping import Array
 from .operation import evaluate
 from .pack import pack, pack_p, unpack, unpack_p
 from .scope import MAX_SIZE, is_numeric
+from .understood import ELEMENTWISE, REDUCTIONS, is_understood
 
 # Of the products of numbers that a product of arrays is taken apart into.
 MAX_PRODUCT = 216
 
-ELEMENTWISE = frozenset(
-    "abs acos acosh add add_any and asin asinh atan atan2 atanh cbrt ceil clamp complex conj "
-    "convert_element_type copy cos cosh div eq erf exp exp2 expm1 floor ge gt imag integer_pow "
-    "is_finite le log log1p logistic lt max min mul ne neg not or pow real rem round rsqrt "
-    "select_n sign sin sinh sqrt square stop_gradient sub tan tanh xor".split()
-)
-REDUCTIONS: dict[str, Callable[[Any, Any], Any]] = {
-    "reduce_and": operator.and_,
-    "reduce_max": lax.max,
-    "reduce_min": lax.min,
-    "reduce_or": operator.or_,
-    "reduce_prod": operator.mul,
-    "reduce_sum": operator.add,
-}
 SCATTERS: dict[str, Callable[[Any, Any], Any]] = {
     "scatter-add": operator.add,
     "scatter-mul": operator.mul,
-    "scatter_add": operator.add,
-    "scatter_mul": operator.mul,
 }
 
 
@@ -75,22 +60,19 @@ def literal(v: Literal) -> Any:
     return number(v.val, aval.dtype)
 
 
-def in_components(
-    jaxpr: Jaxpr, eqn: JaxprEqn, values: list[Any], fixed: Sequence[bool]
-) -> Sequence[Any] | None:
+def in_components(jaxpr: Jaxpr, eqn: JaxprEqn, values: list[Any]) -> Sequence[Any] | None:
     """The results of one operation, if there is a rule for it, else None."""
     name = eqn.primitive.name
     avals: list[Any] = [v.aval for v in eqn.outvars]
+    if not all(is_numeric(v.aval) for v in (*eqn.invars, *eqn.outvars)):
+        return None
     constants = list(map(known, values))
-    if (
-        not any(x is None for x in constants)
-        and not any(map(is_inexact, avals))
-        and not eqn.effects
-    ):
+    is_known = not any(x is None for x in constants) and not any(map(is_inexact, avals))
+    if is_known and not eqn.effects:
         with jax.ensure_compile_time_eval():
             return list(map(np.asarray, evaluate(jaxpr, eqn, constants)))
-    shapes: list[Any] = [getattr(aval, "shape", None) for aval in avals]
-    if any(shape is None or not 1 <= math.prod(shape) <= MAX_SIZE for shape in shapes):
+    shapes: list[Any] = [aval.shape for aval in avals]
+    if not is_understood(eqn) or not all(1 <= math.prod(shape) <= MAX_SIZE for shape in shapes):
         return None
     if eqn.primitive is unpack_p or name == "split":
         if not is_components(values[0]):
@@ -104,9 +86,6 @@ def in_components(
         return [values[0].at(np.asarray(part)) for part in parts]
     if eqn.primitive.multiple_results or any(map(_is_whole, values)):
         return None
-    if name == "div" and list(fixed) == [False, True]:
-        if jnp.issubdtype(avals[0].dtype, jnp.floating):
-            return [_by_reciprocal(values[0], values[1], shapes[0])]
     if name in MOVES:
         if not any(map(is_components, values)) and name not in _FROM_NUMBERS:
             return None
@@ -118,8 +97,8 @@ def in_components(
     if shapes[0] != () and name in ELEMENTWISE:
         rows = zip(*(components(v, shapes[0]).entries for v in values), strict=True)
         return [Components((eqn.primitive.bind(*row, **eqn.params) for row in rows), shapes[0])]
-    if name in REDUCTIONS and is_components(values[0]):
-        return [_reduced(REDUCTIONS[name], values[0], eqn.params["axes"], shapes[0])]
+    if name in REDUCTIONS and is_components(values[0]) and not is_lexicographic(eqn):
+        return [_reduced(reduction(eqn), values[0], eqn.params["axes"], shapes[0])]
     if name == "dot_general" and _is_plain_product(eqn):
         return [_product(values[0], values[1], eqn.params["dimension_numbers"], shapes[0])]
     return None
@@ -145,7 +124,6 @@ MOVES: dict[str, Callable[[np.ndarray, tuple[int, ...], dict[str, Any]], np.ndar
     "concatenate": None,
     "dynamic_slice": None,
     "dynamic_update_slice": None,
-    "expand_dims": lambda places, shape, params: places.reshape(shape),
     "gather": None,
     "pad": None,
     "reshape": lambda places, shape, params: places.reshape(shape),
@@ -156,7 +134,7 @@ MOVES: dict[str, Callable[[np.ndarray, tuple[int, ...], dict[str, Any]], np.ndar
     "transpose": lambda places, shape, params: places.transpose(params["permutation"]),
 }
 # Those that may make a small array from single numbers.
-_FROM_NUMBERS = frozenset(("broadcast_in_dim", "reshape", "expand_dims"))
+_FROM_NUMBERS = frozenset(("broadcast_in_dim", "reshape"))
 # Of the others: which operands are arrays whose entries are moved. The rest are indices.
 _MOVED_OPERANDS = {
     "concatenate": slice(None),
@@ -181,11 +159,18 @@ def moved(eqn: JaxprEqn, values: Sequence[Any], shape: tuple[int, ...]) -> Seque
         return None
 
     def by_jax(*places: np.ndarray) -> np.ndarray:
-        given = indices | dict(zip(moved, places, strict=True))
-        operands = [jnp.asarray(given[k], int) for k in range(len(values))]
+        numbers = (np.asarray(x, np.int32) for x in places)
+        operands = indices | dict(zip(moved, numbers, strict=True))
+        operands = [jnp.asarray(operands[k]) for k in range(len(values))]
         if name == "scatter":
             return _scattered(operands, eqn.params)
-        return np.asarray(eqn.primitive.bind(*operands, **eqn.params))
+        params = eqn.params
+        if name == "gather":
+            # What fills is no entry, nor is what was promised not to be asked for.
+            is_clipped = params["mode"] == lax.GatherScatterMode.CLIP
+            mode = lax.GatherScatterMode.CLIP if is_clipped else lax.GatherScatterMode.FILL_OR_DROP
+            params = params | {"fill_value": -1, "mode": mode}
+        return np.asarray(eqn.primitive.bind(*operands, **params))
 
     with jax.ensure_compile_time_eval():
         return _arranged([values[k] for k in moved], by_jax)
@@ -209,7 +194,8 @@ def scattered_into(
         return None
     x, updates = components(values[0]), components(values[2])
     with jax.ensure_compile_time_eval():
-        none, places = jnp.full(shape, -1), jnp.asarray(places_of(updates))
+        none = jnp.full(shape, -1, np.int32)
+        places = jnp.asarray(np.asarray(places_of(updates), np.int32))
         taken = _scattered((none, jnp.asarray(indices), places), params)
     used = taken[taken >= 0]
     if len(np.unique(used)) < len(updates.entries):
@@ -232,21 +218,52 @@ def _arranged(values: Sequence[Any], move: Callable[..., np.ndarray]) -> list[An
     return [Components(entries, (len(entries),)).at(np.asarray(places))]
 
 
+def reduction(eqn: JaxprEqn) -> Callable[[Sequence[Any]], Any]:
+    """What a reduction makes of the entries that it reduces, all of one shape."""
+    name, aval = eqn.primitive.name, eqn.outvars[0].aval
+    if name in _EXTREMES and is_inexact(aval):
+        return functools.partial(_extreme, _EXTREMES[name])
+    return functools.partial(functools.reduce, _COMBINED[name])
+
+
+def is_lexicographic(eqn: JaxprEqn) -> bool:
+    aval: Any = eqn.outvars[0].aval
+    return eqn.primitive.name in _EXTREMES and jnp.issubdtype(aval.dtype, jnp.complexfloating)
+
+
+_EXTREMES: dict[str, Callable[[Any, Any], Any]] = {"reduce_max": lax.max, "reduce_min": lax.min}
+_COMBINED = _EXTREMES | {
+    "reduce_and": operator.and_,
+    "reduce_or": operator.or_,
+    "reduce_prod": operator.mul,
+    "reduce_sum": operator.add,
+}
+
+
+@functools.partial(jax.custom_jvp, nondiff_argnums=(0,))
+def _extreme(combine: Callable[[Any, Any], Any], entries: Sequence[Any]) -> Any:
+    """The largest or smallest; the derivative is shared evenly by all that are, as in JAX."""
+    return functools.reduce(combine, entries)
+
+
+@_extreme.defjvp
+def _(combine, primals, tangents):
+    (entries,), (moving,) = primals, tangents
+    extreme = _extreme(combine, entries)
+    shares = [lax.convert_element_type(lax.eq(x, extreme), extreme.dtype) for x in entries]
+    total = functools.reduce(operator.add, map(operator.mul, moving, shares))
+    return extreme, total / functools.reduce(operator.add, shares)
+
+
 def _reduced(
-    combine: Callable[[Any, Any], Any], x: Components, axes: Sequence[int], shape: tuple[int, ...]
+    combine: Callable[[Sequence[Any]], Any],
+    x: Components,
+    axes: Sequence[int],
+    shape: tuple[int, ...],
 ) -> Any:
     kept = [k for k in range(len(x.shape)) if k not in axes]
     rows = places_of(x).transpose(*kept, *axes).reshape(math.prod(shape), -1)
-    return _shaped([functools.reduce(combine, x.at(row).entries) for row in rows], shape)
-
-
-def _by_reciprocal(x: Any, divisor: Any, shape: tuple[int, ...]) -> Any:
-    # Each reciprocal once, also if there is one divisor for all entries.
-    divisor = jtu.tree_map(lambda entry: lax.integer_pow(entry, -1), divisor)
-    if shape == ():
-        return x * divisor
-    pairs = zip(components(x, shape).entries, components(divisor, shape).entries, strict=True)
-    return Components((a * b for a, b in pairs), shape)
+    return _shaped([combine([jnp.asarray(e) for e in x.at(row).entries]) for row in rows], shape)
 
 
 def _is_plain_product(eqn: JaxprEqn) -> bool:

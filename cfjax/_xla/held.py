@@ -124,11 +124,13 @@ def _by_reduction(entries: Sequence[Array]) -> list[Array]:
 
 
 def _by_call(entries: Sequence[Array]) -> list[Array]:
-    # In a batch a reduction would compute everything twice.
-    whole = pack(entries, axis=entries[0].ndim)
+    # In a batch a reduction would compute everything twice. One array goes as it is: with an axis
+    # more XLA may update it in place where it is still read (`understood.py`).
+    is_one = len(entries) == 1
+    whole = entries[0] if is_one else pack(entries, axis=entries[0].ndim)
     with set_xla_metadata(inlineable="false"):
         whole = _identity(whole)
-    return unpack(whole, axis=entries[0].ndim)
+    return [whole] if is_one else unpack(whole, axis=entries[0].ndim)
 
 
 @jax.jit

@@ -1,7 +1,7 @@
 """Many equal steps in one loop, which XLA turns into one function; so it does its derivative."""
 
 from collections.abc import Callable, Sequence
-from typing import Any
+from typing import Any, NamedTuple
 
 import equinox as eqx
 import jax
@@ -12,46 +12,77 @@ from jaxtyping import Array, Int, PyTree
 
 from .operation import operation
 from .pack import pack, unpack
-from .program import join, split, trace
+from .program import join, split, split_like, trace
+from .scope import within_equal_steps
 
 # Beyond, the derivative gains less than copying them costs.
 _MAX_TRAVELLERS = 16
 
 
 def repeat(
-    step: Callable[[PyTree], PyTree], carry: PyTree, num_steps: int | Int[Array, ""]
-) -> PyTree:
-    """Replaces `carry` by `step(carry)`, `num_steps` times.
+    step: Callable[[PyTree], PyTree],
+    carry: PyTree,
+    num_steps: int | Int[Array, ""],
+    keep: Callable[[PyTree], PyTree] | None = None,
+) -> tuple[PyTree, PyTree]:
+    """Replaces `carry` by `step(carry)`, `num_steps` times; and `keep(carry)` after each step.
 
     `step` may close over traced values. Reverse mode keeps one carry a step, and computes the step
-    again. It needs a Python int; an array makes one program for every number of steps.
+    again. It needs a Python int; an array makes one program for every number of steps, without
+    `keep`. What `keep` returns are parts of the carry; each is stacked along a new first axis.
 
     On CPU a loop of small steps is fast if XLA has few operations left after fusion, and it fuses
     towards each result all that leads to it. So where the step is taken apart there is one result:
-    the numbers of the carry travel as one vector. In a derivative the numbers among the parameters,
-    that is, what `step` closes over, travel with them unchanged: in the reversed loop they are the
-    sums of the derivatives, which else would be results of their own.
+    the numbers of the carry travel as one vector, which is kept as it is. In a derivative the
+    numbers among the parameters, that is, what `step` closes over, travel with them unchanged: in
+    the reversed loop they are the sums of the derivatives, which otherwise would be results of
+    their own.
     """
     program = trace(step, carry, "loop")
     if program is None:
-        return _loop(jax.checkpoint(step), carry, num_steps)
+        with within_equal_steps():
+            return _loop(jax.checkpoint(step), carry, num_steps, keep)
     leaves, structure = jtu.tree_flatten(carry)
     leaves = list(map(jnp.asarray, leaves))
 
-    def of_leaves(leaves: list[Any], parameters: list[Any]) -> list[Any]:
-        carry = jtu.tree_unflatten(structure, leaves)
-        return structure.flatten_up_to(program.run(carry, parameters))
+    def of_leaves(run: Callable[[PyTree, PyTree], PyTree]) -> Callable[..., list[Any]]:
+        return lambda leaves, parameters: structure.flatten_up_to(
+            run(jtu.tree_unflatten(structure, leaves), parameters)
+        )
 
-    leaves = _repeat(
-        leaves, program.parameters, run=of_leaves, num_steps=num_steps, rows=program.rows
+    leaves, kept = _repeat(
+        leaves,
+        program.parameters,
+        step=_Step(of_leaves(program.run), of_leaves(program.plain), program.rows),
+        num_steps=num_steps,
+        is_kept=keep is not None,
     )
-    return jtu.tree_unflatten(structure, leaves)
+    if keep is not None:
+        kept = keep(jtu.tree_unflatten(structure, kept))
+    return jtu.tree_unflatten(structure, leaves), kept
 
 
-def _loop(step: Callable[[PyTree], PyTree], carry: PyTree, num_steps: Any) -> PyTree:
+def _loop(
+    step: Callable[[PyTree], PyTree],
+    carry: PyTree,
+    num_steps: Any,
+    keep: Callable[[PyTree], PyTree] | None,
+) -> tuple[PyTree, PyTree]:
+    def body(carry: PyTree, _: None) -> tuple[PyTree, PyTree]:
+        carry = step(carry)
+        return carry, None if keep is None else keep(carry)
+
     if isinstance(num_steps, int):
-        return lax.scan(lambda carry, _: (step(carry), None), carry, length=num_steps)[0]
-    return lax.fori_loop(0, num_steps, lambda _, carry: step(carry), carry)
+        return lax.scan(body, carry, length=num_steps)
+    return lax.fori_loop(0, num_steps, lambda _, carry: step(carry), carry), None
+
+
+class _Step(NamedTuple):
+    """A step of leaves and parameters that are split, and the same before it was taken apart."""
+
+    run: Callable[[list[Any], list[Any]], list[Any]]
+    plain: Callable[[list[Any], list[Any]], list[Any]]
+    rows: bool
 
 
 @eqx.filter_custom_jvp
@@ -59,23 +90,23 @@ def _repeat(
     leaves: list[Array],
     parameters: list[Array],
     *,
-    run: Callable,
+    step: _Step,
     num_steps: int | Array,
-    rows: bool,
-) -> list[Array]:
+    is_kept: bool,
+) -> tuple[list[Array], list[Array] | None]:
     moves = [True] * len(leaves), [False] * len(parameters)
-    return _scan(run, num_steps, leaves, parameters, moves[0], moves[1], rows)
+    return _scan(step, num_steps, leaves, parameters, moves[0], moves[1], is_kept)
 
 
 @_repeat.def_jvp
-def _(primals, tangents, *, run, num_steps, rows):
+def _(primals, tangents, *, step, num_steps, is_kept):
     moves = [[tangent is not None for tangent in group] for group in tangents]
-    sizes = [len(jtu.tree_leaves(split(x, rows))) for x in primals[1]]
+    sizes = [len(jtu.tree_leaves(split(x, step.rows))) for x in primals[1]]
     if sum(n for n, is_one in zip(sizes, moves[1], strict=True) if is_one) > _MAX_TRAVELLERS:
         moves[1] = [False] * len(sizes)
     return eqx.filter_jvp(
         lambda leaves, parameters: _scan(
-            run, num_steps, leaves, parameters, moves[0], moves[1], rows
+            step, num_steps, leaves, parameters, moves[0], moves[1], is_kept
         ),
         primals,
         tangents,
@@ -83,25 +114,27 @@ def _(primals, tangents, *, run, num_steps, rows):
 
 
 def _scan(
-    run: Callable[[list[Any], list[Any]], list[Any]],
+    step: _Step,
     num_steps: int | Int[Array, ""],
     leaves: list[Array],
     parameters: list[Array],
     leaves_move: Sequence[bool],
     parameters_move: Sequence[bool],
-    rows: bool,
-) -> list[Array]:
+    is_kept: bool,
+) -> tuple[list[Array], list[Array] | None]:
     """The loop, where those parameters travel that are in components, if they move.
 
     Numbers of the carry that do not move, such as what sums have lost, are a vector of their own:
     a derivative does not carry it.
     """
+    rows = step.rows
     moves = [
         is_one
         for x, is_one in zip(leaves, leaves_move, strict=True)
         for _ in jtu.tree_leaves(split(x, rows))
     ]
-    leaves, structure = jtu.tree_flatten(split(leaves, rows))
+    like = split(leaves, rows)
+    leaves, structure = jtu.tree_flatten(like)
     packed = _packed(leaves)
     moves, _ = _partition(moves, packed)
     numbers, rest = _partition(leaves, packed)
@@ -123,27 +156,45 @@ def _scan(
         moving, travellers = found[: sum(moves)], found[sum(moves) : end]
         return _merge(moving, found[end:], moves), travellers
 
-    def step(
-        numbers: list[Array], travellers: list[Array], rest: list[Array], known: Any, others: Any
-    ) -> Any:
-        pieces = _merge(
-            [_borrow(*pair) for pair in zip(known, travellers, strict=True)], others, travels
-        )
-        leaves = run(
-            jtu.tree_unflatten(structure, _merge(numbers, rest, packed)),
-            jtu.tree_unflatten(parameter_structure, pieces),
-        )
-        numbers, rest = _partition(jtu.tree_leaves(leaves), packed)
-        return vectors(numbers, travellers), rest
+    def whole(carry: tuple[list[Array], list[Array]]) -> list[Array]:
+        numbers, _ = entries(carry[0])
+        return join(jtu.tree_unflatten(structure, _merge(numbers, carry[1], packed)))
+
+    def stepped(run: Callable[[list[Any], list[Any]], list[Any]]) -> Callable[..., Any]:
+        def stepped(
+            numbers: list[Array],
+            travellers: list[Array],
+            rest: list[Array],
+            known: Any,
+            others: Any,
+        ) -> Any:
+            pieces = _merge(
+                [_borrow(*pair) for pair in zip(known, travellers, strict=True)], others, travels
+            )
+            leaves = run(
+                jtu.tree_unflatten(structure, _merge(numbers, rest, packed)),
+                jtu.tree_unflatten(parameter_structure, pieces),
+            )
+            numbers, rest = _partition(jtu.tree_leaves(split_like(like, leaves)), packed)
+            return vectors(numbers, travellers), rest
+
+        return stepped
 
     def body(carry: tuple[list[Array], list[Array]]) -> tuple[list[Array], list[Array]]:
         return operation(
-            step, *entries(carry[0]), carry[1], known, others, place="loop", is_batch=rows
+            stepped(step.run),
+            *entries(carry[0]),
+            carry[1],
+            known,
+            others,
+            place="loop",
+            is_batch=rows,
+            plain=stepped(step.plain),
         )
 
-    carried, rest = _loop(body, (vectors(numbers, known), rest), num_steps)
-    numbers, _ = entries(carried)
-    return join(jtu.tree_unflatten(structure, _merge(numbers, rest, packed)))
+    keep = (lambda carry: carry) if is_kept else None
+    carried, kept = _loop(body, (vectors(numbers, known), rest), num_steps, keep)
+    return whole(carried), jax.vmap(whole)(kept) if is_kept else None
 
 
 def _packed(leaves: list[Array]) -> list[bool]:

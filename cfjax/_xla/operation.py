@@ -1,10 +1,13 @@
-"""A program as one operation of JAX, whose derivatives are such operations too.
+"""A program as one operation of JAX, whose first derivative is such an operation too.
 
-A derivative of a program of scalars has several times its operations, and a second derivative
-several times more. Each of them becomes a program of its own here, so that when it is compiled its
-length is known. A long program is a sequence of pieces, between which few values are on their way,
-and its derivatives are sequences of derivatives of the pieces. What is too long for one of XLA's
-functions is compiled as several, with these values sent through memory.
+A derivative of a program of scalars has several times its operations. It becomes a program of its
+own here, so that when it is compiled its length is known. A long program is a sequence of pieces,
+between which few values are on their way, and its derivatives are sequences of derivatives of the
+pieces. What is too long for one of XLA's functions is compiled as several, with these values sent
+through memory.
+
+A derivative that would take too long to compile is JAX's own of the program as it was before it was
+taken apart (`_Plain`).
 """
 
 import functools
@@ -18,6 +21,7 @@ import jax.numpy as jnp
 import jax.tree_util as jtu
 import numpy as np
 from jax import lax
+from jax.core import Tracer
 from jax.extend.core import (
     ClosedJaxpr,
     DropVar,
@@ -43,7 +47,7 @@ from .scope import Place
 _WHOLE = {"loop": (math.inf, 6000, 3000), "step": (math.inf, 3500, 3000)}
 _WHOLE_IN_BATCHES = (math.inf, 4500, 3000)
 _GROUP = 1000
-# A second derivative has up to five times the operations, and should fit.
+# A derivative has up to five times the operations, and should fit.
 _PIECE = 250
 # Of so many directions each is computed on its own.
 _FEW = 16
@@ -54,12 +58,18 @@ _FREE = frozenset(
 
 
 def operation(
-    fun: Callable[..., PyTree], *args: PyTree, place: Place, is_batch: bool = False
+    fun: Callable[..., PyTree],
+    *args: PyTree,
+    place: Place,
+    is_batch: bool = False,
+    plain: Callable[..., PyTree] | None = None,
+    order: int = 1,
 ) -> PyTree:
     """`fun(*args)`, as one operation, of a batch if it is one already.
 
     `fun` may close over traced values, and has no effects. Reverse mode keeps the arguments and
-    computes everything again, as with `jax.checkpoint`.
+    computes everything again, as with `jax.checkpoint`. `plain` is the same function before it was
+    taken apart, and closes over nothing that is traced: derivatives beyond `order` are of that.
     """
     leaves, structure = jtu.tree_flatten(args)
     leaves = list(map(jnp.asarray, leaves))
@@ -71,7 +81,12 @@ def operation(
         out, out_structure = jtu.tree_flatten(jtu.tree_map(jnp.asarray, out))
         return out
 
-    kind = _Kind(place, is_batch=is_batch)
+    def of_plain_leaves(*operands):
+        # What comes first are constants of the program that was taken apart.
+        leaves = operands[len(operands) - structure.num_leaves :]
+        return jtu.tree_leaves(plain(*jtu.tree_unflatten(structure, leaves)))
+
+    kind = _Kind(place, is_batch=is_batch, last=order)
     made = jax.make_jaxpr(of_leaves)(*leaves)
     jaxpr = without_dead_code(made.jaxpr)
     code = jaxpr.replace(
@@ -82,11 +97,46 @@ def operation(
     program = ClosedJaxpr(code, [])
     ends = _places(code)
     if len(ends) > 2:
-        program = _program(
-            functools.partial(_in_pieces, program, ends, kind), *_structs(code.invars)
-        )
-    outs = operation_p.bind(*made.consts, *leaves, program=program, kind=kind)
+        pieces = functools.partial(_in_pieces, program, ends, kind)
+        program = _program(pieces, *_structs(code.invars))
+    is_closed = not any(isinstance(x, Tracer) for x in made.consts)
+    before = None
+    if plain is not None and is_closed:
+        before = _Plain(of_plain_leaves, _structs(code.invars))
+    outs = operation_p.bind(*made.consts, *leaves, program=program, kind=kind, plain=before)
     return jtu.tree_unflatten(out_structure, outs)
+
+
+class _Plain:
+    """The program of an operation before it was taken apart. It is traced if it is needed."""
+
+    def __init__(self, fun: Callable[..., Sequence[Array]], operands: Sequence[Any]):
+        self.fun, self.operands = fun, operands
+
+    @functools.cached_property
+    def program(self) -> ClosedJaxpr:
+        return _program(lambda *leaves: [jnp.asarray(x) for x in self.fun(*leaves)], *self.operands)
+
+    def derived(
+        self,
+        make: Callable[[ClosedJaxpr], Callable[..., Sequence[Array]]],
+        operands: Sequence[Any],
+        takes: Sequence[int],
+        gives: Sequence[int],
+    ) -> "_Plain":
+        """What `make` makes of the program, for some of its operands and results.
+
+        The results depend on no other operands.
+        """
+
+        def fun(*taken: Array) -> list[Array]:
+            values = [jnp.zeros(x.shape, x.dtype) for x in operands]
+            for k, x in zip(takes, taken, strict=True):
+                values[k] = x
+            outs = make(self.program)(*values)
+            return [outs[k] for k in gives]
+
+        return _Plain(fun, [operands[k] for k in takes])
 
 
 def _places(jaxpr: Jaxpr) -> list[int]:
@@ -130,7 +180,7 @@ def _in_pieces(
     env = dict(zip(jaxpr.invars, operands, strict=True))
     for start, stop in itertools.pairwise(ends):
         part, taken, given = _part(jaxpr, start, stop)
-        outs = operation_p.bind(*(env[v] for v in taken), program=part, kind=kind)
+        outs = operation_p.bind(*(env[v] for v in taken), program=part, kind=kind, plain=None)
         env.update(zip(given, outs, strict=True))
     return _results(jaxpr, env)
 
@@ -183,7 +233,7 @@ def _pruned(eqn: JaxprEqn, wanted: set[Any]) -> JaxprEqn:
     return eqn.replace(
         invars=[eqn.invars[k] for k in takes],
         outvars=[eqn.outvars[k] for k in gives],
-        params={"program": program, "kind": kind._replace(linear=linear)},
+        params={"program": program, "kind": kind._replace(linear=linear), "plain": None},
     )
 
 
@@ -205,14 +255,15 @@ def variables(atoms: Iterable[Any]) -> list[Any]:
 
 
 class _Kind(NamedTuple):
-    """Where it runs, how many of the last operands it is linear in, which derivative it is, and
-    whether it is of a batch.
+    """Where it runs, how many of the last operands it is linear in, which derivative it is, whether
+    it is of a batch, and up to which derivative there are operations.
     """
 
     place: Place
     linear: int = 0
     order: int = 0
     is_batch: bool = False
+    last: int = 1
 
 
 operation_p = Primitive("cfjax_operation")
@@ -220,7 +271,7 @@ operation_p.multiple_results = True
 
 
 @operation_p.def_impl
-def _run(*operands, program, kind):
+def _run(*operands, program, kind, plain):
     order = min(kind.order, 2)
     most = _WHOLE[kind.place][order]
     if kind.is_batch:
@@ -334,7 +385,7 @@ def evaluate(jaxpr: Jaxpr, eqn: JaxprEqn, values: Sequence[Any]) -> Sequence[Any
 
 
 # Where newer versions of JAX put types of their own within, they take them out first.
-operation_p.to_lojax = lambda *operands, program, kind: jaxpr_as_fun(program)(*operands)
+operation_p.to_lojax = lambda *operands, program, **_: jaxpr_as_fun(program)(*operands)
 
 
 def _is_inexact(x: Array) -> bool:
@@ -342,21 +393,23 @@ def _is_inexact(x: Array) -> bool:
 
 
 @operation_p.def_abstract_eval
-def _(*operands, program, kind):
+def _(*operands, program, **_):
     return [v.aval for v in program.jaxpr.outvars]
 
 
-def _jvp(primals, tangents, *, program, kind):
-    outs = operation_p.bind(*primals, program=program, kind=kind)
+def _jvp(primals, tangents, *, program, kind, plain):
     moving = [
         k
         for k, (x, tangent) in enumerate(zip(primals, tangents, strict=True))
         if type(tangent) is not ad.Zero and _is_inexact(x)
     ]
+    if moving and plain is not None and kind.order >= kind.last:
+        return _plain_jvp(plain, primals, tangents, moving)
+    outs = operation_p.bind(*primals, program=program, kind=kind, plain=plain)
     smooth = [k for k, x in enumerate(outs) if _is_inexact(x)]
     out_tangents: list[Any] = [ad.Zero(v.aval.to_tangent_aval()) for v in program.jaxpr.outvars]
     if moving and smooth:
-        derivative = _tangent(program, tuple(moving), tuple(smooth))
+        derivative = _tangent(program, plain, tuple(moving), tuple(smooth))
         moved = (tangents[k] for k in moving)
         new = derivative.bind([*primals, *moved], kind._replace(order=kind.order + 1))
         for k, tangent in zip(derivative.gives, new, strict=True):
@@ -364,33 +417,56 @@ def _jvp(primals, tangents, *, program, kind):
     return outs, out_tangents
 
 
+def _plain_jvp(
+    plain: _Plain, primals: Sequence[Any], tangents: Sequence[Any], moving: Sequence[int]
+) -> tuple[Sequence[Any], list[Any]]:
+    def along(*some):
+        outs = jaxpr_as_fun(plain.program)(*_with(primals, moving, some))
+        smooth = [x for x in outs if _is_inexact(x)]
+        return smooth, outs
+
+    points, ways = (tuple(xs[k] for k in moving) for xs in (primals, tangents))
+    _, moved, outs = jax.jvp(along, points, ways, has_aux=True)
+    moved = iter(moved)
+    return outs, [
+        next(moved) if _is_inexact(x) else ad.Zero(jax.typeof(x).to_tangent_aval()) for x in outs
+    ]
+
+
+def _with(values: Sequence[Any], places: Sequence[int], new: Sequence[Any]) -> list[Any]:
+    values = list(values)
+    for k, x in zip(places, new, strict=True):
+        values[k] = x
+    return values
+
+
 @functools.lru_cache(maxsize=256)
-def _tangent(program: ClosedJaxpr, moving: Sequence[int], smooth: Sequence[int]) -> "_Linear":
+def _tangent(
+    program: ClosedJaxpr, plain: _Plain | None, moving: Sequence[int], smooth: Sequence[int]
+) -> "_Linear":
     n = len(program.jaxpr.invars)
 
-    def tangent(*values):
-        primals = values[:n]
+    def tangent_of(program):
+        def tangent(*values):
+            def along(*some):
+                outs = jaxpr_as_fun(program)(*_with(values[:n], moving, some))
+                return [outs[k] for k in smooth]
 
-        def along(*some):
-            all_of_them = list(primals)
-            for k, x in zip(moving, some, strict=True):
-                all_of_them[k] = x
-            outs = jaxpr_as_fun(program)(*all_of_them)
-            return [outs[k] for k in smooth]
+            return jax.jvp(along, tuple(values[k] for k in moving), values[n:])[1]
 
-        return jax.jvp(along, tuple(primals[k] for k in moving), values[n:])[1]
+        return tangent
 
     operands = _structs(program.jaxpr.invars)
-    made = _program(tangent, *operands, *(operands[k] for k in moving))
-    return _linear(made, n, smooth)
+    operands = [*operands, *(operands[k] for k in moving)]
+    return _linear(tangent_of, program, plain, operands, n, smooth)
 
 
-def _transpose(cotangents, *operands, program, kind):
+def _transpose(cotangents, *operands, program, kind, plain):
     unknown = tuple(k for k, x in enumerate(operands) if ad.is_undefined_primal(x))
     coming = tuple(k for k, x in enumerate(cotangents) if type(x) is not ad.Zero)
     results: list[Any] = [None] * len(operands)
     if coming:
-        transposed = _transposed(program, unknown, coming)
+        transposed = _transposed(program, plain, unknown, coming)
         fixed = (x for k, x in enumerate(operands) if k not in unknown)
         come = (cotangents[k] for k in coming)
         new = transposed.bind([*fixed, *come], kind)
@@ -400,30 +476,36 @@ def _transpose(cotangents, *operands, program, kind):
 
 
 @functools.lru_cache(maxsize=256)
-def _transposed(program: ClosedJaxpr, linear: Sequence[int], coming: Sequence[int]) -> "_Linear":
+def _transposed(
+    program: ClosedJaxpr, plain: _Plain | None, linear: Sequence[int], coming: Sequence[int]
+) -> "_Linear":
     structs = _structs(program.jaxpr.invars)
     fixed = [k for k in range(len(structs)) if k not in linear]
 
-    def transposed(*values):
-        known = dict(zip(fixed, values, strict=False))
+    def transpose_of(program):
+        def transposed(*values):
+            known = dict(zip(fixed, values, strict=False))
 
-        def forward(*some):
-            operands = known | dict(zip(linear, some, strict=True))
-            outs = jaxpr_as_fun(program)(*(operands[k] for k in range(len(structs))))
-            return [outs[k] for k in coming]
+            def forward(*some):
+                operands = known | dict(zip(linear, some, strict=True))
+                outs = jaxpr_as_fun(program)(*(operands[k] for k in range(len(structs))))
+                return [outs[k] for k in coming]
 
-        back = jax.linear_transpose(forward, *(structs[k] for k in linear))
-        return back(list(values[len(fixed) :]))
+            back = jax.linear_transpose(forward, *(structs[k] for k in linear))
+            return back(list(values[len(fixed) :]))
+
+        return transposed
 
     cotangents = _structs([program.jaxpr.outvars[k] for k in coming])
-    made = _program(transposed, *(structs[k] for k in fixed), *cotangents)
-    return _linear(made, len(fixed), linear)
+    operands = [*(structs[k] for k in fixed), *cotangents]
+    return _linear(transpose_of, program, plain, operands, len(fixed), linear)
 
 
 class _Linear(NamedTuple):
     """A program that is linear in its last operands."""
 
     program: ClosedJaxpr
+    plain: _Plain | None
     takes: list[int]
     linear: int
     gives: list[int]
@@ -431,17 +513,27 @@ class _Linear(NamedTuple):
     def bind(self, operands: Sequence[Any], kind: _Kind) -> list[Any]:
         taken = (operands[k] for k in self.takes)
         kind = kind._replace(linear=self.linear)
-        return operation_p.bind(*taken, program=self.program, kind=kind)
+        return operation_p.bind(*taken, program=self.program, kind=kind, plain=self.plain)
 
 
-def _linear(program: ClosedJaxpr, first: int, places: Sequence[int]) -> _Linear:
-    """A program that is linear in its operands from `first` on, without what is always zero."""
-    jaxpr = program.jaxpr
-    reached = _reached(jaxpr, jaxpr.invars[first:])
-    outs = enumerate(jaxpr.outvars)
+def _linear(
+    make: Callable[[ClosedJaxpr], Callable[..., Sequence[Array]]],
+    program: ClosedJaxpr,
+    plain: _Plain | None,
+    operands: Sequence[Any],
+    first: int,
+    places: Sequence[int],
+) -> _Linear:
+    """What `make` makes of a program, linear in operands from `first` on, without what is zero."""
+    made = _program(make(program), *operands)
+    reached = _reached(made.jaxpr, made.jaxpr.invars[first:])
+    outs = enumerate(made.jaxpr.outvars)
     gives = [k for k, v in outs if not isinstance(v, Literal) and v in reached]
-    program, takes = _narrowed(program, gives)
-    return _Linear(program, takes, sum(k >= first for k in takes), [places[k] for k in gives])
+    program, takes = _narrowed(made, gives)
+    plain = None if plain is None else plain.derived(make, operands, takes, gives)
+    return _Linear(
+        program, plain, takes, sum(k >= first for k in takes), [places[k] for k in gives]
+    )
 
 
 def _reached(jaxpr: Jaxpr, sources: Iterable[Any]) -> set[Any]:
@@ -460,7 +552,7 @@ def _reached(jaxpr: Jaxpr, sources: Iterable[Any]) -> set[Any]:
     return reached
 
 
-def _batch(operands, dims, *, program, kind):
+def _batch(operands, dims, *, program, kind, plain):
     size = next(x.shape[d] for x, d in zip(operands, dims, strict=True) if d is not None)
     fixed = len(operands) - kind.linear
     if size <= _FEW and all(d is None for d in dims[:fixed]):
@@ -471,20 +563,21 @@ def _batch(operands, dims, *, program, kind):
         def one(some):
             given = dict(enumerate(operands)) | dict(zip(moving, some, strict=True))
             values = (given[k] for k in range(len(operands)))
-            return operation_p.bind(*values, program=program, kind=kind)
+            return operation_p.bind(*values, program=program, kind=kind, plain=plain)
 
         outs = lax.map(one, [jnp.moveaxis(operands[k], dims[k], 0) for k in moving])
         out_dims = [0] * len(outs)
     else:
-        batched, out_dims = _batched(program, tuple(dims), size)
-        outs = operation_p.bind(*operands, program=batched, kind=kind._replace(is_batch=True))
+        batched, plain, out_dims = _batched(program, plain, tuple(dims), size)
+        kind = kind._replace(is_batch=True)
+        outs = operation_p.bind(*operands, program=batched, kind=kind, plain=plain)
     return outs, out_dims
 
 
 @functools.lru_cache(maxsize=256)
 def _batched(
-    program: ClosedJaxpr, dims: tuple[int | None, ...], size: int
-) -> tuple[ClosedJaxpr, list[int | None]]:
+    program: ClosedJaxpr, plain: _Plain | None, dims: tuple[int | None, ...], size: int
+) -> tuple[ClosedJaxpr, _Plain | None, list[int | None]]:
     structs = [
         x if d is None else jax.ShapeDtypeStruct((*x.shape[:d], size, *x.shape[d:]), x.dtype)
         for x, d in zip(_structs(program.jaxpr.invars), dims, strict=True)
@@ -493,8 +586,13 @@ def _batched(
     moving = (v for v, d in zip(jaxpr.invars, dims, strict=True) if d is not None)
     reached = _reached(jaxpr, moving)
     out_dims = [0 if not isinstance(v, Literal) and v in reached else None for v in jaxpr.outvars]
-    batched = jax.vmap(jaxpr_as_fun(program), in_axes=dims, out_axes=out_dims)
-    return _program(batched, *structs), out_dims
+
+    def batch_of(program):
+        return jax.vmap(jaxpr_as_fun(program), in_axes=dims, out_axes=out_dims)
+
+    if plain is not None:
+        plain = plain.derived(batch_of, structs, range(len(structs)), range(len(out_dims)))
+    return _program(batch_of(program), *structs), plain, out_dims
 
 
 def _program(fun: Callable[..., Sequence[Array]], *structs: Any) -> ClosedJaxpr:

@@ -14,6 +14,7 @@ import jax
 import jax.numpy as jnp
 import jax.tree_util as jtu
 import numpy as np
+from jax import lax
 from jax.core import Tracer
 from jax.extend.core import (
     ClosedJaxpr,
@@ -21,14 +22,12 @@ from jax.extend.core import (
     JaxprEqn,
     Literal,
     jaxpr_as_fun,
-    jaxprs_in_params,
 )
 from jaxtyping import Array, PyTree
 
-from .columns import Columns, columns, in_columns
+from .columns import Columns, columns, conformed, in_columns
 from .components import (
     MOVES,
-    REDUCTIONS,
     Components,
     components,
     in_components,
@@ -47,10 +46,13 @@ from .scope import (
     is_on,
     is_rows,
     is_short,
+    rewriting,
     unread,
     where,
     within,
 )
+from .smooth import by_fixed, has_reciprocals
+from .understood import REDUCTIONS, is_in_place, is_readable
 
 # A state is taken apart if all of it is numbers and short vectors, so many entries together, and if
 # a step is not longer than that, counted in operations on single numbers: the time to compile grows
@@ -60,11 +62,13 @@ _MAX_ENTRIES: dict[Place, int] = {"step": 16, "loop": 34}
 _MAX_OPERATIONS = 4000
 # One that is longer is more than one of XLA's functions, and is cut.
 _SHORT = 2000
+# Of a longer step that stands alone, not in a loop of equal steps, derivatives are left to JAX: a
+# gradient through diffrax's loop would take two to three times as long to compile.
+_SHORT_TO_DIFFERENTIATE = 1000
 # About as many combine the stages of a long method.
 _COMBINATIONS = 1000
 
 _CALLS = frozenset(("jit", "pjit"))
-_CONTROL = frozenset(("cond", "scan", "while"))
 
 
 def split(tree: PyTree, rows: bool = False) -> PyTree:
@@ -76,6 +80,17 @@ def split(tree: PyTree, rows: bool = False) -> PyTree:
         return columns(x) if rows and is_rows(x) else x
 
     return jtu.tree_map(apart, tree, is_leaf=_is_apart)
+
+
+def split_like(other: PyTree, tree: PyTree) -> PyTree:
+    """The tree taken apart as another one of its structure, shapes and dtypes is."""
+
+    def apart(like: Any, x: Any) -> Any:
+        if isinstance(like, Columns):
+            return conformed(x, like)
+        return components(x) if isinstance(like, Components) else _whole(x)
+
+    return jtu.tree_map(apart, other, tree, is_leaf=_is_apart)
 
 
 def join(tree: PyTree) -> PyTree:
@@ -96,23 +111,29 @@ def by_components(fun: Callable[[PyTree], PyTree], y: PyTree) -> PyTree:
 
     The result agrees with that of `fun` to rounding. `fun` may close over traced values. Operations
     that have no rule here get the array whole. Where `y` is another state, the program is too long
-    or cannot be read, and inside of `trace`, this is `fun(y)`.
-
-    Divisions by what no `y` changes become products with the reciprocal, as XLA does for literals:
-    a loop then computes the reciprocal once, and a division would be a barrier to fusion.
+    or cannot be taken apart, and inside of `trace`, this is `fun(y)`.
     """
     program = None if where() else trace(fun, y, "step")
     if program is None:
         return fun(y)
+    y, parameters = split((y, program.parameters), program.rows)
     # What is around may use single entries, so that XLA computes anew what these share. It does
     # little harm to a step, but much to a derivative.
-    y, parameters = _held(split((y, program.parameters), program.rows))
+    is_derived = program.length <= _SHORT_TO_DIFFERENTIATE
+    through = _held if is_derived else lambda x: x
     # The derivative of an adaptive loop computes a step at one place and uses its derivative at
     # another. What that needs of the step is many numbers: to compute them again is cheaper than to
     # send them there through memory.
-    out = operation(program.run, y, parameters, place="step", is_batch=program.rows)
+    out = operation(
+        program.run,
+        *through((y, parameters)),
+        place="step",
+        is_batch=program.rows,
+        plain=program.plain,
+        order=1 if is_derived else 0,
+    )
     # One by one: what nobody uses is not computed.
-    return jtu.tree_map(lambda x: _whole(_held(x)), out, is_leaf=_is_apart)
+    return jtu.tree_map(lambda x: _whole(through(x)), out, is_leaf=_is_apart)
 
 
 def are_long(fun: Callable[[PyTree], PyTree], y: PyTree, times: int) -> bool:
@@ -122,22 +143,28 @@ def are_long(fun: Callable[[PyTree], PyTree], y: PyTree, times: int) -> bool:
 
 
 class Program(NamedTuple):
-    """A function that can be taken apart, and what it closes over.
+    """A function that is taken apart, and what it closes over.
 
     `run(y, parameters)` takes both split, returns what is split and closes over nothing traced.
-    With `rows` the state has short vectors along leading axes, and is to be split so.
+    `plain` is the same, but for how it computes: as the function does. With `rows` the state has
+    short vectors along leading axes, and is to be split so. `length` counts operations.
     """
 
     run: Callable[[PyTree, PyTree], PyTree]
+    plain: Callable[[PyTree, PyTree], PyTree]
     parameters: list[Array]
     rows: bool
+    length: int
+
+
+class _Declined(Exception):
+    """A program has something that is not to be taken apart."""
 
 
 def trace(fun: Callable[[PyTree], PyTree], y: PyTree, place: Place) -> Program | None:
-    """`fun` as a program to take apart at `y`; None if that does not pay or cannot be done.
+    """`fun` as a program that is taken apart at `y`; None if that does not pay or cannot be done.
 
-    It must have no effects, no branches or loops, and no function with a rule for reverse mode
-    alone.
+    It must have no effects and be readable (`is_readable`).
     """
     rows = _has_rows(y, _MAX_ENTRIES[place])
     if not is_on() or not (rows or _is_small_state(y, _MAX_ENTRIES[place])):
@@ -145,35 +172,53 @@ def trace(fun: Callable[[PyTree], PyTree], y: PyTree, place: Place) -> Program |
     with within(place, rows):
         jaxpr, out = jax.make_jaxpr(fun, return_shape=True)(y)
     structure = jtu.tree_structure(out)
-    consts = [_constant(x) for x in jaxpr.consts]
     try:
         code = without_dead_code(jaxpr.jaxpr)
-        if jaxpr.effects or not _is_readable(code):
-            return None
         num_operations = _operations(code)
-        if num_operations > _MAX_OPERATIONS:
+        if jaxpr.effects or not is_readable(code) or num_operations > _MAX_OPERATIONS:
             return None
     except Exception as error:
         return unread(error)
+    before = ClosedJaxpr(code, jaxpr.consts)
+    if place == "loop" or num_operations > _SHORT_TO_DIFFERENTIATE:
+        # Where a step is not taken apart its stages may be one loop.
+        with rewriting(False):
+            rolled, shape = jax.make_jaxpr(fun, return_shape=True)(y)
+        before = rolled if jtu.tree_structure(shape) == structure else before
+    unknown = {id(x): x for x in (*jaxpr.consts, *before.consts) if _constant(x) is None}
+    number = {key: k for k, key in enumerate(unknown)}
 
-    def run(y: PyTree, parameters: PyTree) -> PyTree:
-        rest = iter(parameters)
-        values = [next(rest) if x is None else x for x in consts]
-        moving = jtu.tree_leaves(y, is_leaf=_is_apart)
-        fixed = [True] * len(values) + [False] * len(moving)
-        try:
-            outs, _ = _evaluate(code, (*values, *moving), fixed, rows, num_operations > _SHORT)
-        except Exception as error:
-            unread(error)
-            outs = jaxpr_as_fun(ClosedJaxpr(code, list(map(_whole, values))))(*map(_whole, moving))
+    def values(consts: Sequence[Any], parameters: PyTree) -> list[Any]:
+        return [parameters[number[id(x)]] if id(x) in number else _constant(x) for x in consts]
+
+    def apart(y: PyTree, parameters: PyTree) -> PyTree:
+        first, moving = values(jaxpr.consts, parameters), jtu.tree_leaves(y, is_leaf=_is_apart)
+        fixed = [True] * len(first) + [False] * len(moving)
+        form = _Form(rows, num_operations > _SHORT, has_reciprocals(code, fixed))
+        outs, _ = _evaluate(code, (*first, *moving), fixed, form)
         # What is known before the program runs may come out as NumPy's.
         outs = [x if _is_apart(x) else jnp.asarray(x) for x in outs]
         return split(jtu.tree_unflatten(structure, outs), rows)
 
-    parameters = [
-        jnp.asarray(x) for x, known in zip(jaxpr.consts, consts, strict=True) if known is None
-    ]
-    return Program(run, parameters, rows)
+    parameters = list(map(jnp.asarray, unknown.values()))
+    try:
+        shapes = jax.eval_shape(lambda *args: split(args, rows), y, parameters)
+        made, out = jax.make_jaxpr(apart, return_shape=True)(*shapes)
+    except _Declined:
+        return None
+    except Exception as error:
+        return unread(error)
+
+    def run(y: PyTree, parameters: PyTree) -> PyTree:
+        outs = jaxpr_as_fun(made)(*jtu.tree_leaves((y, parameters)))
+        return jtu.tree_unflatten(jtu.tree_structure(out), outs)
+
+    def plain(y: PyTree, parameters: PyTree) -> PyTree:
+        closed = ClosedJaxpr(before.jaxpr, list(map(_whole, values(before.consts, parameters))))
+        outs = jaxpr_as_fun(closed)(*jtu.tree_leaves(join(y)))
+        return split_like(out, jtu.tree_unflatten(structure, outs))
+
+    return Program(run, plain, parameters, rows, num_operations)
 
 
 def _constant(x: Any) -> np.ndarray | None:
@@ -199,20 +244,6 @@ def _has_rows(y: PyTree, max_entries: int) -> bool:
         any(map(is_rows, leaves))
         and all(map(is_numeric, leaves))
         and sum(map(_entries, map(np.shape, leaves))) <= max_entries
-    )
-
-
-def _is_readable(jaxpr: Jaxpr) -> bool:
-    """Whether there are no branches and loops, nor functions with a rule for reverse mode alone.
-
-    Branches and loops stay whole, as in the exponential of a matrix. What is around them, taken
-    apart, XLA would compute anew for each of the entries that go in.
-    """
-    return all(
-        eqn.primitive.name not in _CONTROL
-        and "custom_vjp" not in eqn.primitive.name
-        and all(map(_is_readable, jaxprs_in_params(eqn.params)))
-        for eqn in jaxpr.eqns
     )
 
 
@@ -246,8 +277,20 @@ def _entries(shape: tuple[int, ...]) -> int:
     return shape[-1] if len(shape) > 1 and shape[-1] <= MAX_LENGTH else 1
 
 
+class _Form(NamedTuple):
+    """How a program is taken apart.
+
+    Whether arrays have leading axes, the program is long, and products with reciprocals take the
+    place of divisions by what is fixed.
+    """
+
+    rows: bool
+    is_long: bool
+    has_reciprocals: bool
+
+
 def _evaluate(
-    jaxpr: Jaxpr, values: Sequence[Any], fixed: Sequence[bool], rows: bool, is_long: bool
+    jaxpr: Jaxpr, values: Sequence[Any], fixed: Sequence[bool], form: _Form
 ) -> tuple[list[Any], list[bool]]:
     """What a program makes of values for its constants and arguments, some of which are fixed.
 
@@ -267,6 +310,8 @@ def _evaluate(
         env[variable] = components(value) if is_small(value) else value
         if not is_one:
             loose.add(variable)
+    # Each reciprocal once.
+    reciprocals: dict[int, tuple[Any, Any]] = {}
     for eqn in jaxpr.eqns:
         values = [read(v) for v in eqn.invars]
         fixed = [is_fixed(v) for v in eqn.invars]
@@ -275,10 +320,20 @@ def _evaluate(
             inner = eqn.params["jaxpr"]
             constants = [True] * len(inner.consts)
             outs, outs_fixed = _evaluate(
-                inner.jaxpr, (*inner.consts, *values), (*constants, *fixed), rows, is_long
+                inner.jaxpr, (*inner.consts, *values), (*constants, *fixed), form
             )
         else:
-            outs = _apart(jaxpr, eqn, values, fixed, rows, is_long)
+            if form.has_reciprocals and by_fixed(eqn, fixed):
+                key = id(values[1])
+                if key not in reciprocals:
+                    one = jtu.tree_map(lambda x: lax.integer_pow(x, -1), values[1])
+                    # With the divisor, so that it is not forgotten and its identity used again.
+                    reciprocals[key] = one, values[1]
+                eqn = eqn.replace(primitive=lax.mul_p, params=_PARAMETERS_OF_A_PRODUCT)
+                values[1] = reciprocals[key][0]
+            outs = _apart(jaxpr, eqn, values, fixed, form)
+            if outs is None and is_in_place(eqn):
+                raise _Declined
             if outs is None:
                 outs = map(split, evaluate(jaxpr, eqn, list(map(_whole, values))))
         env.update(zip(eqn.outvars, outs, strict=True))
@@ -286,22 +341,26 @@ def _evaluate(
     return [read(v) for v in jaxpr.outvars], [is_fixed(v) for v in jaxpr.outvars]
 
 
+# As a version of JAX has them.
+_PARAMETERS_OF_A_PRODUCT = jax.make_jaxpr(lax.mul)(1.0, 1.0).jaxpr.eqns[0].params
+
+
 def _apart(
-    jaxpr: Jaxpr, eqn: JaxprEqn, values: list[Any], fixed: Sequence[bool], rows: bool, is_long: bool
+    jaxpr: Jaxpr, eqn: JaxprEqn, values: list[Any], fixed: Sequence[bool], form: _Form
 ) -> Sequence[Any] | None:
     """The results of one operation, taken apart, if there is a rule for it, else None."""
     if eqn.primitive is held_p:
-        if eqn.params["is_cut"] and not is_long:
+        if eqn.params["is_cut"] and not form.is_long:
             return values
         # What is whole is in memory anyway.
         groups = [jtu.tree_flatten(x) for x in values]
         new = iter(held([x for group, _ in groups for x in group], **eqn.params))
         return [shape.unflatten(next(new) for _ in group) for group, shape in groups]
-    if rows:
+    if form.rows:
         sizes = (math.prod(getattr(v.aval, "shape", ())) for v in (*eqn.invars, *eqn.outvars))
         if any(isinstance(x, Columns) for x in values) or max(sizes) > MAX_SIZE:
             return in_columns(eqn, values, fixed)
-    return in_components(jaxpr, eqn, values, fixed)
+    return in_components(jaxpr, eqn, values)
 
 
 def _held(tree: Any) -> Any:

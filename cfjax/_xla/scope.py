@@ -3,9 +3,7 @@
 import contextlib
 import os
 import warnings
-from collections.abc import Iterator
-from contextvars import ContextVar
-from typing import Any, Literal
+from typing import Any, Literal, NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -55,37 +53,52 @@ def unread(error: Exception) -> None:
 
 
 Place = Literal["step", "loop"]
-_place: ContextVar[Place | None] = ContextVar("place", default=None)
-_has_rows: ContextVar[bool] = ContextVar("has_rows", default=False)
 
 
-@contextlib.contextmanager
-def within(place: Place, rows: bool) -> Iterator[None]:
+class _Around(NamedTuple):
+    """What is taken apart around a function that is being traced."""
+
+    place: Place | None = None
+    has_rows: bool = False
+    in_equal_steps: bool = False
+
+
+# JAX traces anew where it changes, so that a function that is jitted, or cached otherwise, is
+# traced for the place in which it is called.
+_around = jax.make_user_context(_Around())
+
+
+def within(place: Place, rows: bool) -> contextlib.AbstractContextManager:
     """The time in which a program is traced that is to be taken apart as a whole.
 
     With `rows` its state has short vectors along leading axes.
     """
-    tokens = _place.set(place), _has_rows.set(rows)
-    try:
-        yield
-    finally:
-        _place.reset(tokens[0])
-        _has_rows.reset(tokens[1])
+    return _around(_around.value._replace(place=place, has_rows=rows))
+
+
+def within_equal_steps() -> contextlib.AbstractContextManager:
+    """The time in which a step is traced that a loop makes, but not taken apart as a whole."""
+    return _around(_around.value._replace(in_equal_steps=True))
+
+
+def in_equal_steps() -> bool:
+    """Whether a loop of equal steps is around here."""
+    return _around.value.in_equal_steps
 
 
 def where() -> Place | None:
     """What is taken apart around here: one step, or a loop of many."""
-    return _place.get()
+    return _around.value.place
 
 
 def has_rows() -> bool:
     """Whether short vectors along leading axes are taken apart around here."""
-    return _has_rows.get()
+    return _around.value.has_rows
 
 
 def is_rewritten() -> bool:
     """Whether this is part of a program that is taken apart."""
-    return _place.get() is not None
+    return where() is not None
 
 
 def is_short(x: Any) -> bool:
@@ -100,4 +113,6 @@ def is_rows(x: Any) -> bool:
 
 
 def is_numeric(x: Any) -> bool:
-    return any(jnp.issubdtype(jnp.result_type(x), kind) for kind in (np.number, np.bool_))
+    # `jnp.result_type` knows no PRNG keys.
+    dtype = x.dtype if hasattr(x, "dtype") else jnp.result_type(x)
+    return any(jnp.issubdtype(dtype, kind) for kind in (np.number, np.bool_))

@@ -11,7 +11,7 @@ from jaxtyping import Array, PyTree, Real
 from .operation import operation
 from .pack import pack, unpack
 from .program import join, split, trace
-from .scope import is_on, is_short, where
+from .scope import in_equal_steps, is_on, is_short, where
 
 
 def table(
@@ -47,10 +47,19 @@ def table(
         if program is None:
             return to_vector(fun(x, from_vector(vector)))
 
-        def run(numbers: list[Array], parameters: PyTree) -> Array:
-            return to_vector(program.run(jtu.tree_unflatten(structure, numbers), parameters))
+        def vector_of(run: Callable[[PyTree, PyTree], PyTree]) -> Callable[[Any, Any], Array]:
+            return lambda numbers, parameters: to_vector(
+                run(jtu.tree_unflatten(structure, numbers), parameters)
+            )
 
-        return operation(run, unpack(vector), split(program.parameters), place="step")
+        return operation(
+            vector_of(program.run),
+            unpack(vector),
+            split(program.parameters),
+            place="step",
+            plain=vector_of(program.plain),
+            order=1 if in_equal_steps() else 0,
+        )
 
     def body(vectors: Array, turn: Any) -> Any:
         k, row, x = turn

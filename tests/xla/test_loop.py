@@ -56,7 +56,7 @@ def plain(carry, parameters):
 
 
 def looped(carry, parameters):
-    return repeat(lambda c: mix(c, parameters), carry, NUM_STEPS)
+    return repeat(lambda c: mix(c, parameters), carry, NUM_STEPS)[0]
 
 
 def scalar(run):
@@ -100,7 +100,7 @@ def test_a_number_of_steps_that_is_traced(case):
     @jax.jit
     def several(case, num_steps):
         carry, parameters = case
-        return repeat(lambda c: mix(c, parameters), carry, num_steps)
+        return repeat(lambda c: mix(c, parameters), carry, num_steps)[0]
 
     close(several(case, jnp.asarray(NUM_STEPS)), jax.jit(plain)(*case), case)
     # The same program.
@@ -156,7 +156,7 @@ def test_only_what_is_differentiated():
                 return y + jnp.sin(a * y) / (1 + jax.jit(lambda: b * b)())
 
             if repeated:
-                return jnp.sum(repeat(step, VECTOR, NUM_STEPS))
+                return jnp.sum(repeat(step, VECTOR, NUM_STEPS)[0])
             return jnp.sum(lax.fori_loop(0, NUM_STEPS, lambda _, y: step(y), VECTOR))
 
         return jax.jacfwd(jax.grad(fun, 1), 0)(VECTOR, jnp.asarray(0.7)), jax.grad(fun)(VECTOR, 0.7)
@@ -189,7 +189,7 @@ def test_a_derivative_does_not_carry_what_has_none(rewritten):
 
         carry = x, jnp.zeros(3)
         if repeated:
-            carry = repeat(step, carry, NUM_STEPS)
+            carry = repeat(step, carry, NUM_STEPS)[0]
         else:
             carry = lax.scan(lambda c, _: (step(c), None), carry, length=NUM_STEPS)[0]
         return jnp.sum(carry[0])

@@ -1,0 +1,112 @@
+"""Where a division by a parameter may be a product with its reciprocal.
+
+XLA materialises a division, which cuts a program of numbers in two: the gradient of a loop of small
+steps takes six times as long. The product differs from the quotient in the last bit. That is
+rounding to what is smooth, but not to a comparison, a floor or an index: `49 * (1 / 49)` is less
+than 1. So a program has products only if nothing but smooth operations makes anything of them.
+"""
+
+import functools
+from collections.abc import Callable, Sequence
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+from jax.extend.core import Jaxpr, JaxprEqn, Literal
+
+from .understood import is_understood
+
+_SCOPE = "cfjax_smooth"
+# Functions that are smooth wherever they have values, and those that only move entries or add them.
+_SMOOTH = frozenset(
+    "acos acosh add add_any asin asinh atan atan2 atanh broadcast_in_dim cbrt cfjax_pack "
+    "cfjax_unpack complex concatenate conj copy cos cosh cumprod cumsum div dot_general erf exp "
+    "exp2 expm1 fft imag integer_pow log log1p logistic mul neg pad pow real reduce_prod "
+    "reduce_sum reshape rev rsqrt scatter-add scatter-mul sin sinh slice split sqrt square squeeze "
+    "stack stop_gradient sub tan tanh transpose".split()
+)
+# Which of their operands may be what a division gives. The others are indices and predicates.
+_SMOOTH_IN_PART = {
+    "dynamic_slice": slice(1),
+    "dynamic_update_slice": slice(2),
+    "gather": slice(1),
+    "scatter": slice(0, None, 2),
+    "select_n": slice(1, None),
+}
+_CALLS = {"custom_jvp_call": "call_jaxpr", "jit": "jaxpr", "pjit": "jaxpr"}
+
+
+def smooth(fun: Callable[..., Any]) -> Callable[..., Any]:
+    """`fun`, which is smooth up to rounding, although it compares or rounds numbers.
+
+    As a function does that has a series for small arguments and a closed form for others.
+    """
+
+    @functools.wraps(fun)
+    def within_scope(*args: Any) -> Any:
+        with jax.named_scope(_SCOPE):
+            return fun(*args)
+
+    return within_scope
+
+
+def has_reciprocals(jaxpr: Jaxpr, fixed: Sequence[bool]) -> bool:
+    """Whether divisions by what is fixed may be products; `fixed` says it of all arguments."""
+    is_fixed = dict(zip((*jaxpr.constvars, *jaxpr.invars), fixed, strict=True))
+    try:
+        _follow(jaxpr, is_fixed, set(), False)
+    except _NotSmooth:
+        return False
+    return True
+
+
+class _NotSmooth(Exception):
+    pass
+
+
+def by_fixed(eqn: JaxprEqn, fixed: Sequence[bool]) -> bool:
+    """Whether this is a real division by what is fixed, of what is not."""
+    aval: Any = eqn.outvars[0].aval
+    is_real = jnp.issubdtype(aval.dtype, jnp.floating)
+    return eqn.primitive.name == "div" and list(fixed) == [False, True] and is_real
+
+
+def _follow(jaxpr: Jaxpr, is_fixed: dict[Any, bool], inexact: set[Any], is_smooth: bool) -> None:
+    """Follows what comes of divisions: the variables whose last bits may differ, `inexact`."""
+    for eqn in jaxpr.eqns:
+        fixed = [isinstance(v, Literal) or is_fixed[v] for v in eqn.invars]
+        reached = [not isinstance(v, Literal) and v in inexact for v in eqn.invars]
+        name = eqn.primitive.name
+        within = is_smooth or _SCOPE in str(getattr(eqn.source_info, "name_stack", ""))
+        is_fixed.update((v, all(fixed)) for v in eqn.outvars)
+        if name in _CALLS:
+            inner: Any = eqn.params[_CALLS[name]].jaxpr
+            known = dict(zip(inner.invars, fixed, strict=True))
+            known.update((v, True) for v in inner.constvars)
+            some = {v for v, is_one in zip(inner.invars, reached, strict=True) if is_one}
+            _follow(inner, known, some, within)
+            for v, out in zip(eqn.outvars, inner.outvars, strict=True):
+                is_fixed[v] = isinstance(out, Literal) or known[out]
+                if not isinstance(out, Literal) and out in some:
+                    inexact.add(v)
+        elif any(reached):
+            if not within and not _is_smooth(eqn, reached):
+                raise _NotSmooth
+            inexact.update(eqn.outvars)
+        elif by_fixed(eqn, fixed):
+            inexact.update(eqn.outvars)
+
+
+def _is_smooth(eqn: JaxprEqn, reached: Sequence[bool]) -> bool:
+    name = eqn.primitive.name
+    if name == "cfjax_held":
+        return True
+    if name == "convert_element_type":
+        aval: Any = eqn.outvars[0].aval
+        return jnp.issubdtype(aval.dtype, jnp.inexact)
+    if not is_understood(eqn):
+        return False
+    if name in _SMOOTH_IN_PART:
+        places = range(len(reached))
+        return not any(reached[k] for k in places if k not in places[_SMOOTH_IN_PART[name]])
+    return name in _SMOOTH
