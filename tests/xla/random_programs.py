@@ -14,9 +14,11 @@ import re
 import string
 import sys
 import time
+import traceback
 import warnings
 from collections import Counter
 from collections.abc import Callable, Iterator
+from pathlib import Path
 from typing import Any, NamedTuple
 
 import jax
@@ -27,6 +29,9 @@ from jax import lax
 
 import cfjax
 from cfjax._xla import by_components
+
+sys.path.insert(0, str(Path(__file__).parent))
+from interpreter import run
 
 # What the text of a program may use.
 
@@ -363,7 +368,7 @@ class Maker(string.Formatter):
         else:
             self.state = state
             self.state_text = "{" + ", ".join(f'"{k}": {v}' for k, v in texts.items()) + "}"
-        self.namespace = dict(globals(), y=self.state, p=self.parameters)
+        self.made: dict[str, Any] = {}
 
     def _literal(self, x: np.ndarray, seed: int) -> str:
         if x.size > 16 or not np.all(np.isfinite(x)):
@@ -398,7 +403,7 @@ class Maker(string.Formatter):
 
     def _parameter(self, shape: tuple[int, ...], dtype: str, kind: str | None = None) -> str:
         old = [
-            k for k, x in enumerate(self.parameters) if x.shape == shape and str(x.dtype) == dtype
+            k for k, x in enumerate(self.parameters) if (x.shape, str(x.dtype)) == (shape, dtype)
         ]
         if old and kind is None:
             return f"p[{self.rng.choice(old)}]"
@@ -673,8 +678,9 @@ class Maker(string.Formatter):
                 text = self.vformat(template, (), {})
                 if "key" in text:
                     text = text.replace("(key", f"(jax.random.key({self.rng.randint(0, 9)})")
-                x = eval(text, self.namespace)
-                if not isinstance(x, jax.Array) or x.size > self._largest() or x.ndim > 4:
+                moving = {"y": self.state, "p": self.parameters} | self.made
+                x = run(lambda given, t=text: eval(t, globals() | given), moving)
+                if not isinstance(x, np.ndarray) or x.size > self._largest() or x.ndim > 4:
                     raise Unfit
                 exact = is_exact(x) and not self.inexact_used
             except Exception:
@@ -688,7 +694,7 @@ class Maker(string.Formatter):
                 )
             self.lines.append(f"{name} = {text}")
             self.exact.append(exact)
-            self.namespace[name] = x
+            self.made[name] = x
             self.values.append(Value(name, x, exact))
             return
 
@@ -829,15 +835,30 @@ def batch(fun: Callable[..., Any]) -> Callable[..., Any]:
     return of
 
 
-KINDS: dict[str, Callable[[Callable[..., Any]], Callable[..., Any]]] = {
-    "value": lambda fun: fun,
-    "grad": gradient,
-    "jvp": tangent,
-    "vmap": batch,
-    "jit": jax.jit,
-    "jit of known parameters": lambda fun: lambda y, p: jax.jit(lambda y: fun(y, p))(y),
-    "jit of grad": lambda fun: jax.jit(gradient(fun)),
-    "jit of vmap": lambda fun: jax.jit(batch(fun)),
+# What of a program is compared, and whether XLA compiles it. What it does not, NumPy evaluates.
+KINDS: dict[str, tuple[Callable[[Callable[..., Any]], Callable[..., Any]], bool]] = {
+    "value": (lambda fun: fun, False),
+    "grad": (gradient, False),
+    "jvp": (tangent, False),
+    "vmap": (batch, False),
+    "grad of vmap": (lambda fun: gradient(batch(fun)), False),
+    "jvp of grad": (lambda fun: tangent(gradient(fun)), False),
+    "jit": (lambda fun: fun, True),
+    "jit of grad": (gradient, True),
+    "jit of vmap": (batch, True),
+}
+
+
+CHANCES = {
+    "value": 1.0,
+    "grad": 0.3,
+    "jvp": 0.1,
+    "vmap": 0.1,
+    "grad of vmap": 0.03,
+    "jvp of grad": 0.03,
+    "jit": 0.02,
+    "jit of grad": 0.01,
+    "jit of vmap": 0.01,
 }
 
 
@@ -955,37 +976,43 @@ def _agree(a: np.ndarray, b: np.ndarray, tolerance: Any, unstable: Any) -> np.nd
 
 def failure(program: Program, kind: str, found: Counter | None = None) -> str | None:
     """How the rewritten program differs, under one transformation; None if it does not."""
-    transform, fun = KINDS[kind], program.function()
+    transform, is_compiled = KINDS[kind]
     y, p = program.state, program.parameters
-    # Eager references: what XLA makes of a whole program is under test, too.
-    plain = KINDS[kind.removeprefix("jit of ").replace("known parameters", "value")] \
-        if kind != "jit" else KINDS["value"]  # fmt: skip
+    is_known = program.seed % 2 == 1
+
+    def result(change: Callable[..., Any], compiled: bool, nudge: Any = None) -> Any:
+        fun = program.function(nudge)
+        execute = (lambda fun, *args: jax.jit(fun)(*args)) if compiled else run
+        if is_known:
+            return execute(lambda y: transform(change(lambda y, _: fun(y, p)))(y, []), y)
+        return execute(transform(change(fun)), y, p)
+
+    def as_it_is(fun):
+        return fun
+
     with warnings.catch_warnings():
         warnings.simplefilter("ignore")
         with cfjax.rewriting(False):
             try:
-                want = plain(fun)(y, p)
+                want = result(as_it_is, False)
             except Exception:
+                if found is not None:
+                    found["cannot be run"] += 1
                 return None
         warnings.filterwarnings("error", message="cfjax could not")
         try:
             with cfjax.rewriting(True):
-                got = transform(rewritten(fun))(y, p)
+                got = result(rewritten, is_compiled)
         except Exception as error:
-            try:
-                with cfjax.rewriting(False):
-                    jax.eval_shape(lambda y, p: transform(fun)(y, p), y, p)
-            except Exception:
-                if found is not None:
-                    found["skipped"] += 1
-                return None
-            return f"{type(error).__name__}: {str(error)[:500]}"
+            lines = traceback.extract_tb(error.__traceback__)
+            where = [f"{line.name}:{line.lineno}" for line in lines if "/_xla/" in line.filename]
+            return f"{type(error).__name__}: {str(error)[:400]} ({where[-1:]})"
 
         def noise() -> list[Any]:
             with cfjax.rewriting(False):
-                trees = [plain(program.function(nudge(k)))(y, p) for k in range(RUNS)]
+                trees = [result(as_it_is, False, nudge(k)) for k in range(RUNS)]
                 # XLA's own liberties are no fault of the rewriting.
-                return trees + ([transform(fun)(y, p)] if transform is not plain else [])
+                return trees + ([result(as_it_is, True)] if is_compiled else [])
 
         return difference(got, want, noise)
 
@@ -993,12 +1020,11 @@ def failure(program: Program, kind: str, found: Counter | None = None) -> str | 
 def kinds_of(program: Program, always_jit: bool = False) -> Iterator[str]:
     rng = random.Random(-program.seed)
     yield "value"
-    for kind, chance in {"grad": 0.3, "jvp": 0.1, "vmap": 0.1}.items():
-        if rng.random() < chance:
-            yield kind
-    chances = {"jit": 0.06, "jit of known parameters": 0.02, "jit of grad": 0.02, "jit of vmap": 0.01}
-    for kind, chance in chances.items():
-        if rng.random() < (1 if always_jit and kind == "jit" else chance * (5 if always_jit else 1)):
+    for kind, (_, is_compiled) in KINDS.items():
+        chance = CHANCES[kind]
+        if always_jit and is_compiled:
+            chance = 1.0 if kind == "jit" else 10 * chance
+        if kind != "value" and rng.random() < chance:
             yield kind
 
 
@@ -1034,8 +1060,9 @@ def main() -> int:
                         break
                 else:
                     program_to_print = program
+                known = ", parameters known" if seed % 2 else ""
                 text = program_to_print.text()
-                print(f"# seed {seed}, {kind}: {message}\n{text}", flush=True)
+                print(f"# seed {seed}, {kind}{known}: {message}\n{text}", flush=True)
         # A compiled program keeps memory maps; a process may have 65 530.
         if number % 2000 == 1999 or (number % 50 == 49 and _num_maps() > 40000):
             jax.clear_caches()
