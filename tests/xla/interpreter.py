@@ -6,6 +6,7 @@ to agree with XLA only where that says what the result is.
 
 import math
 import operator
+from collections import Counter
 from collections.abc import Callable, Sequence
 from typing import Any
 
@@ -13,7 +14,10 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import scipy.special
-from jax.extend.core import ClosedJaxpr, Jaxpr, Literal
+from jax.extend.core import ClosedJaxpr, DropVar, Jaxpr, Literal, jaxpr_as_fun
+
+# How often each primitive has been met.
+calls: Counter[str] = Counter()
 
 _CALLS = {"jit": "jaxpr", "pjit": "jaxpr", "closed_call": "call_jaxpr", "core_call": "call_jaxpr",
           "custom_jvp_call": "call_jaxpr", "custom_vjp_call": "call_jaxpr", "checkpoint": "jaxpr",
@@ -43,7 +47,7 @@ def evaluate(jaxpr: Jaxpr, consts: Sequence[Any], *args: Any) -> list[Any]:
 
     for eqn in jaxpr.eqns:
         values = list(map(read, eqn.invars))
-        outs = _apply(eqn, values)
+        outs = _apply(jaxpr, eqn, values)
         for v, x in zip(eqn.outvars, outs, strict=True):
             aval: Any = v.aval
             if isinstance(x, np.ndarray | np.generic | float | int | complex):
@@ -56,8 +60,9 @@ def evaluate(jaxpr: Jaxpr, consts: Sequence[Any], *args: Any) -> list[Any]:
     return list(map(read, jaxpr.outvars))
 
 
-def _apply(eqn: Any, values: list[Any]) -> Sequence[Any]:
+def _apply(jaxpr: Jaxpr, eqn: Any, values: list[Any]) -> Sequence[Any]:
     name, params = eqn.primitive.name, eqn.params
+    calls[name] += 1
     if name in _CALLS and _CALLS[name] in params:
         inner = params[_CALLS[name]]
         if isinstance(inner, ClosedJaxpr):
@@ -68,20 +73,27 @@ def _apply(eqn: Any, values: list[Any]) -> Sequence[Any]:
     if any(not isinstance(x, np.ndarray) for x in values) or any(
         x.dtype.kind == "V" or x.dtype.name == "bfloat16" for x in values
     ):
-        return _by_jax(eqn, values)
+        return _by_jax(jaxpr, eqn, values)
     rule = _RULES.get(name)
     if rule is None:
-        return _by_jax(eqn, values)
+        return _by_jax(jaxpr, eqn, values)
     out = rule(*values, aval=eqn.outvars[0].aval, **params)
     if out is NotImplemented:
-        return _by_jax(eqn, values)
+        return _by_jax(jaxpr, eqn, values)
     return out if eqn.primitive.multiple_results else [out]
 
 
-def _by_jax(eqn: Any, values: list[Any]) -> Sequence[Any]:
-    subfuns, params = eqn.primitive.get_bind_params(eqn.params)
-    out = eqn.primitive.bind(*subfuns, *map(jnp.asarray, values), **params)
-    return list(map(array, out if eqn.primitive.multiple_results else [out]))
+def _by_jax(jaxpr: Jaxpr, eqn: Any, values: list[Any]) -> Sequence[Any]:
+    known = {v: x for v, x in zip(eqn.invars, values, strict=True) if not isinstance(v, Literal)}
+    alone = jaxpr.replace(
+        constvars=[],
+        invars=list(known),
+        outvars=[v for v in eqn.outvars if not isinstance(v, DropVar)],
+        eqns=[eqn],
+        debug_info=jaxpr.debug_info.with_unknown_names(),
+    )
+    outs = iter(jaxpr_as_fun(ClosedJaxpr(alone, []))(*map(jnp.asarray, known.values())))
+    return [None if isinstance(v, DropVar) else array(next(outs)) for v in eqn.outvars]
 
 
 def _cond(values: list[Any], params: dict[str, Any]) -> list[Any]:
@@ -189,7 +201,11 @@ def _select_n(which, *cases, **_):
     which = np.broadcast_to(which.astype(int), cases[0].shape)
     if len(cases) == 1:
         return cases[0]
-    return np.choose(which, cases, mode="clip") if len(cases) > 2 else np.where(which, cases[1], cases[0])
+    return (
+        np.choose(which, cases, mode="clip")
+        if len(cases) > 2
+        else np.where(which, cases[1], cases[0])
+    )
 
 
 def _broadcast(x, *dynamic, aval, shape, broadcast_dimensions, **_):
@@ -201,6 +217,10 @@ def _broadcast(x, *dynamic, aval, shape, broadcast_dimensions, **_):
 
 def _reshape(x, *, aval, dimensions=None, **_):
     return (x if dimensions is None else x.transpose(dimensions)).reshape(aval.shape)
+
+
+def _same_order(x, *, aval, **_):
+    return x.reshape(aval.shape)
 
 
 def _slice(x, *, aval, start_indices, limit_indices, strides, **_):
@@ -241,7 +261,9 @@ def _dynamic_update_slice(x, update, *starts, **_):
 def _reduction(fun, initial):
     def rule(x, *, aval, axes, **_):
         if any(x.shape[k] == 0 for k in axes):
-            return np.full(aval.shape, initial, aval.dtype) if initial is not None else NotImplemented
+            return (
+                np.full(aval.shape, initial, aval.dtype) if initial is not None else NotImplemented
+            )
         if initial is None and x.dtype.kind == "c":
             return NotImplemented
         options = {"dtype": x.dtype} if fun in (np.sum, np.prod) else {}
@@ -307,9 +329,7 @@ def _gather(x, indices, *, aval, dimension_numbers, slice_sizes, mode, fill_valu
             ends = np.iinfo(x.dtype)
             fill_value = ends.min if kind == "i" else ends.max
     for place, start in _places(x.shape, indices, numbers, "gather"):
-        inside = all(
-            0 <= s <= n - m for s, n, m in zip(start, x.shape, slice_sizes, strict=True)
-        )
+        inside = all(0 <= s <= n - m for s, n, m in zip(start, x.shape, slice_sizes, strict=True))
         if fills and not inside:
             out[place] = fill_value
         else:
@@ -414,7 +434,7 @@ _RULES: dict[str, Callable[..., Any]] = {
     "dot_general": _dot,
     "dynamic_slice": _dynamic_slice,
     "dynamic_update_slice": _dynamic_update_slice,
-    "expand_dims": _reshape,
+    "expand_dims": _same_order,
     "gather": _gather,
     "integer_pow": _integer_pow,
     "not": lambda x, *, aval: np.logical_not(x) if x.dtype == bool else np.invert(x),
@@ -436,21 +456,28 @@ _RULES: dict[str, Callable[..., Any]] = {
     "scatter-min": _scatter(np.minimum),
     "scatter-mul": _scatter(operator.mul),
     "select_n": _select_n,
+    "shift_left": lambda x, y, *, aval: np.where(y < 8 * x.itemsize, x << y, 0),
+    "stop_gradient": lambda x, *, aval, **_: x,
+    "lt_to": _real_only(operator.lt),
+    "le_to": _real_only(operator.le),
+    "unstack": lambda x, *, aval, axis, **_: [x.take(k, axis) for k in range(x.shape[axis])],
     "sign": _sign,
     "slice": _slice,
     "sort": _sort,
     "split": _split,
-    "squeeze": _reshape,
+    "squeeze": _same_order,
     "stack": lambda *xs, aval, axis, **_: np.stack(xs, axis),
     "transpose": lambda x, *, aval, permutation: x.transpose(permutation),
-    "iota": lambda *xs, aval, dimension, shape, **_: np.broadcast_to(
-        np.arange(shape[dimension]).reshape(
-            [-1 if k == dimension else 1 for k in range(len(shape))]
-        ),
-        shape,
-    )
-    if math.prod(shape)
-    else np.zeros(shape),
+    "iota": lambda *xs, aval, dimension, shape, **_: (
+        np.broadcast_to(
+            np.arange(shape[dimension]).reshape(
+                [-1 if k == dimension else 1 for k in range(len(shape))]
+            ),
+            shape,
+        )
+        if math.prod(shape)
+        else np.zeros(shape)
+    ),
 }
 for _name in ("scatter_add", "scatter_max", "scatter_min", "scatter_mul"):
     _RULES[_name] = _RULES[_name.replace("_", "-")]
