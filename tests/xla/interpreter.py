@@ -189,6 +189,10 @@ def _sign(x, *, aval, **_):
     return np.where(x == 0, x, np.sign(x)) if x.dtype.kind == "f" else np.sign(x)
 
 
+def _any(fun):
+    return lambda *xs, aval, **_: fun(*xs)
+
+
 def _real_only(fun):
     return lambda *xs, aval, **_: NotImplemented if xs[0].dtype.kind == "c" else fun(*xs)
 
@@ -384,7 +388,7 @@ _UNARY = {
     "sin": np.sin, "cos": np.cos, "exp": np.exp, "exp2": np.exp2, "log": np.log,
     "log1p": np.log1p, "expm1": np.expm1, "sqrt": np.sqrt, "neg": np.negative,
     "real": np.real, "imag": np.imag, "conj": np.conj, "square": np.square, "abs": np.abs,
-    "is_finite": np.isfinite, "copy": np.copy, "copy_p": np.copy, "optimization_barrier": None,
+    "is_finite": np.isfinite, "copy": np.copy, "copy_p": np.copy,
 }  # fmt: skip
 _REAL = {
     "tan": np.tan, "tanh": np.tanh, "sinh": np.sinh, "cosh": np.cosh, "asin": np.arcsin,
@@ -410,11 +414,7 @@ def _complex_of(x, y, *, aval, **_):
 
 
 _RULES: dict[str, Callable[..., Any]] = {
-    **{
-        k: (lambda f: lambda *xs, aval, **_: f(*xs))(f)
-        for k, f in (_UNARY | _BINARY).items()
-        if f is not None
-    },
+    **{k: _any(f) for k, f in (_UNARY | _BINARY).items()},
     **{k: _real_only(f) for k, f in _REAL.items()},
     "argmax": _arg(np.argmax),
     "argmin": _arg(np.argmin),

@@ -47,7 +47,9 @@ def draw(seed, shape, dtype, values):
             return rng.integers(-2, 3, shape).astype(float)
         x = rng.normal(size=shape)
         if values == "special":
-            some = rng.choice([np.nan, np.inf, -np.inf, 0.0, -0.0, 1.0], shape)
+            ends = np.finfo(dtype)
+            some = [np.nan, np.inf, -np.inf, 0.0, -0.0, 1.0, ends.tiny / 4, ends.max / 2]
+            some = rng.choice(np.array(some, float), shape)
             x = np.where(rng.random(shape) < 0.2, some, x)
         return x
 
@@ -76,9 +78,10 @@ def both(a, b):
     return a * b, jnp.where(a > b, a, b) if not jnp.iscomplexobj(a) else a - b
 
 
-# Templates. Fields: x is a value, f a real or complex one, r a real one, i an integer one, v a
-# vector, m a square matrix, s a number; like broadcasts with x, same has its shape and dtype; axis
-# is one of x, and at an index along it. Those with a letter and nothing else are drawn once a line.
+# Templates, apart by " | " and by lines. Fields: x is a value, f a real or complex one, r a real
+# one, i an integer one, v a vector, m a square matrix, s a number; like broadcasts with x, same has
+# its shape and dtype; axis is one of x, and at an index along it, far one that may be outside.
+# Those in `ONCE` are drawn once a line.
 
 ARITHMETIC = """
 {x} + {like} | {x} - {like} | {x} * {like} | {f} / {like} | {like} / {f} | -{x} | {x} ** {small}
@@ -101,8 +104,9 @@ lax.rsqrt({f}) | jax.scipy.special.erf({r}) | jnp.exp2({r}) | jnp.arcsinh({f}) |
 jnp.square({x}) | jnp.rint({r}) | jnp.deg2rad({r}) | jnp.cosh({f}) | jnp.i0({r}) | lax.erf_inv({r})
 jnp.conj({x}) | jnp.real({x}) | jnp.imag({x}) | jnp.angle({f}) | lax.complex({r}, {r})
 jnp.nan_to_num({f}) | jnp.nan_to_num({f}, nan=2.0, posinf=1.0) | lax.reduce_precision({r}, 8, 7)
-lax.stop_gradient({f}) | {f} * lax.stop_gradient({f}) | jnp.frexp({r})[{zero_or_one}] | lax.lgamma({r})
-jnp.modf({r})[{zero_or_one}] | jnp.positive({x}) | lax.round({r}, lax.RoundingMethod.TO_NEAREST_EVEN)
+lax.stop_gradient({f}) | {f} * lax.stop_gradient({f}) | jnp.frexp({r})[{zero_or_one}]
+lax.lgamma({r}) | jnp.modf({r})[{zero_or_one}] | jnp.positive({x})
+lax.round({r}, lax.RoundingMethod.TO_NEAREST_EVEN)
 lax.round({r}, lax.RoundingMethod.AWAY_FROM_ZERO) | lax.integer_pow({f}, {small}) | jnp.log2({f})
 jnp.arccos({r} / 4) | jnp.tan({f}) | jax.scipy.special.xlogy({r}, {r}) | lax.digamma({r})
 """
@@ -114,9 +118,10 @@ jnp.clip({x}, {like}) | lax.clamp({number}, {r}, {number} + 2.0) | {x} > {like} 
 {x} != {like} | {x} <= {like} | jnp.isfinite({f}) | jnp.isnan({f}) | jnp.isclose({x}, {like})
 jnp.logical_and({bool}, {bool}) | jnp.logical_not({x}) | jnp.logical_xor({x}, {like}) | ~{bool}
 {bool} * {x} | {bool} + {x} | lax.select({bool}, {x}, {same}) | jnp.where({bool}, {f} / {f}, 1)
-jnp.where({x} > 0, jnp.log(jnp.where({x} > 0, {x}, 1)), 0) | jnp.select([{bool}, {x} > 0], [{x}, -{x}])
-jnp.piecewise({r}, [{r} > 0, {r} < -1], [jnp.sin, 2.0]) | jnp.where(jnp.isnan({f}), 0, {f})
-jnp.where({x} > {like}, {x}, {like}) | jnp.choose(({s} > 0).astype(int), [{x}, -{x}]) | jnp.signbit({r})
+jnp.where({x} > 0, jnp.log(jnp.where({x} > 0, {x}, 1)), 0)
+jnp.select([{bool}, {x} > 0], [{x}, -{x}]) | jnp.piecewise({r}, [{r} > 0, {r} < -1], [jnp.sin, 2.0])
+jnp.where(jnp.isnan({f}), 0, {f}) | jnp.where({x} > {like}, {x}, {like})
+jnp.choose(({s} > 0).astype(int), [{x}, -{x}]) | jnp.signbit({r})
 lax.select_n(({s} > 0).astype(jnp.int32), {x}, {same}) | jnp.array_equal({x}, {like})
 lax.select_n({index_array_of_x}, {x}, {same}, {x}) | jnp.isinf({f}) | jnp.iscomplex({f})
 """
@@ -127,129 +132,231 @@ jnp.prod({x}) | jnp.max({x}) | jnp.max({x}, {axis}) | jnp.min({x}, {axis}, keepd
 jnp.mean({f}) | jnp.mean({f}, {axis}, keepdims=True) | jnp.var({f}) | jnp.std({f}, {axis})
 jnp.median({r}) | jnp.any({x} > 0) | jnp.all({x} > 0, {axis}) | jnp.any({x}, {axis}) | jnp.all({x})
 jnp.cumsum({x}, {axis}) | jnp.cumprod({x}, {axis}) | lax.cumsum({x}, {axis}, reverse=True)
-lax.cumprod({x}, {axis}, reverse=True) | lax.cummax({r}, {axis}) | lax.cummin({r}, {axis}, reverse=True)
-lax.cumlogsumexp({r}, {axis}) | jnp.argmax({r}) | jnp.argmax({r}, {axis}) | jnp.argmin({r}, {axis})
-lax.argmax({r}, {axis}, jnp.int32) | jnp.count_nonzero({x}) | jnp.ptp({r}) | jnp.nansum({x}) | jnp.nanmax({r})
+lax.cumprod({x}, {axis}, reverse=True) | lax.cummax({r}, {axis})
+lax.cummin({r}, {axis}, reverse=True) | lax.cumlogsumexp({r}, {axis}) | jnp.argmax({r})
+jnp.argmax({r}, {axis}) | jnp.argmin({r}, {axis}) | lax.argmax({r}, {axis}, jnp.int32)
+jnp.count_nonzero({x}) | jnp.ptp({r}) | jnp.nansum({x}) | jnp.nanmax({r})
 jnp.average({f}, weights={same}) | jnp.quantile({r}, 0.3) | jnp.diff({x}, axis={axis})
-lax.reduce({x}, np.asarray(1, {x}.dtype), lax.mul, ({axis},)) | lax.reduce({r}, np.asarray(0, {r}.dtype), lax.max, ({axis},))
-lax.reduce({x}, {x}.ravel()[0], lax.add, ({axis},)) | jnp.sum({x}, where={bool}) | jnp.max({r}, where={bool}, initial=0)
+lax.reduce({x}, np.asarray(1, {x}.dtype), lax.mul, ({axis},))
+lax.reduce({r}, np.asarray(0, {r}.dtype), lax.max, ({axis},))
+lax.reduce({x}, {x}.ravel()[0], lax.add, ({axis},)) | jnp.sum({x}, where={bool})
+jnp.max({r}, where={bool}, initial=0)
 lax.reduce_window({r}, np.asarray(-9, {r}.dtype), lax.max, {windows}, {strides}, "SAME")
 lax.reduce_window({x}, np.asarray(0, {x}.dtype), lax.add, {windows}, {strides}, "VALID")
-lax.reduce_and({bool}, ({axis},)) | lax.reduce_or({bool}, ({axis},)) | jnp.trapezoid({f}, axis={axis})
-jnp.prod({x}, where={bool}) | jnp.cumsum({bool}, {axis}) | jnp.ediff1d({x}) | jnp.gradient({f}, axis={axis})
-lax.reduce_xor({i}, ({axis},)) | jnp.sum({bool}) | jnp.mean({x}, dtype=jnp.float32) | jnp.sum({x}, dtype=complex)
-lax.reduce(({r}, {r} + 1), (np.asarray(0, {r}.dtype), np.asarray(1, {r}.dtype)), lambda a, b: (a[0] + b[0], a[1] * b[1]), ({axis},))[{zero_or_one}]
+lax.reduce_and({bool}, ({axis},)) | lax.reduce_or({bool}, ({axis},))
+jnp.trapezoid({f}, axis={axis}) | jnp.prod({x}, where={bool}) | jnp.cumsum({bool}, {axis})
+jnp.ediff1d({x}) | jnp.gradient({f}, axis={axis}) | lax.reduce_xor({i}, ({axis},)) | jnp.sum({bool})
+jnp.mean({x}, dtype=jnp.float32) | jnp.sum({x}, dtype=complex)
+lax.reduce(({r}, {r} + 1), (np.asarray(0, {r}.dtype), np.asarray(1, {r}.dtype)), lambda a, b: \
+(a[0] + b[0], a[1] * b[1]), ({axis},))[{zero_or_one}]
 """
 
 MOVES = """
-jnp.roll({x}, {shift}) | jnp.roll({x}, {shift}, {axis}) | jnp.flip({x}, {axis}) | jnp.flip({x}) | {x}[::-1]
-jnp.tile({x}, 2) | jnp.tile({x}, (2, 1)) | jnp.repeat({x}, 2, {axis}) | jnp.repeat({x}, 2) | jnp.ravel({x})
+jnp.roll({x}, {shift}) | jnp.roll({x}, {shift}, {axis}) | jnp.flip({x}, {axis}) | jnp.flip({x})
+{x}[::-1] | jnp.tile({x}, 2) | jnp.tile({x}, (2, 1)) | jnp.repeat({x}, 2, {axis})
+jnp.repeat({x}, 2) | jnp.ravel({x})
 jnp.repeat({v}, np.arange({v}.size) % 3, total_repeat_length=4) | jnp.ravel({x}, order="F") | {x}.T
 jnp.reshape({x}, (1, *{x}.shape)) | jnp.reshape({x}, (-1, 1)) | jnp.reshape({x}, {shape_of_x})
 jnp.reshape({x}, {shape_of_x}, order="F") | lax.reshape({x}, {shape_of_x}, {permutation})
-lax.transpose({x}, {permutation}) | jnp.moveaxis({x}, {axis}, {another}) | jnp.swapaxes({x}, {axis}, {another})
-jnp.stack([{x}, {same}]) | jnp.stack([{x}, {same}, {x}], -1) | jnp.stack([{x}, {same}], {axis})
-jnp.concatenate([{x}, {same}], {axis}) | jnp.concatenate([{x}, {x}[:0], {same}]) | jnp.hstack([{x}, {same}])
-jnp.concatenate([{x}[1:], {x}[:1]]) | jnp.concatenate([{x}[..., :0], {x}], -1) | jnp.split({x}, [1], {axis})[{zero_or_one}]
-jnp.concatenate([{x}[..., 1:], {x}[..., :2]], -1) | jnp.split({x}, [0, 2], {axis})[{zero_or_one}]
-jnp.array_split({x}, 2, {axis})[{zero_or_one}] | jnp.unstack({x}, axis={axis})[-1] | jnp.expand_dims({x}, {axis})
-jnp.squeeze({x}) | jnp.broadcast_to({x}, (2, *{x}.shape)) | jnp.broadcast_to({x}[:1], {x}.shape) | {x}[None]
-lax.broadcast_in_dim({x}, ({x}.shape[0], 2, *{x}.shape[1:]), (0, *range(2, {x}.ndim + 1))) | {x}[..., None]
-lax.rev({x}, ({axis},)) | jnp.rot90({m}) | jnp.pad({x}, {pads}, mode="{pad_mode}") | jnp.pad({x}, 1)
-jnp.pad({x}, {pads}, constant_values=2) | lax.pad({x}, np.asarray(2, {x}.dtype), {lax_pads}) | lax.pad({x}, {x}.ravel()[0], {lax_pads})
-jnp.delete({v}, 0) | jnp.insert({v}, 1, 2) | jnp.append({v}, {s}) | jnp.diag({v}) | jnp.diag({v}, 1) | jnp.diag({m})
-jnp.tril({m}) | jnp.triu({m}, 1) | jnp.diagonal({m}) | jnp.vander({v}, 3) | jnp.resize({x}, (2, 3)) | jnp.atleast_2d({x})
-jnp.meshgrid({v}, {v})[{zero_or_one}] | jnp.block([[{v}, {v}], [{v}, {v}]]) | jnp.fft.fftshift({x}, {axis}) | {x}.at[{at}].get()
-jnp.stack([{s}, {s}, {s} * 2]) | jnp.array([{s}, 1, {s}]) | jnp.full((3,), {s}) | jnp.full_like({x}, {s}) | jnp.zeros_like({x})
-jnp.linspace({s}, 1, 4) | jnp.arange({x}.size) * {s} | jnp.eye({x}.shape[-1]) * {s} | jnp.ones_like({x}) | lax.full_like({x}, 3)
-jnp.linspace({v}, 2 * {v}, 3) | jnp.column_stack([{v}, {v}]) | jnp.geomspace(1.0 + {s} * {s}, 2.0, 3) | jnp.vstack([{x}, {same}])
-lax.tile({x}, (2,) * {x}.ndim) | jnp.rollaxis({x}, {axis}) | lax.broadcasted_iota({x}.dtype, (3, 2), {zero_or_one}) * {s}
-lax.reshape({x}, (int(np.prod({x}.shape)),), {permutation}) | jnp.transpose({x}) | lax.squeeze({x}[None], (0,)) | lax.expand_dims({x}, (0, {x}.ndim + 1))
+lax.transpose({x}, {permutation}) | jnp.moveaxis({x}, {axis}, {another})
+jnp.swapaxes({x}, {axis}, {another}) | jnp.stack([{x}, {same}]) | jnp.stack([{x}, {same}, {x}], -1)
+jnp.stack([{x}, {same}], {axis}) | jnp.concatenate([{x}, {same}], {axis})
+jnp.concatenate([{x}, {x}[:0], {same}]) | jnp.hstack([{x}, {same}])
+jnp.concatenate([{x}[1:], {x}[:1]]) | jnp.concatenate([{x}[..., :0], {x}], -1)
+jnp.split({x}, [1], {axis})[{zero_or_one}] | jnp.concatenate([{x}[..., 1:], {x}[..., :2]], -1)
+jnp.split({x}, [0, 2], {axis})[{zero_or_one}] | jnp.array_split({x}, 2, {axis})[{zero_or_one}]
+jnp.unstack({x}, axis={axis})[-1] | jnp.expand_dims({x}, {axis}) | jnp.squeeze({x})
+jnp.broadcast_to({x}, (2, *{x}.shape)) | jnp.broadcast_to({x}[:1], {x}.shape) | {x}[None]
+lax.broadcast_in_dim({x}, ({x}.shape[0], 2, *{x}.shape[1:]), (0, *range(2, {x}.ndim + 1)))
+{x}[..., None] | lax.rev({x}, ({axis},)) | jnp.rot90({m}) | jnp.pad({x}, {pads}, mode="{pad_mode}")
+jnp.pad({x}, 1) | jnp.pad({x}, {pads}, constant_values=2)
+lax.pad({x}, np.asarray(2, {x}.dtype), {lax_pads}) | lax.pad({x}, {x}.ravel()[0], {lax_pads})
+jnp.delete({v}, 0) | jnp.insert({v}, 1, 2) | jnp.append({v}, {s}) | jnp.diag({v}) | jnp.diag({v}, 1)
+jnp.diag({m}) | jnp.tril({m}) | jnp.triu({m}, 1) | jnp.diagonal({m}) | jnp.vander({v}, 3)
+jnp.resize({x}, (2, 3)) | jnp.atleast_2d({x}) | jnp.meshgrid({v}, {v})[{zero_or_one}]
+jnp.block([[{v}, {v}], [{v}, {v}]]) | jnp.fft.fftshift({x}, {axis}) | {x}.at[{at}].get()
+jnp.stack([{s}, {s}, {s} * 2]) | jnp.array([{s}, 1, {s}]) | jnp.full((3,), {s})
+jnp.full_like({x}, {s}) | jnp.zeros_like({x}) | jnp.linspace({s}, 1, 4) | jnp.arange({x}.size) * {s}
+jnp.eye({x}.shape[-1]) * {s} | jnp.ones_like({x}) | lax.full_like({x}, 3)
+jnp.linspace({v}, 2 * {v}, 3) | jnp.column_stack([{v}, {v}])
+jnp.geomspace(1.0 + {s} * {s}, 2.0, 3) | jnp.vstack([{x}, {same}]) | lax.tile({x}, (2,) * {x}.ndim)
+jnp.rollaxis({x}, {axis}) | lax.broadcasted_iota({x}.dtype, (3, 2), {zero_or_one}) * {s}
+lax.reshape({x}, (int(np.prod({x}.shape)),), {permutation}) | jnp.transpose({x})
+lax.squeeze({x}[None], (0,)) | lax.expand_dims({x}, (0, {x}.ndim + 1))
 """
 
 INDEXING = """
-{x}[{at}] | {x}[..., {last_at}] | {x}[1:] | {x}[::2] | {x}[::-1] | {x}[-2:] | {x}[{index_array}] | {x}[..., ::-1]
-{x}[..., 1:] | {x}[..., ::-2] | {x}[..., {last_array}] | {x}[{traced_at}] | {x}[..., {traced_at}] | {x}[{traced_array}]
-jnp.take({x}, {index_array}, axis={axis}, mode="{take_mode}") | jnp.take({x}, {far}) | jnp.take({x}, {traced_array}, axis={axis})
-jnp.take({x}, {far}, axis={axis}, mode="fill", fill_value=7) | jnp.take({x}, {far}, axis={axis}) | jnp.take({x}, {index_array}, mode="wrap")
-jnp.take_along_axis({r}, jnp.argsort({r}, {axis}), {axis}) | jnp.take_along_axis({x}, {index_array_of_x}, {axis}, mode="clip")
-{x}.at[{far}].get(mode="{mode}") | {x}.at[{far}].get(mode="fill", fill_value=3) | {x}.at[{index_array}].get(mode="promise_in_bounds")
-{x}.at[{far_array}].get(mode="{mode}") | {x}.at[{far_array}].get(mode="fill", fill_value=-1) | {x}.at[..., {far}].get(mode="{mode}", fill_value=2)
-{x}.at[{traced_at}].get(mode="{mode}", fill_value=5) | {x}.at[..., {far_array}].get(mode="{mode}") | {x}[{far}] | {x}[{far_array}]
-lax.dynamic_slice({x}, {starts}, {sizes}) | lax.dynamic_slice({x}, {traced_starts}, {sizes}) | lax.dynamic_index_in_dim({x}, {far}, {axis})
-lax.dynamic_index_in_dim({x}, {traced_at}, {axis}, keepdims=False) | lax.dynamic_slice_in_dim({x}, {far}, 1, {axis}) | lax.index_take({x}, ({index_array},), (0,))
-lax.slice_in_dim({x}, 0, 2, 1, {axis}) | lax.slice({x}, {low_limits}, {high_limits}, {slice_strides}) | {x}[jnp.argmax({r})] | {x}[np.array([True] * 1 + [False] * ({x}.shape[0] - 1))]
-jnp.compress([False, True], {x}, axis={axis}) | jnp.extract({bool}, {x}, size=2, fill_value=1) | {x}[({x} > 0).astype(int)] | {v}[{m}.astype(int) % {v}.size] | jnp.nonzero({x}, size=2)[0]
-lax.gather({x}, {gather_indices}, lax.GatherDimensionNumbers(tuple(range(1, {x}.ndim)), (0,), (0,)), (1, *{x}.shape[1:]), mode="{mode}")
-lax.gather({x}, {gather_indices}, lax.GatherDimensionNumbers(tuple(range(1, {x}.ndim + 1)), (), (0,)), (1, *{x}.shape[1:]), mode="{gather_mode}", fill_value=4)
-jnp.trace({m}) | {m}[{index_array}, {index_array}] | {m}[:, {at}] | {m}[{at}] | {m}[np.ix_([0, 1], [1, 0])] | {m}[jnp.triu_indices({m}.shape[-1])] | {x}[{at}:] | {m}[{at}, 1:]
-jax.ops.segment_sum({v}, np.arange({v}.size) % 2, 3) | jax.ops.segment_max({v}, np.arange({v}.size) % 2, 2) | jnp.bincount({i}.ravel() % 3, length=4) | jnp.bincount({i}.ravel(), length=3)
+{x}[{at}] | {x}[..., {last_at}] | {x}[1:] | {x}[::2] | {x}[::-1] | {x}[-2:] | {x}[{index_array}]
+{x}[..., ::-1] | {x}[..., 1:] | {x}[..., ::-2] | {x}[..., {last_array}] | {x}[{traced_at}]
+{x}[..., {traced_at}] | {x}[{traced_array}]
+jnp.take({x}, {index_array}, axis={axis}, mode="{take_mode}") | jnp.take({x}, {far})
+jnp.take({x}, {traced_array}, axis={axis})
+jnp.take({x}, {far}, axis={axis}, mode="fill", fill_value=7) | jnp.take({x}, {far}, axis={axis})
+jnp.take({x}, {index_array}, mode="wrap")
+jnp.take_along_axis({r}, jnp.argsort({r}, {axis}), {axis})
+jnp.take_along_axis({x}, {index_array_of_x}, {axis}, mode="clip") | {x}.at[{far}].get(mode="{mode}")
+{x}.at[{far}].get(mode="fill", fill_value=3) | {x}.at[{index_array}].get(mode="promise_in_bounds")
+{x}.at[{far_array}].get(mode="{mode}") | {x}.at[{far_array}].get(mode="fill", fill_value=-1)
+{x}.at[..., {far}].get(mode="{mode}", fill_value=2)
+{x}.at[{traced_at}].get(mode="{mode}", fill_value=5) | {x}.at[..., {far_array}].get(mode="{mode}")
+{x}[{far}] | {x}[{far_array}] | lax.dynamic_slice({x}, {starts}, {sizes})
+lax.dynamic_slice({x}, {traced_starts}, {sizes}) | lax.dynamic_index_in_dim({x}, {far}, {axis})
+lax.dynamic_index_in_dim({x}, {traced_at}, {axis}, keepdims=False)
+lax.dynamic_slice_in_dim({x}, {far}, 1, {axis}) | lax.index_take({x}, ({index_array},), (0,))
+lax.slice_in_dim({x}, 0, 2, 1, {axis})
+lax.slice({x}, {low_limits}, {high_limits}, {slice_strides}) | {x}[jnp.argmax({r})]
+{x}[np.array([True] * 1 + [False] * ({x}.shape[0] - 1))]
+jnp.compress([False, True], {x}, axis={axis}) | jnp.extract({bool}, {x}, size=2, fill_value=1)
+{x}[({x} > 0).astype(int)] | {v}[{m}.astype(int) % {v}.size] | jnp.nonzero({x}, size=2)[0]
+lax.gather({x}, {gather_indices}, lax.GatherDimensionNumbers(tuple(range(1, {x}.ndim)), (0,), \
+(0,)), (1, *{x}.shape[1:]), mode="{mode}")
+lax.gather({x}, {gather_indices}, lax.GatherDimensionNumbers(tuple(range(1, {x}.ndim + 1)), (), \
+(0,)), (1, *{x}.shape[1:]), mode="{gather_mode}", fill_value=4) | jnp.trace({m})
+{m}[{index_array}, {index_array}] | {m}[:, {at}] | {m}[{at}] | {m}[np.ix_([0, 1], [1, 0])]
+{m}[jnp.triu_indices({m}.shape[-1])] | {x}[{at}:] | {m}[{at}, 1:]
+jax.ops.segment_sum({v}, np.arange({v}.size) % 2, 3)
+jax.ops.segment_max({v}, np.arange({v}.size) % 2, 2) | jnp.bincount({i}.ravel() % 3, length=4)
+jnp.bincount({i}.ravel(), length=3)
 """
 
 UPDATES = """
-{x}.at[{at}].set({number}) | {x}.at[{at}].add({s}) | {x}.at[{at}].multiply({number}) | {x}.at[{at}].divide({number}) | {x}.at[{at}].set({x}[{at}])
-{x}.at[{at}].power(2) | {x}.at[{at}].min({number}) | {x}.at[{at}].max({s}) | {x}.at[{at}].apply(jnp.sin) | {x}.at[{at}].apply(lambda a: a * a + 1)
-{x}.at[{index_array}].set({number}) | {x}.at[{index_array}].add({number}) | {x}.at[{index_array}].multiply({number}) | {x}.at[{index_array}].max({number})
-{x}.at[{index_array}].apply(jnp.square) | {x}.at[{far}].set({number}) | {x}.at[{far}].add({number}, mode="{mode}") | {x}.at[{far_array}].add({number}, mode="{mode}")
-{x}.at[{far_array}].set({number}, mode="{mode}") | {x}.at[{far_array}].multiply({s}, mode="{mode}") | {x}.at[{far_array}].min({number}, mode="{mode}") | {x}.at[{far_array}].apply(jnp.cos, mode="{mode}")
-{x}.at[{traced_at}].set({number}) | {x}.at[{traced_at}].add({s}) | {x}.at[{traced_array}].add({number}) | {x}.at[{traced_array}].set({number}, mode="{mode}")
-{x}.at[..., {last_at}].set({number}) | {x}.at[..., {last_at}].add({x}[..., 0]) | {x}.at[..., {last_array}].add({number}) | {x}.at[..., {last_at}].multiply({s})
-{x}.at[..., {last_at}].set({x}[..., -1]) | {x}.at[..., {last_array}].set({number}) | {x}.at[..., {last_at}].max({number}) | {x}.at[..., {last_array}].apply(jnp.square)
-{x}.at[1:].set({number}) | {x}.at[:2].add({x}[-2:]) | {x}.at[::2].multiply({number}) | {x}.at[::-1].set({same}) | {x}.at[...].add({like}) | {x}.at[..., 1:].set({x}[..., :-1])
-{x}.at[..., :1].divide({number}) | {x}.at[..., :2].power(2) | {x}.at[{bool}].set({number}) | {x}.at[{at}].add({s}, unique_indices=True) | {x}.at[{at}].subtract({s})
-lax.dynamic_update_slice({x}, {same}[:1], {starts}) | lax.dynamic_update_slice({x}, {same}[:1], {traced_starts}) | lax.dynamic_update_index_in_dim({x}, {number}, {far}, {axis})
-{x}.at[{at}].set(lax.dynamic_slice({x}, {starts}, (1,) * {x}.ndim).ravel()[0]) | {x}.at[:1].set(lax.dynamic_slice({x}, {traced_starts}, (1,) * {x}.ndim)) | {x}.at[{index_array}, {index_array}].add({number})
-lax.scatter({x}, {gather_indices}, {x}[:2], lax.ScatterDimensionNumbers(tuple(range(1, {x}.ndim)), (0,), (0,)), mode="{mode}") | {m}.at[{index_array}, {index_array}].add({number}) | {m}.at[{at}].set({number})
-lax.scatter_add({x}, {gather_indices}, {x}[:2], lax.ScatterDimensionNumbers(tuple(range(1, {x}.ndim)), (0,), (0,)), mode="{mode}") | {m}.at[jnp.diag_indices({m}.shape[-1])].multiply({number})
-lax.scatter_mul({x}, {gather_indices}, {x}[:2], lax.ScatterDimensionNumbers(tuple(range(1, {x}.ndim)), (0,), (0,)), mode="{mode}") | {m}.at[:, {at}].set({number}) | jnp.put({x}, {index_array}, {number}, inplace=False)
-lax.scatter_max({r}, {gather_indices}, {r}[:2], lax.ScatterDimensionNumbers(tuple(range(1, {r}.ndim)), (0,), (0,)), mode="{mode}") | jnp.fill_diagonal({m}, {number}, inplace=False)
-lax.scatter_min({r}, {gather_indices}, {r}[:2], lax.ScatterDimensionNumbers(tuple(range(1, {r}.ndim)), (0,), (0,)), mode="{mode}") | {x}.at[{at}].mul({x}[{at}])
+{x}.at[{at}].set({number}) | {x}.at[{at}].add({s}) | {x}.at[{at}].multiply({number})
+{x}.at[{at}].divide({number}) | {x}.at[{at}].set({x}[{at}]) | {x}.at[{at}].power(2)
+{x}.at[{at}].min({number}) | {x}.at[{at}].max({s}) | {x}.at[{at}].apply(jnp.sin)
+{x}.at[{at}].apply(lambda a: a * a + 1) | {x}.at[{index_array}].set({number})
+{x}.at[{index_array}].add({number}) | {x}.at[{index_array}].multiply({number})
+{x}.at[{index_array}].max({number}) | {x}.at[{index_array}].apply(jnp.square)
+{x}.at[{far}].set({number}) | {x}.at[{far}].add({number}, mode="{mode}")
+{x}.at[{far_array}].add({number}, mode="{mode}") | {x}.at[{far_array}].set({number}, mode="{mode}")
+{x}.at[{far_array}].multiply({s}, mode="{mode}") | {x}.at[{far_array}].min({number}, mode="{mode}")
+{x}.at[{far_array}].apply(jnp.cos, mode="{mode}") | {x}.at[{traced_at}].set({number})
+{x}.at[{traced_at}].add({s}) | {x}.at[{traced_array}].add({number})
+{x}.at[{traced_array}].set({number}, mode="{mode}") | {x}.at[..., {last_at}].set({number})
+{x}.at[..., {last_at}].add({x}[..., 0]) | {x}.at[..., {last_array}].add({number})
+{x}.at[..., {last_at}].multiply({s}) | {x}.at[..., {last_at}].set({x}[..., -1])
+{x}.at[..., {last_array}].set({number}) | {x}.at[..., {last_at}].max({number})
+{x}.at[..., {last_array}].apply(jnp.square) | {x}.at[1:].set({number}) | {x}.at[:2].add({x}[-2:])
+{x}.at[::2].multiply({number}) | {x}.at[::-1].set({same}) | {x}.at[...].add({like})
+{x}.at[..., 1:].set({x}[..., :-1]) | {x}.at[..., :1].divide({number}) | {x}.at[..., :2].power(2)
+{x}.at[{bool}].set({number}) | {x}.at[{at}].add({s}, unique_indices=True)
+{x}.at[{at}].subtract({s}) | lax.dynamic_update_slice({x}, {same}[:1], {starts})
+lax.dynamic_update_slice({x}, {same}[:1], {traced_starts})
+lax.dynamic_update_index_in_dim({x}, {number}, {far}, {axis})
+{x}.at[{at}].set(lax.dynamic_slice({x}, {starts}, (1,) * {x}.ndim).ravel()[0])
+{x}.at[:1].set(lax.dynamic_slice({x}, {traced_starts}, (1,) * {x}.ndim))
+{x}.at[{index_array}, {index_array}].add({number})
+lax.scatter({x}, {gather_indices}, {x}[:2], lax.ScatterDimensionNumbers(tuple(range(1, {x}.ndim)), \
+(0,), (0,)), mode="{mode}") | {m}.at[{index_array}, {index_array}].add({number})
+{m}.at[{at}].set({number})
+lax.scatter_add({x}, {gather_indices}, {x}[:2], lax.ScatterDimensionNumbers(tuple(range(1, \
+{x}.ndim)), (0,), (0,)), mode="{mode}") | {m}.at[jnp.diag_indices({m}.shape[-1])].multiply({number})
+lax.scatter_mul({x}, {gather_indices}, {x}[:2], lax.ScatterDimensionNumbers(tuple(range(1, \
+{x}.ndim)), (0,), (0,)), mode="{mode}") | {m}.at[:, {at}].set({number})
+jnp.put({x}, {index_array}, {number}, inplace=False)
+lax.scatter_max({r}, {gather_indices}, {r}[:2], lax.ScatterDimensionNumbers(tuple(range(1, \
+{r}.ndim)), (0,), (0,)), mode="{mode}") | jnp.fill_diagonal({m}, {number}, inplace=False)
+lax.scatter_min({r}, {gather_indices}, {r}[:2], lax.ScatterDimensionNumbers(tuple(range(1, \
+{r}.ndim)), (0,), (0,)), mode="{mode}") | {x}.at[{at}].mul({x}[{at}])
 """
 
 PRODUCTS = """
-{v} @ {v} | jnp.dot({x}, {x}.T) | {m} @ {m} | {m} @ {rowvector} | {x} @ {square} | {square} @ {x} | jnp.vdot({x}, {same}) | jnp.outer({v}, {v}) | jnp.inner({x}, {same}) | jnp.vecdot({x}, {same})
-jnp.cross({x}, {same}) | jnp.cross({x}, {triple}) | jnp.kron({v}, {v}) | jnp.einsum("...i,...i->...", {x}, {same}) | jnp.einsum("...i,ij->...j", {x}, {square}) | jnp.einsum("...i,ji,...j->...", {x}, {square}, {same})
-jnp.einsum("i,j->ji", {v}, {v}) | jnp.einsum("ii->i", {m}) | jnp.einsum("ij->", {m}) | jnp.einsum("ij,jk,kl->il", {m}, {m}, {m}) | jnp.tensordot({x}, {same}, {x}.ndim) | jnp.tensordot({v}, {v}, 0) | jnp.einsum("...i->i", {x})
-lax.dot_general({x}, {same}, ((({axis},), ({axis},)), ((), ()))) | lax.dot_general({x}, {same}, (((), ()), (({axis},), ({axis},)))) | lax.dot_general({x}, {same}, (((), ()), (tuple(range({x}.ndim)),) * 2))
-lax.dot_general({v}, {v}, (((0,), (0,)), ((), ())), preferred_element_type=jnp.{float_type}) | lax.dot_general({x}, {same}, ((({axis},), ({axis},)), ((), ())), precision="highest", preferred_element_type=jnp.{float_type})
-lax.dot({v}, {v}, precision=lax.Precision.HIGHEST) | jnp.matmul({m}, {rowvector}, preferred_element_type=jnp.{float_type}) | jnp.convolve({v}, {v}) | jnp.convolve({v}, {v}, mode="same") | jnp.correlate({v}, {v}) | jnp.polyval({v}, {s})
-lax.conv_general_dilated({v}[None, None], {v}[None, None, :2], (1,), "SAME") | lax.conv_general_dilated({v}[None, None], {v}[None, None, :2], (2,), [(1, 0)], rhs_dilation=(2,)) | jnp.polyfit(np.arange(3.0), {v}[:3], 1) | jnp.linalg.multi_dot([{m}, {m}, {rowvector}])
-jnp.interp({r}, np.array([-1.0, 0.5, 2.0]), {table}) | jnp.interp({r}, {table_sorted}, {table}) | jnp.searchsorted({table_sorted}, {r}) | jnp.searchsorted(jnp.sort({v}), {r}, side="right") | jnp.digitize({r}, {table_sorted}) | jnp.cov({v}) | jnp.corrcoef({v}, {v})
-jnp.fft.fft({f}) | jnp.fft.ifft({f}).real | jnp.fft.fft({f}, axis={axis}) | jnp.fft.rfft({r}) | jnp.fft.irfft({f}) | jnp.fft.fft2({m}) | jnp.apply_along_axis(jnp.cumsum, {axis}, {x}) | jnp.matvec({m}, {rowvector}) | {m} @ {m}.T
-jnp.einsum("...i,...j->...ij", {x}, {same}) | jnp.einsum("...i,...j->...", {x}, {same}) | jnp.cross({x}, {triple}) + {x} | jnp.cross({triple}, jnp.cross({triple}, {x})) | jnp.einsum("a...,a...->...", {x}, {same}) | jnp.einsum("a...,b...->ab", {x}, {same})
+{v} @ {v} | jnp.dot({x}, {x}.T) | {m} @ {m} | {m} @ {rowvector} | {x} @ {square} | {square} @ {x}
+jnp.vdot({x}, {same}) | jnp.outer({v}, {v}) | jnp.inner({x}, {same}) | jnp.vecdot({x}, {same})
+jnp.cross({x}, {same}) | jnp.cross({x}, {triple}) | jnp.kron({v}, {v})
+jnp.einsum("...i,...i->...", {x}, {same}) | jnp.einsum("...i,ij->...j", {x}, {square})
+jnp.einsum("...i,ji,...j->...", {x}, {square}, {same}) | jnp.einsum("i,j->ji", {v}, {v})
+jnp.einsum("ii->i", {m}) | jnp.einsum("ij->", {m}) | jnp.einsum("ij,jk,kl->il", {m}, {m}, {m})
+jnp.tensordot({x}, {same}, {x}.ndim) | jnp.tensordot({v}, {v}, 0) | jnp.einsum("...i->i", {x})
+lax.dot_general({x}, {same}, ((({axis},), ({axis},)), ((), ())))
+lax.dot_general({x}, {same}, (((), ()), (({axis},), ({axis},))))
+lax.dot_general({x}, {same}, (((), ()), (tuple(range({x}.ndim)),) * 2))
+lax.dot_general({v}, {v}, (((0,), (0,)), ((), ())), preferred_element_type=jnp.{float_type})
+lax.dot_general({x}, {same}, ((({axis},), ({axis},)), ((), ())), precision="highest", \
+preferred_element_type=jnp.{float_type}) | lax.dot({v}, {v}, precision=lax.Precision.HIGHEST)
+jnp.matmul({m}, {rowvector}, preferred_element_type=jnp.{float_type}) | jnp.convolve({v}, {v})
+jnp.convolve({v}, {v}, mode="same") | jnp.correlate({v}, {v}) | jnp.polyval({v}, {s})
+lax.conv_general_dilated({v}[None, None], {v}[None, None, :2], (1,), "SAME")
+lax.conv_general_dilated({v}[None, None], {v}[None, None, :2], (2,), [(1, 0)], rhs_dilation=(2,))
+jnp.polyfit(np.arange(3.0), {v}[:3], 1) | jnp.linalg.multi_dot([{m}, {m}, {rowvector}])
+jnp.interp({r}, np.array([-1.0, 0.5, 2.0]), {table}) | jnp.interp({r}, {table_sorted}, {table})
+jnp.searchsorted({table_sorted}, {r}) | jnp.searchsorted(jnp.sort({v}), {r}, side="right")
+jnp.digitize({r}, {table_sorted}) | jnp.cov({v}) | jnp.corrcoef({v}, {v}) | jnp.fft.fft({f})
+jnp.fft.ifft({f}).real | jnp.fft.fft({f}, axis={axis}) | jnp.fft.rfft({r}) | jnp.fft.irfft({f})
+jnp.fft.fft2({m}) | jnp.apply_along_axis(jnp.cumsum, {axis}, {x}) | jnp.matvec({m}, {rowvector})
+{m} @ {m}.T | jnp.einsum("...i,...j->...ij", {x}, {same})
+jnp.einsum("...i,...j->...", {x}, {same}) | jnp.cross({x}, {triple}) + {x}
+jnp.cross({triple}, jnp.cross({triple}, {x})) | jnp.einsum("a...,a...->...", {x}, {same})
+jnp.einsum("a...,b...->ab", {x}, {same})
 """
 
 ALGEBRA = """
-jnp.linalg.norm({f}) | jnp.linalg.norm({f}, axis=-1, keepdims=True) | {f} / jnp.linalg.norm({f}, axis=-1, keepdims=True) | jnp.linalg.norm({r}, 1, {axis}) | jnp.linalg.norm({r}, jnp.inf, {axis}) | jnp.linalg.norm({m})
-jnp.linalg.inv({regular}) | jnp.linalg.det({m}) | jnp.linalg.solve({regular}, {rowvector}) | jnp.linalg.eigh({m} + {m}.T)[0] | jnp.linalg.matrix_power({m}, 3) | jnp.linalg.cholesky({m} @ {m}.T + 4 * jnp.eye({m}.shape[-1])) | jnp.linalg.slogdet({regular})[1]
-jax.scipy.linalg.solve_triangular({regular}, {rowvector}, lower=True) | jnp.linalg.qr({regular})[1] | jnp.linalg.svd({m}, compute_uv=False) | jax.scipy.linalg.expm({m}) | jnp.linalg.trace({m}) | jnp.linalg.pinv({regular})
+jnp.linalg.norm({f}) | jnp.linalg.norm({f}, axis=-1, keepdims=True)
+{f} / jnp.linalg.norm({f}, axis=-1, keepdims=True) | jnp.linalg.norm({r}, 1, {axis})
+jnp.linalg.norm({r}, jnp.inf, {axis}) | jnp.linalg.norm({m}) | jnp.linalg.inv({regular})
+jnp.linalg.det({m}) | jnp.linalg.solve({regular}, {rowvector}) | jnp.linalg.eigh({m} + {m}.T)[0]
+jnp.linalg.matrix_power({m}, 3) | jnp.linalg.cholesky({m} @ {m}.T + 4 * jnp.eye({m}.shape[-1]))
+jnp.linalg.slogdet({regular})[1]
+jax.scipy.linalg.solve_triangular({regular}, {rowvector}, lower=True) | jnp.linalg.qr({regular})[1]
+jnp.linalg.svd({m}, compute_uv=False) | jax.scipy.linalg.expm({m}) | jnp.linalg.trace({m})
+jnp.linalg.pinv({regular})
 """
 
 NETWORKS = """
-jax.nn.softmax({r}) | jax.nn.softmax({r}, axis={axis}) | jax.nn.log_softmax({r}) | jax.nn.relu({r}) | jax.nn.gelu({r}) | jax.nn.silu({f}) | jax.nn.logsumexp({r}) | jax.nn.logsumexp({r}, axis={axis}, keepdims=True) | jax.nn.one_hot({i}, 3) | jax.nn.sigmoid({f})
-jax.nn.softplus({r}) | jax.nn.elu({r}) | jax.nn.leaky_relu({r}) | jax.nn.relu6({r}) | jax.nn.standardize({r}) | jax.nn.one_hot(jnp.argmax({r}), 3) | jax.nn.selu({r}) | jax.nn.hard_tanh({r}) | jax.nn.glu(jnp.concatenate([{r}, {r}], -1)) | jax.nn.celu({r})
+jax.nn.softmax({r}) | jax.nn.softmax({r}, axis={axis}) | jax.nn.log_softmax({r}) | jax.nn.relu({r})
+jax.nn.gelu({r}) | jax.nn.silu({f}) | jax.nn.logsumexp({r})
+jax.nn.logsumexp({r}, axis={axis}, keepdims=True) | jax.nn.one_hot({i}, 3) | jax.nn.sigmoid({f})
+jax.nn.softplus({r}) | jax.nn.elu({r}) | jax.nn.leaky_relu({r}) | jax.nn.relu6({r})
+jax.nn.standardize({r}) | jax.nn.one_hot(jnp.argmax({r}), 3) | jax.nn.selu({r})
+jax.nn.hard_tanh({r}) | jax.nn.glu(jnp.concatenate([{r}, {r}], -1)) | jax.nn.celu({r})
 jax.nn.soft_sign({r}) | jax.nn.mish({r}) | jax.nn.squareplus({r}) | jax.nn.log_sigmoid({r})
 """
 
 SORTING = """
-jnp.sort({r}) | jnp.sort({r}, {axis}, descending=True) | jnp.argsort({r}) | jnp.argsort({r}, {axis}, descending=True) | jnp.sort({r}, {axis}) | lax.top_k({r}, 1)[{zero_or_one}] | jnp.partition({v}, 0) | lax.sort([{r}, {x}], num_keys=1)[1] | lax.sort([{r}, -{r}, {r} + 1], dimension={axis}, num_keys=2)[2]
-lax.top_k({v}, {v}.size)[{zero_or_one}] | jnp.unique({v}, size=3, fill_value=0) | jnp.lexsort(({v}, {v})) | {v}[jnp.argsort({v})] | jnp.isin({x}, {table}) | jnp.setdiff1d({v}, {table}, size=2) | jnp.flatnonzero({v}, size=3, fill_value=1) | jnp.rank({x}) if hasattr(jnp, "rank") else jnp.ndim({x})
-jnp.percentile({r}, 50, axis={axis}) | jnp.median({r}, {axis}) | jnp.nanmedian({r}) | jnp.histogram({v}, 3, (-2.0, 2.0))[0] | jnp.argwhere({v}, size=2)[:, 0]
+jnp.sort({r}) | jnp.sort({r}, {axis}, descending=True) | jnp.argsort({r})
+jnp.argsort({r}, {axis}, descending=True) | jnp.sort({r}, {axis}) | lax.top_k({r}, 1)[{zero_or_one}]
+jnp.partition({v}, 0) | lax.sort([{r}, {x}], num_keys=1)[1]
+lax.sort([{r}, -{r}, {r} + 1], dimension={axis}, num_keys=2)[2]
+lax.top_k({v}, {v}.size)[{zero_or_one}] | jnp.unique({v}, size=3, fill_value=0)
+jnp.lexsort(({v}, {v})) | {v}[jnp.argsort({v})] | jnp.isin({x}, {table})
+jnp.setdiff1d({v}, {table}, size=2) | jnp.flatnonzero({v}, size=3, fill_value=1)
+jnp.rank({x}) if hasattr(jnp, "rank") else jnp.ndim({x}) | jnp.percentile({r}, 50, axis={axis})
+jnp.median({r}, {axis}) | jnp.nanmedian({r}) | jnp.histogram({v}, 3, (-2.0, 2.0))[0]
+jnp.argwhere({v}, size=2)[:, 0]
 """
 
 CONVERSIONS = """
-{x}.astype(int) | {r}.astype(jnp.int32) | {x}.astype(bool) | {i}.astype(float) | {i} + 1.0 | {i} * {x} | {x}.astype(jnp.float32) | {x}.astype(jnp.float64) | {x}.astype(complex) | {r}.astype(jnp.int8) | {r}.astype(jnp.uint8) | {r}.astype(jnp.float16)
-{x}.astype(jnp.bfloat16) | {i} // 2 | {i} % 3 | {i} & 1 | {i} << 1 | {i} >> 1 | {i} ^ {i} | jnp.sign({i}) | jnp.abs({i}) | {i} // {int_table} | {i} @ {i}.T | lax.bitcast_convert_type({r}, jnp.uint8) | lax.bitcast_convert_type(jnp.asarray({r}, jnp.float32), jnp.int32)
-lax.population_count({i}) | lax.clz({i}) | jnp.bitwise_not({i}) | lax.convert_element_type({x}, jnp.float32) * 2.0 | jnp.asarray({s}).astype(int) | jnp.round({r}).astype(int) | lax.shift_right_logical({i}, {i}) | {i} ** 2 | {i} / 2 | {i}.sum() | jnp.float32({s}) * {x} | np.float32(2) * {x}
-np.float64(0.1) * {x} | 0.1 * {i} | True * {x} | jnp.asarray(2.5) * {x} | jnp.asarray([0.5], jnp.float32) * {x} | 2 ** {i} | {x} + 1j | jnp.invert({bool}) | ({bool}).astype({x}.dtype) * {x} | jnp.int32(1) + {i} | lax.bitcast_convert_type(lax.bitcast_convert_type(jnp.asarray({r}, jnp.float32), jnp.int32) + 1, jnp.float32)
-jnp.bool_({bool}) ^ {bool} | jnp.uint8(250) + {i}.astype(jnp.uint8) | {i}.astype(jnp.int8) * np.int8(100) | {r}.astype(int).astype(float) | -{i}.astype(jnp.uint32)
+{x}.astype(int) | {r}.astype(jnp.int32) | {x}.astype(bool) | {i}.astype(float) | {i} + 1.0
+{i} * {x} | {x}.astype(jnp.float32) | {x}.astype(jnp.float64) | {x}.astype(complex)
+{r}.astype(jnp.int8) | {r}.astype(jnp.uint8) | {r}.astype(jnp.float16) | {x}.astype(jnp.bfloat16)
+{i} // 2 | {i} % 3 | {i} & 1 | {i} << 1 | {i} >> 1 | {i} ^ {i} | jnp.sign({i}) | jnp.abs({i})
+{i} // {int_table} | {i} @ {i}.T | lax.bitcast_convert_type({r}, jnp.uint8)
+lax.bitcast_convert_type(jnp.asarray({r}, jnp.float32), jnp.int32) | lax.population_count({i})
+lax.clz({i}) | jnp.bitwise_not({i}) | lax.convert_element_type({x}, jnp.float32) * 2.0
+jnp.asarray({s}).astype(int) | jnp.round({r}).astype(int) | lax.shift_right_logical({i}, {i})
+{i} ** 2 | {i} / 2 | {i}.sum() | jnp.float32({s}) * {x} | np.float32(2) * {x}
+np.float64(0.1) * {x} | 0.1 * {i} | True * {x} | jnp.asarray(2.5) * {x}
+jnp.asarray([0.5], jnp.float32) * {x} | 2 ** {i} | {x} + 1j | jnp.invert({bool})
+({bool}).astype({x}.dtype) * {x} | jnp.int32(1) + {i}
+lax.bitcast_convert_type(lax.bitcast_convert_type(jnp.asarray({r}, jnp.float32), jnp.int32) + 1, \
+jnp.float32) | jnp.bool_({bool}) ^ {bool} | jnp.uint8(250) + {i}.astype(jnp.uint8)
+{i}.astype(jnp.int8) * np.int8(100) | {r}.astype(int).astype(float) | -{i}.astype(jnp.uint32)
 """
 
 CONTROL = """
-power_of({small}, {f}) | jax.jit(odd)({f}) | jax.checkpoint(jnp.sin)({f}) | jax.vmap(lambda a: a * 2 - jnp.sum(a))({x}) | jax.vmap(jnp.dot)({x}, {same}) | jax.grad(lambda a: jnp.sum(jnp.abs(a) ** 3))({r}) | jax.jit(jnp.dot)({v}, {v}) | jax.vmap(lambda a, b: jnp.where(a > 0, a, b), (0, None))({r}, 1.0)
-jax.jvp(jnp.tanh, ({f},), ({f},))[1] | jax.jit(lambda a: a[0] * a)({x}) | jax.random.normal(key, {x}.shape) * {x} | jax.random.uniform(key, {x}.shape) + {x} | jax.random.permutation(key, {x}) | jax.random.choice(key, {v}) | jax.random.bernoulli(key, 0.5, {x}.shape) * {x} | jax.random.randint(key, (3,), 0, 5)
-jax.jacfwd(lambda a: a * a[::-1])({v}) | jax.vmap(lambda a: jax.nn.softmax(a))({r}) | jax.lax.map(lambda a: a * 2, {x}) | lax.cond({s} > 0, lambda a: a, lambda a: -a, {x}) | lax.fori_loop(0, 2, lambda k, a: a * a - 1, {x}) | lax.scan(lambda c, a: (c + a, c), {x}[0], {x})[1] | lax.associative_scan(jnp.add, {x})
-lax.switch(({s} > 0).astype(int), [jnp.sin, jnp.cos], {f}) | lax.while_loop(lambda c: c[0] < 3, lambda c: (c[0] + 1, c[1] * 0.5), (0, {f}))[1] | lax.map(jnp.sum, {x})
+power_of({small}, {f}) | jax.jit(odd)({f}) | jax.checkpoint(jnp.sin)({f})
+jax.vmap(lambda a: a * 2 - jnp.sum(a))({x}) | jax.vmap(jnp.dot)({x}, {same})
+jax.grad(lambda a: jnp.sum(jnp.abs(a) ** 3))({r}) | jax.jit(jnp.dot)({v}, {v})
+jax.vmap(lambda a, b: jnp.where(a > 0, a, b), (0, None))({r}, 1.0)
+jax.jvp(jnp.tanh, ({f},), ({f},))[1] | jax.jit(lambda a: a[0] * a)({x})
+jax.random.normal(key, {x}.shape) * {x} | jax.random.uniform(key, {x}.shape) + {x}
+jax.random.permutation(key, {x}) | jax.random.choice(key, {v})
+jax.random.bernoulli(key, 0.5, {x}.shape) * {x} | jax.random.randint(key, (3,), 0, 5)
+jax.jacfwd(lambda a: a * a[::-1])({v}) | jax.vmap(lambda a: jax.nn.softmax(a))({r})
+jax.lax.map(lambda a: a * 2, {x}) | lax.cond({s} > 0, lambda a: a, lambda a: -a, {x})
+lax.fori_loop(0, 2, lambda k, a: a * a - 1, {x}) | lax.scan(lambda c, a: (c + a, c), {x}[0], {x})[1]
+lax.associative_scan(jnp.add, {x}) | lax.switch(({s} > 0).astype(int), [jnp.sin, jnp.cos], {f})
+lax.while_loop(lambda c: c[0] < 3, lambda c: (c[0] + 1, c[1] * 0.5), (0, {f}))[1]
+lax.map(jnp.sum, {x})
 """
 
 CATEGORIES = {
@@ -263,8 +370,9 @@ WEIGHTS = {name: 1.0 for name in CATEGORIES} | {
 }  # fmt: skip
 
 SMALL = [{"": (n,)} for n in (3, 3, 3, 3, 1, 2, 4, 5, 6, 7)] + [
-    {"a": (), "b": (3,)}, {"a": (3,), "b": (2,)}, {"a": (3,), "b": (3,)}, {"a": (4,), "b": (3,), "c": ()},
-    {"a": (3,), "b": (3,), "c": (3,)}, {"a": (), "b": (), "c": (2,)}, {"a": (1,), "b": (3,)},
+    {"a": (), "b": (3,)}, {"a": (3,), "b": (2,)}, {"a": (3,), "b": (3,)},
+    {"a": (4,), "b": (3,), "c": ()}, {"a": (3,), "b": (3,), "c": (3,)},
+    {"a": (), "b": (), "c": (2,)}, {"a": (1,), "b": (3,)},
 ]  # fmt: skip
 LATTICES = [{"": s} for s in ((70, 3), (70, 3), (9, 8, 3), (100, 2), (1, 80, 3))] + [
     {"a": (70, 3), "b": (70, 1)}, {"a": (70, 3), "b": (70,)}, {"a": (9, 8, 3), "b": (9, 8, 2)},
@@ -914,10 +1022,11 @@ def difference(
     """What is different, beyond rounding; None if nothing is.
 
     Numbers may differ by 16 units of rounding of the largest in their array, for sums in another
-    order, and by 100 times what nudges of each value by some units of rounding change: the rewritten
-    program rounds every value differently, and a few times more often. What these nudges change in
-    kind, a comparison or an infinity, is not compared. A derivative may be finite where that of the
-    program is NaN: what is overwritten, or multiplied with zero, has none when it is taken apart.
+    order, and by 100 times what nudges of each value by some units of rounding change: the
+    rewritten program rounds every value differently, and a few times more often. What these nudges
+    change in kind, a comparison or an infinity, is not compared. A derivative may be finite where
+    that of the program is NaN: an entry that is overwritten is dead code when it is taken apart,
+    where the program multiplies its infinite derivative by zero.
     """
     got, want = jtu.tree_leaves(got), jtu.tree_leaves(want)
     if len(got) != len(want):
