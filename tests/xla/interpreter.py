@@ -164,6 +164,24 @@ def _rem(x, y, *, aval, **_):
     return np.fmod(x, y)
 
 
+def _shifted_right(x, y, *, aval, **_):
+    return np.where(y < 8 * x.itemsize, x >> y, 0 if x.dtype.kind == "u" else x >> 63)
+
+
+def _logical(x, y, *, aval, **_):
+    size = x.itemsize
+    bits = x.view(f"u{size}")
+    return np.where(y < 8 * size, bits >> y.view(f"u{size}"), 0).astype(bits.dtype).view(x.dtype)
+
+
+def _bitcast(x, *, aval, new_dtype, **_):
+    if new_dtype == jnp.bfloat16:
+        return NotImplemented
+    # NumPy's last axis has to be one of memory.
+    x = np.ascontiguousarray(x)
+    return x.reshape(*x.shape, 1).view(new_dtype).reshape(aval.shape)
+
+
 def _integer_pow(x, *, aval, y, **_):
     out, n = np.ones_like(x), abs(y)
     for _i in range(n):
@@ -203,13 +221,7 @@ def _clamp(low, x, high, **_):
 
 def _select_n(which, *cases, **_):
     which = np.broadcast_to(which.astype(int), cases[0].shape)
-    if len(cases) == 1:
-        return cases[0]
-    return (
-        np.choose(which, cases, mode="clip")
-        if len(cases) > 2
-        else np.where(which, cases[1], cases[0])
-    )
+    return np.choose(which, list(cases), mode="clip")
 
 
 def _broadcast(x, *dynamic, aval, shape, broadcast_dimensions, **_):
@@ -419,6 +431,9 @@ _RULES: dict[str, Callable[..., Any]] = {
     "argmax": _arg(np.argmax),
     "argmin": _arg(np.argmin),
     "broadcast_in_dim": _broadcast,
+    "bitcast_convert_type": _bitcast,
+    "shift_right_logical": _logical,
+    "shift_right_arithmetic": _shifted_right,
     "cfjax_held": lambda *xs, aval, **_: list(xs),
     "cfjax_pack": lambda *xs, aval, axis, **_: np.stack(xs, axis),
     "cfjax_unpack": lambda x, *, aval, axis: [x.take(k, axis) for k in range(x.shape[axis])],

@@ -9,6 +9,7 @@ made it runs, so that the next line knows shapes and dtypes; a line that raises 
 
 import argparse
 import functools
+import itertools
 import random
 import re
 import string
@@ -319,7 +320,7 @@ lax.sort([{r}, -{r}, {r} + 1], dimension={axis}, num_keys=2)[2]
 lax.top_k({v}, {v}.size)[{zero_or_one}] | jnp.unique({v}, size=3, fill_value=0)
 jnp.lexsort(({v}, {v})) | {v}[jnp.argsort({v})] | jnp.isin({x}, {table})
 jnp.setdiff1d({v}, {table}, size=2) | jnp.flatnonzero({v}, size=3, fill_value=1)
-jnp.rank({x}) if hasattr(jnp, "rank") else jnp.ndim({x}) | jnp.percentile({r}, 50, axis={axis})
+jnp.percentile({r}, 50, axis={axis})
 jnp.median({r}, {axis}) | jnp.nanmedian({r}) | jnp.histogram({v}, 3, (-2.0, 2.0))[0]
 jnp.argwhere({v}, size=2)[:, 0]
 """
@@ -357,6 +358,13 @@ lax.fori_loop(0, 2, lambda k, a: a * a - 1, {x}) | lax.scan(lambda c, a: (c + a,
 lax.associative_scan(jnp.add, {x}) | lax.switch(({s} > 0).astype(int), [jnp.sin, jnp.cos], {f})
 lax.while_loop(lambda c: c[0] < 3, lambda c: (c[0] + 1, c[1] * 0.5), (0, {f}))[1]
 lax.map(jnp.sum, {x})
+"""
+
+# What has more axes than the state.
+MATRICES = """
+jnp.outer({v}, {v}) | {v} * {pair} | {x}[..., None, :] * {pair} | jnp.stack([{x}, {same}], -2)
+jnp.stack([{x}, {same}, {x} * 2], -1) | {x}[..., None] * {x}[..., None, :] | {v}[:, None] - {v}
+jnp.einsum("...i,ji->...ij", {x}, {pair}) | {v}[:, None, None] * {pair}
 """
 
 CATEGORIES = {
@@ -732,6 +740,11 @@ class Maker(string.Formatter):
             raise Unfit
         return self._parameter((shape[-1],) * 2, self.dtype)
 
+    def _pair(self) -> str:
+        if not np.ndim(self.x) or np.shape(self.x)[-1] > 9:
+            raise Unfit
+        return self._parameter((2, np.shape(self.x)[-1]), self.dtype)
+
     def _triple(self) -> str:
         return self._parameter((3,), self.dtype)
 
@@ -777,10 +790,11 @@ class Maker(string.Formatter):
 
     # Lines.
 
-    def line(self) -> None:
-        for _ in range(60):
+    def line(self, among: list[str] | None = None) -> None:
+        """One more, of some template, or of one of those given; none if nothing fits."""
+        for _ in range(30):
             category = self.rng.choices(list(WEIGHTS), list(WEIGHTS.values()))[0]
-            template = self.rng.choice(CATEGORIES[category])
+            template = self.rng.choice(among or CATEGORIES[category])
             self.fields: dict[str, Any] = {}
             self.inexact_used = False
             number = len(self.parameters)
@@ -812,8 +826,15 @@ class Maker(string.Formatter):
     def _largest(self) -> int:
         return 1200 if self.is_lattice else MAX_SIZE
 
-    def program(self) -> Program:
-        for _ in range(self.rng.choice([1, 2, 2, 3, 3, 4, 5, 6])):
+    def program(self, last: str) -> Program:
+        if self.rng.random() < 0.3:
+            self.line(CATEGORIES["matrices"])
+        for _ in range(self.rng.choice([0, 0, 1, 1, 2, 2, 3, 4])):
+            self.line()
+        # Each template in turn, so that rare ones have their share.
+        templates = [t for t in itertools.chain(*CATEGORIES.values()) if re.search(last, t)]
+        self.line([templates[self.seed % len(templates)]])
+        if not self.lines:
             self.line()
         code = " ".join(self.lines)
         names = [line.split(" = ")[0] for line in self.lines]
@@ -872,11 +893,11 @@ def smaller(program: Program) -> Iterator[Program]:
         )
 
 
-def make(seed: int, lattices: float = 0.35) -> Program:
-    """The program of a seed; so many of all have leading axes."""
+def make(seed: int, lattices: float = 0.35, last: str = "") -> Program:
+    """The program of a seed; so many of all have leading axes. `last` matches its last operation."""
     with warnings.catch_warnings():
         warnings.simplefilter("ignore")
-        return Maker(seed, lattices).program()
+        return Maker(seed, lattices).program(last)
 
 
 # What is compared.
@@ -979,12 +1000,9 @@ def rewritten(fun: Callable[..., Any]) -> Callable[..., Any]:
 
 @functools.partial(jax.custom_jvp, nondiff_argnums=(1, 2))
 def _nudged(x: Any, run: int, exact: bool) -> Any:
-    eps = jnp.finfo(x.dtype).eps
-    # The same for equal numbers, so that ties stay ties.
-    part = x.real if jnp.iscomplexobj(x) else x
-    sign = jnp.sin((part * 1e3 + 1) * (run + 1)).astype(part.dtype)
-    largest = jnp.max(jnp.where(jnp.isfinite(x), jnp.abs(x), 0), initial=0).astype(part.dtype)
-    moved = x * (1 + 2 * eps * sign) + jnp.where(x == 0, 0, eps * sign * largest)
+    largest = jnp.max(jnp.where(jnp.isfinite(x), jnp.abs(x), 0), initial=0).astype(x.real.dtype)
+    part = _part(x, run)
+    moved = x * (1 + 2 * part) + part * jnp.where(x == 0, 0, largest)
     keep = ~jnp.isfinite(x) | (is_dyadic(x) if exact else False)
     zero = jnp.asarray(-0.0 if run % 2 else 0.0, x.dtype)
     return jnp.where(x == 0, zero, jnp.where(keep, x, moved.astype(x.dtype)))
@@ -993,16 +1011,20 @@ def _nudged(x: Any, run: int, exact: bool) -> Any:
 @_nudged.defjvp
 def _(run, exact, primals, tangents):
     (x,), (t,) = primals, tangents
-    part = x.real if jnp.iscomplexobj(x) else x
-    eps = jnp.finfo(x.dtype).eps
-    sign = jnp.cos((jnp.where(jnp.isfinite(part), part, 0) * 1e3 + 1) * (run + 1))
-    return _nudged(x, run, exact), (t * (1 + 2 * eps * sign)).astype(x.dtype)
+    return _nudged(x, run, exact), (t * (1 + 2 * _part(x, run + 0.5))).astype(x.dtype)
+
+
+def _part(x: Any, run: float) -> Any:
+    """Up to a unit of rounding, the same for equal numbers, so that ties stay ties."""
+    part = jnp.where(jnp.abs(x) < 1e6, x.real, 1)
+    return (jnp.finfo(x.dtype).eps * jnp.sin((part * 1e3 + 1) * (run + 1))).astype(part.dtype)
 
 
 def nudge(run: int) -> Callable[..., Any]:
     """Changes numbers by units of rounding, but not those that are computed exactly."""
 
     def nudged(tree: Any, line: int, exact: bool) -> Any:
+        tree = jtu.tree_map(jnp.asarray, tree)
         return jtu.tree_map(
             lambda x: (
                 _nudged(x, run + 5 * line, exact) if jnp.issubdtype(x.dtype, jnp.inexact) else x
@@ -1157,6 +1179,7 @@ def main() -> int:
     parser.add_argument("--first", type=int, default=0, metavar="SEED")
     parser.add_argument("--count", type=int, default=1000)
     parser.add_argument("--jit", action="store_true", help="compile each program")
+    parser.add_argument("--only", metavar="REGEX", help="operations to end with, by their text")
     parser.add_argument("--skip", metavar="REGEX", help="operations not to draw, by their text")
     parser.add_argument("--lattices", type=float, default=0.35, help="the part with leading axes")
     args = parser.parse_args()
@@ -1167,7 +1190,7 @@ def main() -> int:
     found: Counter = Counter()
     start, start_cpu = time.perf_counter(), time.process_time()
     for number, seed in enumerate(range(args.first, args.first + args.count)):
-        program = make(seed, args.lattices)
+        program = make(seed, args.lattices, args.only or "")
         for kind in kinds_of(program, args.jit):
             found[kind] += 1
             before = calls["cfjax_operation"]
