@@ -894,7 +894,7 @@ def smaller(program: Program) -> Iterator[Program]:
 
 
 def make(seed: int, lattices: float = 0.35, last: str = "") -> Program:
-    """The program of a seed; so many of all have leading axes. `last` matches its last operation."""
+    """The program of a seed. So many of all have leading axes; `last` matches its end."""
     with warnings.catch_warnings():
         warnings.simplefilter("ignore")
         return Maker(seed, lattices).program(last)
