@@ -43,7 +43,8 @@ def evaluate(jaxpr: Jaxpr, consts: Sequence[Any], *args: Any) -> list[Any]:
     env.update(zip(jaxpr.invars, args, strict=True))
 
     def read(v: Any) -> Any:
-        return np.asarray(v.val, v.aval.dtype) if isinstance(v, Literal) else env[v]
+        aval: Any = v.aval
+        return np.asarray(v.val, aval.dtype) if isinstance(v, Literal) else env[v]
 
     for eqn in jaxpr.eqns:
         values = list(map(read, eqn.invars))
