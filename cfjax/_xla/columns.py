@@ -24,6 +24,7 @@ from .components import (
     SCATTERS,
     Components,
     components,
+    is_extreme,
     is_lexicographic,
     known,
     moved,
@@ -492,6 +493,11 @@ def _reduced(call: _Call) -> Columns | None:
     x, axes = columns(call.values[0]), call.eqn.params["axes"]
     positions = tuple(k for k, axis in enumerate(x.long) if axis in axes)
     entries = list(x.entries)
+    kept = [k for k in range(len(x.shape)) if k not in axes]
+    rows = x.places.transpose(*kept, *axes)
+    if positions and is_extreme(call.eqn) and rows.size > math.prod(rows.shape[: len(kept)]):
+        # Of all that are largest each has its share, in whichever column.
+        return None
     if positions:
         x = call.through(x)
         params = call.eqn.params | {"axes": positions}
@@ -503,8 +509,6 @@ def _reduced(call: _Call) -> Columns | None:
             return call.eqn.primitive.bind(_spread(e, sides), **params)
 
         entries = list(map(column, x.entries))
-    kept = [k for k in range(len(x.shape)) if k not in axes]
-    rows = x.places.transpose(*kept, *axes)
     rows = rows.reshape(math.prod(rows.shape[: len(kept)]), -1)
     combine = reduction(call.eqn)
 

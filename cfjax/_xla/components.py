@@ -221,14 +221,18 @@ def _arranged(values: Sequence[Any], move: Callable[..., np.ndarray]) -> list[An
 def reduction(eqn: JaxprEqn) -> Callable[[Sequence[Any]], Any]:
     """What a reduction makes of the entries that it reduces, all of one shape."""
     name, aval = eqn.primitive.name, eqn.outvars[0].aval
-    if name in _EXTREMES and is_inexact(aval):
+    if is_extreme(eqn) and is_inexact(aval):
         return functools.partial(_extreme, _EXTREMES[name])
     return functools.partial(functools.reduce, _COMBINED[name])
 
 
+def is_extreme(eqn: JaxprEqn) -> bool:
+    return eqn.primitive.name in _EXTREMES
+
+
 def is_lexicographic(eqn: JaxprEqn) -> bool:
     aval: Any = eqn.outvars[0].aval
-    return eqn.primitive.name in _EXTREMES and jnp.issubdtype(aval.dtype, jnp.complexfloating)
+    return is_extreme(eqn) and jnp.issubdtype(aval.dtype, jnp.complexfloating)
 
 
 _EXTREMES: dict[str, Callable[[Any, Any], Any]] = {"reduce_max": lax.max, "reduce_min": lax.min}
