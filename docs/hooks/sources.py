@@ -26,13 +26,13 @@ NOTEBOOKS = sorted((ROOT / "notebooks").glob("*.ipynb"))
 CHARTS = [*ROOT.glob("benchmarks/*.png"), *ROOT.glob("benchmarks/charts/*.png")]
 DOCS = [str(path.relative_to(ROOT / "docs")) for path in ROOT.glob("docs/**/*.md")]
 # Files of the repository, and where they are on the site.
-PLACES: dict[str, str] = (
+PLACES = (
     {source: place for place, source in PAGES.items()}
     | {f"docs/{place}": place for place in DOCS}
     | {str(path.relative_to(ROOT)): str(path.relative_to(ROOT)) for path in CHARTS}
     | {f"notebooks/{path.name}": f"notebooks/{path.stem}.md" for path in NOTEBOOKS}
 )
-SOURCES: dict[str, str] = {place: source for source, place in PLACES.items()}
+SOURCES = {place: source for source, place in PLACES.items()}
 
 
 def on_config(config):
