@@ -17,6 +17,8 @@ from results import Row, cell, in_units, load, one, pick, two_digits
 HERE = Path(__file__).parent
 PAGES = sorted((HERE.parent / "docs").rglob("*.md"))
 MARKED = re.compile(r"(<!-- (table|number): ([\w-]+) -->)(.*?)(<!-- end -->)", flags=re.DOTALL)
+# Methods that the results have by their tableaus.
+SHORT = {"RKMK(Tsit5)": "RKMK5", "RKMK(Dopri8)": "RKMK8"}
 # Those that draw, and how fine.
 PICTURES = {
     "batch": 120,
@@ -109,8 +111,10 @@ def values(rows: Iterable[Row], key: str) -> list:
 
 def code(program: str) -> str:
     """The name of a program with its code marked up: `"diffrax, CF4"` has two words of code."""
+    for measured, name in SHORT.items():
+        program = program.replace(measured, name)
     return re.sub(
-        r"cfjax\.integrate|C[FG]\d+(\([\w=]+\))?|Magnus\d+|(Richardson|RKMK)\(\w+\)",
+        r"cfjax\.integrate|C[FG]\d+(\([\w=]+\))?|(Magnus|RKMK)\d+|(Richardson|RKMK)\(\w+\)",
         r"`\g<0>`",
         program,
     )
@@ -132,23 +136,24 @@ def machine() -> str:
 
 @table
 def tolerances() -> list[list[str]]:
+    rows = pick(load("tolerances")["rows"], equal="tolerance", systems=1)
+    tolerance = values(rows, "to")[0]
+    return [["", f"steps at tolerance {power(tolerance)}", "error at the end"]] + [
+        [code(row["method"]), str(row["steps"]), power(row["error"])]
+        for row in pick(rows, to=tolerance)
+    ]
+
+
+@table
+def errors() -> list[list[str]]:
     rows = pick(load("tolerances")["rows"], equal="error")
-    same = pick(load("tolerances")["rows"], equal="tolerance", systems=1)
-    cases = list(itertools.product(values(rows, "systems"), values(rows, "to")))
-
-    def at_error(row: Row) -> str:
-        text = f"{row['steps']}, {cell(row['over Tsit5'])}"
-        is_met = 0.8 < row["error"] / row["to"] < 1.25
-        return text if is_met else f"{text}, to {power(row['error'])}"
-
-    tolerance = values(same, "to")[0]
-    head = ["", f"tolerance {power(tolerance)}"]
-    head += [f"error {power(error)}, {systems(count)}" for count, error in cases]
-    table = [head]
-    for method in values(rows, "method"):
-        row = one(same, method=method, to=tolerance)
-        cells = [code(method), f"{row['steps']}, to {power(row['error'])}"]
-        cells += [at_error(one(rows, method=method, systems=n, to=e)) for n, e in cases]
+    counts = values(rows, "systems")
+    columns = ("steps", "error", "time over Tsit5's")
+    table = [["asked", "method", *(f"{what}, {systems(n)}" for n in counts for what in columns)]]
+    for error, method in itertools.product(values(rows, "to"), values(rows, "method")):
+        cells = [power(error), code(method)]
+        for row in (one(rows, method=method, systems=n, to=error) for n in counts):
+            cells += [str(row["steps"]), power(row["error"]), cell(row["over Tsit5"])]
         table.append(cells)
     return table
 
@@ -186,15 +191,14 @@ def scenes() -> list[list[str]]:
 @table
 def attitude() -> list[list[str]]:
     rows = load("attitude")["rows"]
-    cases = list(itertools.product(*(values(rows, k) for k in ("scene", "to", "systems"))))
-    head = ["", *(f"{scene}, {power(error)}, {systems(n)}" for scene, error, n in cases)]
-    table = [head]
-    for method in values(rows, "method"):
-        found = [
-            one(rows, method=method, scene=scene, to=error, systems=n) for scene, error, n in cases
-        ]
-        cells = [f"{r['steps']}, {cell(r['over the better in plain space'])}" for r in found]
-        table.append([code(method), *cells])
+    counts = values(rows, "systems")
+    table = [["", "error", "method", "steps", *(f"time, {systems(n)}" for n in counts)]]
+    keys = (values(rows, key) for key in ("scene", "to", "method"))
+    for scene, error, method in itertools.product(*keys):
+        found = [one(rows, scene=scene, to=error, method=method, systems=n) for n in counts]
+        (steps,) = {row["steps"] for row in found}
+        times = [cell(row["over the better in plain space"]) for row in found]
+        table.append([scene, power(error), code(method), str(steps), *times])
     return table
 
 
@@ -216,18 +220,14 @@ def gradients() -> list[list[str]]:
 @table
 def batch() -> list[list[str]]:
     rows = load("batch")["rows"]
-    programs = ["chunks of 10000", "one jax.vmap"]
-    head = ["members", *(f"{program}: a trajectory, memory" for program in programs)]
-    table = [
-        [
-            *head[:1],
-            *(h.replace("10000", "10 000").replace("jax.vmap", "`jax.vmap`") for h in head[1:]),
-        ]
-    ]
+    programs = {"chunks of 10000": "chunks of 10 000", "one jax.vmap": "one `jax.vmap`"}
+    columns = ("a trajectory", "memory")
+    table = [["members", *(f"{name}, {what}" for name in programs.values() for what in columns)]]
     for size in values(pick(rows, program="chunks of 10000"), "members"):
-        found = [one(rows, program=program, members=size) for program in programs]
-        cells = [f"{in_units(r['seconds a trajectory'][2])}, {r['MiB']:.3g} MiB" for r in found]
-        table.append([two_digits(size), *cells])
+        cells = [two_digits(size)]
+        for row in (one(rows, program=program, members=size) for program in programs):
+            cells += [in_units(row["seconds a trajectory"][2]), f"{row['MiB']:.3g} MiB"]
+        table.append(cells)
     return table
 
 
@@ -308,15 +308,17 @@ def operators() -> list[list[str]]:
 @table
 def krylov() -> list[list[str]]:
     rows = [row for row in load("operators")["rows"] if row["problem"] != "dense"]
-    table = [["", "2-norm", "`OperatorSum`", "other", "gradient", "other"]]
+    columns = ("`OperatorSum`", "other over it")
+    head = ["", "2-norm", "other", *columns, *(f"gradient, {what}" for what in columns)]
+    table = [head]
     for problem, norm in dict.fromkeys((row["problem"], row["norm"]) for row in rows):
-        cells = [problem, f"{norm:g}"]
+        here = pick(rows, problem=problem, norm=norm)
+        (other,) = {row["program"] for row in here if row["program"] != "OperatorSum"}
+        cells = [problem, f"{norm:g}", other]
         for gradient in (False, True):
-            here = pick(rows, problem=problem, norm=norm, gradient=gradient)
-            cells.append(in_units(here[0]["seconds"][2]))
-            cells += [
-                f"{row['program']}: {two_digits(row['over OperatorSum'][2])}" for row in here[1:]
-            ]
+            ours = one(here, program="OperatorSum", gradient=gradient)
+            ratio = one(here, program=other, gradient=gradient)["over OperatorSum"]
+            cells += [in_units(ours["seconds"][2]), two_digits(ratio[2])]
         table.append(cells)
     return table
 
@@ -373,22 +375,19 @@ def chain() -> list[list[str]]:
     rows = load("chain")["rows"]
     counts = values(rows, "bodies")
     shown = dict.fromkeys((counts[len(counts) // 2], counts[-1]))
-    cases = list(itertools.product(values(rows, "what"), shown))
-
-    def text(program: str, what: str, bodies: int) -> str:
+    table = [["program", "what", "bodies", "to compile", "memory to compile", "100 steps"]]
+    keys = itertools.product(values(rows, "what"), shown, values(rows, "program"))
+    for what, bodies, program in keys:
         found = pick(rows, program=program, what=what, bodies=bodies)
         if not found or "ended" in found[0]:
             last = pick(rows, program=program, what=what)[-1]
-            return f"not in {last['ended']} for {last['bodies']} bodies"
-        (row,) = found
-        compiling = f"{in_units(row['compile CPU seconds'])}, {row['compile MiB']:.3g} MiB"
-        return f"{compiling}; {in_units(row['run seconds'][2])}"
-
-    head = ["", *(f"{what}, {bodies} bodies" for what, bodies in cases)]
-    return [head] + [
-        [code(program), *(text(program, *case) for case in cases)]
-        for program in values(rows, "program")
-    ]
+            cells = [f"not in {last['ended']} for {last['bodies']} bodies", "", ""]
+        else:
+            (row,) = found
+            cells = [in_units(row["compile CPU seconds"]), f"{row['compile MiB']:.3g} MiB"]
+            cells.append(in_units(row["run seconds"][2]))
+        table.append([code(program), what, str(bodies), *cells])
+    return table
 
 
 @table
@@ -402,7 +401,7 @@ def compiling() -> list[list[str]]:
     for method in methods[1:]:
         found = [pick(rows, method=method, way=way) for way in ways]
         cells = [between(r["over Tsit5"][2] for r in few) if few else "" for few in found]
-        table.append([f"`{method}`", *cells])
+        table.append([f"`{SHORT.get(method, method)}`", *cells])
     return table
 
 
@@ -420,23 +419,19 @@ def _quantum() -> dict[tuple[str, int, float], list[Row]]:
 
 @table
 def quantum() -> list[list[str]]:
-    head = ["", "error", "cfjax", "time", "times as fast as", "and as given"]
-    table = [[*head, "norm off by, and theirs"]]
+    columns = ("fastest of the others", "speed-up", "fastest as given", "speed-up")
+    norms = ("norm error, cfjax", "norm error, other")
+    table = [["", "error", "cfjax", "time", *columns, *norms]]
     for (problem, count, goal), rows in _quantum().items():
         ours = [row for row in rows if row["method"].startswith("cfjax")]
         others = [row for row in rows if row not in ours]
         as_given = [row for row in others if not row["method"].endswith("frame")]
         best, *fastest = (min(few, key=lambda r: r[_OVER][2]) for few in (ours, others, as_given))
-        table.append(
-            [
-                f"{problem}, {systems(count)}",
-                power(goal),
-                code(best["method"].removeprefix("cfjax, ")),
-                in_units(best["seconds each"][2]),
-                *(f"{r['method']}: {two_digits(r[_OVER][2] / best[_OVER][2])}" for r in fastest),
-                f"{power(best['off norm'])}, {power(fastest[0]['off norm'])}",
-            ]
-        )
+        cells = [f"{problem}, {systems(count)}", power(goal)]
+        cells += [code(best["method"].removeprefix("cfjax, ")), in_units(best["seconds each"][2])]
+        for row in fastest:
+            cells += [row["method"], two_digits(row[_OVER][2] / best[_OVER][2])]
+        table.append([*cells, power(best["off norm"]), power(fastest[0]["off norm"])])
     return table
 
 
@@ -458,23 +453,30 @@ def _peers(scene: str) -> list[list[str]]:
     return table
 
 
-@table
-def quantum_methods() -> list[list[str]]:
+def _by_method(text: Callable[[Row], str]) -> list[list[str]]:
+    """A row for each method with what `text` says of it in each case, if anything."""
     cases = _quantum()
-    head = ["", *(f"{what}, {power(goal)}, {systems(n)}" for what, n, goal in cases)]
-
-    def text(rows: list[Row], method: str) -> str:
-        found = pick(rows, method=method)
-        if not found:
-            return ""
-        size = found[0]["steps or tolerance"]
-        return f"{size if isinstance(size, int) else power(size)}, {cell(found[0][_OVER])}"
-
     methods = dict.fromkeys(row["method"] for rows in cases.values() for row in rows)
+    head = ["", *(f"{what}, {power(goal)}, {systems(n)}" for what, n, goal in cases)]
     return [head] + [
-        [code(method.removeprefix("cfjax, ")), *(text(rows, method) for rows in cases.values())]
+        [code(method.removeprefix("cfjax, "))]
+        + ["".join(map(text, pick(rows, method=method))) for rows in cases.values()]
         for method in methods
     ]
+
+
+@table
+def quantum_steps() -> list[list[str]]:
+    def text(row: Row) -> str:
+        size = row["steps or tolerance"]
+        return str(size) if isinstance(size, int) else power(size)
+
+    return _by_method(text)
+
+
+@table
+def quantum_times() -> list[list[str]]:
+    return _by_method(lambda row: cell(row[_OVER]))
 
 
 @number

@@ -81,6 +81,8 @@ from ._solvers.magnus import Magnus10 as Magnus10
 from ._solvers.munthe_kaas import RKMK as RKMK
 from ._solvers.munthe_kaas import RKMK3 as RKMK3
 from ._solvers.munthe_kaas import RKMK4 as RKMK4
+from ._solvers.munthe_kaas import RKMK5 as RKMK5
+from ._solvers.munthe_kaas import RKMK8 as RKMK8
 from ._solvers.retraction import CayleyRK4 as CayleyRK4
 from ._solvers.richardson import Richardson as Richardson
 from ._term import LieTerm as LieTerm

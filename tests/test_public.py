@@ -56,6 +56,8 @@ PROMISED = [
     "Magnus10",
     "RKMK3",
     "RKMK4",
+    "RKMK5",
+    "RKMK8",
     "RKMK",
     "CayleyRK4",
     "integrate",

@@ -22,15 +22,3 @@ def test_examples_run_when_pasted(example):
 
 def test_there_are_examples():
     assert EXAMPLES
-
-
-def test_pictures_exist():
-    pictures = re.findall(r"!\[[^]]+\]\(([^)]+)\)", README)
-    assert pictures
-    for picture in pictures:
-        assert (ROOT / picture).stat().st_size > 0
-
-
-def test_links_lead_to_files():
-    for target in re.findall(r"\]\((?!http)([^)#]+)\)", README):
-        assert (ROOT / target).exists(), target

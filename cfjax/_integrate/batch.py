@@ -77,8 +77,8 @@ def map_batch(
     - `progress`: whether to show a progress bar with the time left, on a terminal. Needs `rich`,
       and without it there is none.
 
-    **Raises** `TypeError` or `ValueError` for members that are no arrays or differ in length, for
-    an empty batch, for `chunk_size < 1`, for a `mesh` that is none, and for a `folder` with a
+    **Raises** `TypeError` or `ValueError` if members are not arrays or differ in length, for
+    an empty batch, for `chunk_size < 1`, if `mesh` is not a `Mesh`, and for a `folder` with a
     `solve` that calls a function of the host, as `jax.pure_callback` and progress meters do;
     `OSError` if the folder cannot be made or written to.
     """

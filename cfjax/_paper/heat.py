@@ -246,7 +246,7 @@ def figure_stiffness(runs: Mapping[tuple[str, int], Run]) -> Figure:
         (7.0, 4.8),
         f"Heat conduction: steps attempted to t = 1/2 at tolerance {STIFFNESS_TOLERANCE:g} against "
         "the number of intervals N. Stability bounds the steps of RK4, through the whole operator, "
-        "and of RKMK4, through the commutator, whose factor M no flow damps. So their number grows "
+        "and of RKMK4, through the commutator, which contains M undamped. So their number grows "
         f"like N². Attempted steps at N = {sizes[-1]}: {found}.",
     )
     axes = figure.subplots()

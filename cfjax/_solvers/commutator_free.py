@@ -263,7 +263,8 @@ class CF3(AbstractCommutatorFree, diffrax.AbstractAdaptiveSolver):
 class CF4(AbstractCommutatorFree, diffrax.AbstractAdaptiveSolver):
     """Celledoni, Marthinsen & Owren's method of order 4: 4 evaluations, 5 flows.
 
-    In a linear space this is the classical Runge-Kutta method. The choice for most problems.
+    In a linear space this is the classical Runge-Kutta method. It is the choice for
+    most fields but attitudes and poses, see `RKMK8`, and those that do not depend on y, `Magnus6`.
 
     The estimate costs 1 flow more. Its embedded method of order 3 is first same as last. That tells
     from how the field changes with the state, and sees nothing of how it changes with time. So

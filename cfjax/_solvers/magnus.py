@@ -147,20 +147,22 @@ def _depends_on_state(solver: str, place: str, part: Any) -> str:
 
 
 class Magnus2(AbstractMagnus):
-    """The exponential midpoint rule, for fields of time alone. Order 2, 1 evaluation, 1 flow.
+    """Order 2, for fields that do not depend on y: 1 evaluation, 1 flow.
 
-    Dense output of order 1. No estimate: `cfjax.Richardson(cfjax.Magnus2())` has one.
+    The exponential midpoint rule. Dense output of order 1. No estimate:
+    `cfjax.Richardson(cfjax.Magnus2())` has one.
     """
 
     tableau: ClassVar[MagnusTableau] = _magnus.MAGNUS2
 
 
 class Magnus4(AbstractMagnus, diffrax.AbstractAdaptiveSolver):
-    """Order 4, for fields of time alone: 3 evaluations, 3 flows. All flows go forwards in time.
+    """Order 4, for fields that do not depend on y: 3 evaluations, 3 flows.
 
-    So this is the method for fields that hold strong dissipation: beyond order 4 some flow of every
-    method goes backwards. The estimate, with an embedded method of order 2, costs 1 flow more and
-    asks for small steps: `cfjax.Richardson(cfjax.Magnus4())` takes fewer. Dense output of order 3.
+    All flows go forwards in time. So this is the method for fields with strong dissipation: beyond
+    order 4 some flow of every method goes backwards. The estimate, with an embedded method of order
+    2, costs 1 flow more and asks for small steps: `cfjax.Richardson(cfjax.Magnus4())` takes fewer.
+    Dense output of order 3.
 
     Source: Alvermann & Fehske, High-order commutator-free exponential time-propagation of driven
     quantum systems, J. Comput. Phys. 230 (2011), doi:10.1016/j.jcp.2011.04.006. The embedded method
@@ -171,18 +173,18 @@ class Magnus4(AbstractMagnus, diffrax.AbstractAdaptiveSolver):
 
 
 class Magnus4Lobatto(AbstractMagnus, diffrax.AbstractAdaptiveSolver):
-    """What `CF4` is for fields of time alone, with 2 evaluations and 2 flows instead of 4 and 5.
+    """Order 4, for fields that do not depend on y: 2 evaluations, 2 flows.
 
-    The same numbers, but for rounding. Order 4. The estimate, with the midpoint rule, costs 1 flow
-    more. Dense output of order 3. `Magnus4` has an error constant 50 times smaller for one
-    evaluation and one flow more.
+    Up to rounding it has the numbers of `CF4` on such fields, which takes 4 evaluations and 5
+    flows. The estimate, with the midpoint rule, costs 1 flow more. Dense output of order 3.
+    `Magnus4` has an error constant 50 times smaller for one evaluation and one flow more.
     """
 
     tableau: ClassVar[MagnusTableau] = _magnus.MAGNUS4_LOBATTO
 
 
 class Magnus6(AbstractMagnus, diffrax.AbstractAdaptiveSolver):
-    """Order 6, for fields of time alone: 4 evaluations, 5 flows, 2 more for the estimate.
+    """Order 6, for fields that do not depend on y: 4 evaluations, 5 flows and 2 for the estimate.
 
     The embedded method has order 4. Dense output of order 5. One flow goes backwards in time, by
     0.09 of the step: not for fields that hold strong dissipation, see `CF54`.
@@ -194,7 +196,7 @@ class Magnus6(AbstractMagnus, diffrax.AbstractAdaptiveSolver):
 
 
 class Magnus8(AbstractMagnus, diffrax.AbstractAdaptiveSolver):
-    """Order 8, for fields of time alone: 6 evaluations, 8 flows, 5 more for the estimate.
+    """Order 8, for fields that do not depend on y: 6 evaluations, 8 flows and 5 for the estimate.
 
     The embedded method is `Magnus6` on these nodes. Dense output of order 7. Two flows go backwards
     in time, each by 0.44 of the step: not for fields that hold strong dissipation, see `CF54`.
@@ -207,7 +209,7 @@ class Magnus8(AbstractMagnus, diffrax.AbstractAdaptiveSolver):
 
 
 class Magnus10(AbstractMagnus, diffrax.AbstractAdaptiveSolver):
-    """Order 10, for fields of time alone: 8 evaluations, 16 flows, 5 more for the estimate.
+    """Order 10, for fields that do not depend on y: 8 evaluations, 16 flows and 5 for the estimate.
 
     The embedded method is `Magnus6` on these nodes. Dense output of order 9. Some flows go
     backwards in time, by up to 0.31 of the step: not for fields that hold strong dissipation, see

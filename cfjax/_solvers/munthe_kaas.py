@@ -320,6 +320,36 @@ class RKMK(AbstractMuntheKaas, diffrax.AbstractAdaptiveSolver):
         return stages
 
 
+class RKMK5(RKMK):
+    """Munthe-Kaas method of order 5 of Tsitouras' pair 5(4): 6 evaluations, 6 flows.
+
+    `RKMK(diffrax.Tsit5.tableau)`: without commutators for a field whose `dexpinv` is a closed form,
+    otherwise with 10. The estimate takes no flow, but the field at the end of the step, which is
+    the next one's first, and for it 2 commutators. Dense output of order 4.
+
+    Source: Tsitouras, Runge-Kutta pairs of order 5(4) satisfying only the first column simplifying
+    assumption, Comput. Math. Appl. 62 (2011), doi:10.1016/j.camwa.2011.06.002.
+    """
+
+    def __init__(self, *, estimate: Literal["algebra", "group"] | None = "algebra"):
+        super().__init__(diffrax.Tsit5.tableau, estimate=estimate)
+
+
+class RKMK8(RKMK):
+    """Munthe-Kaas method of order 8 of Dormand and Prince's pair 8(7): 13 evaluations, 13 flows.
+
+    `RKMK(diffrax.Dopri8.tableau)`, for fields whose `dexpinv` is a closed form: of others it takes
+    72 commutators a step. The estimate costs nothing. Dense output of order 7, for 4 evaluations
+    and flows more.
+
+    Source: Prince & Dormand, High order embedded Runge-Kutta formulae, J. Comput. Appl. Math. 7
+    (1981), doi:10.1016/0771-050X(81)90010-3.
+    """
+
+    def __init__(self, *, estimate: Literal["algebra", "group"] | None = "algebra"):
+        super().__init__(diffrax.Dopri8.tableau, estimate=estimate)
+
+
 _classical_order = functools.lru_cache(runge_kutta_order)
 
 

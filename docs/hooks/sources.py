@@ -1,6 +1,11 @@
-"""What the site takes from elsewhere in the repository, its math, and links to the API."""
+"""What the site takes from elsewhere in the repository, its links and math, and links to the API.
+
+A page is written as a code host shows it: links lead to files of the repository, and math is as
+GitHub and GitLab have it. Here these become links between pages, and MathML.
+"""
 
 import html
+import posixpath
 import re
 from pathlib import Path
 
@@ -18,6 +23,16 @@ PAGES = {
     "xla.md": "cfjax/_xla/README.md",
 }
 NOTEBOOKS = sorted((ROOT / "notebooks").glob("*.ipynb"))
+CHARTS = [*ROOT.glob("benchmarks/*.png"), *ROOT.glob("benchmarks/charts/*.png")]
+DOCS = [str(path.relative_to(ROOT / "docs")) for path in ROOT.glob("docs/**/*.md")]
+# Files of the repository, and where they are on the site.
+PLACES = (
+    {source: place for place, source in PAGES.items()}
+    | {f"docs/{place}": place for place in DOCS}
+    | {str(path.relative_to(ROOT)): str(path.relative_to(ROOT)) for path in CHARTS}
+    | {f"notebooks/{path.name}": f"notebooks/{path.stem}.md" for path in NOTEBOOKS}
+)
+SOURCES = {place: source for source, place in PLACES.items()}
 
 
 def on_config(config):
@@ -31,10 +46,10 @@ def on_files(files, *, config):
     def add(place, **source):
         files.append(File.generated(config, place, **source))
 
-    for chart in [*ROOT.glob("benchmarks/*.png"), *ROOT.glob("benchmarks/charts/*.png")]:
+    for chart in CHARTS:
         add(str(chart.relative_to(ROOT)), abs_src_path=str(chart))
     for place, source in PAGES.items():
-        add(place, content=linked((ROOT / source).read_text()))
+        add(place, content=(ROOT / source).read_text())
     for path in NOTEBOOKS:
         # With the results that are stored: nothing is run here.
         text, resources = MarkdownExporter().from_notebook_node(nbformat.read(path, as_version=4))
@@ -50,12 +65,26 @@ def title(path):
     return next(c.source for c in cells if c.source.startswith("# ")).splitlines()[0][2:]
 
 
-def linked(text):
-    """Links between files of the repository, to where these are on the site."""
-    for place, source in PAGES.items():
-        text = text.replace(f"]({source})", f"]({place})")
+def on_page_markdown(markdown, *, page, **_):
+    place = page.file.src_uri
     # Diagrams would need a script from elsewhere.
-    return re.sub("```mermaid\n.*?```\n", "", text, flags=re.DOTALL)
+    markdown = re.sub("```mermaid\n.*?```\n", "", markdown, flags=re.DOTALL)
+    markdown = re.sub(r"```math\n(.*?)```", r"\\[\n\1\\]", markdown, flags=re.DOTALL)
+    markdown = re.sub(r"\$`(.*?)`\$", r"\\(\1\\)", markdown)
+    # The pictures of a notebook stand in it alone.
+    markdown = re.sub(
+        r"<!-- picture: ((\w+)/\w+\.png): (.*?) -->",
+        r"[![\3](notebooks/\1)](notebooks/\2.md)",
+        markdown,
+    )
+    return re.sub(r"\]\(([^)#\s]+)", lambda match: f"]({moved(match[1], place)}", markdown)
+
+
+def moved(target, place):
+    """A link of a page, from its file in the repository to the same from its place on the site."""
+    folder = posixpath.dirname(SOURCES.get(place, place))
+    found = PLACES.get(posixpath.normpath(posixpath.join(folder, target)))
+    return posixpath.relpath(found, posixpath.dirname(place) or ".") if found else target
 
 
 def on_page_content(content, **_):

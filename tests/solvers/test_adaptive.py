@@ -11,7 +11,7 @@ import pytest
 import cfjax
 
 NAMES = """LieEuler CF2 CF3 CF4 CF43 CF54 CG3 CG4 CG5 BWRRK33 BWRRK53 CFEES25 CFEES27 CK34 CK54
-    Luscher3 Williamson3 YRK135 RKMK3 RKMK4"""
+    Luscher3 Williamson3 YRK135 RKMK3 RKMK4 RKMK5 RKMK8"""
 SOLVERS: dict[str, Any] = {name: getattr(cfjax, name)() for name in NAMES.split()}
 SOLVERS["CommutatorFree"] = cfjax.CommutatorFree(cfjax.CF3().tableau)
 SOLVERS["RKMK"] = cfjax.RKMK(diffrax.Heun.tableau)

@@ -488,6 +488,65 @@ def test_a_method_of_order_five_keeps_within_its_brackets(name):
     assert counts == {"evaluations": 6, "flows": 6, "brackets": 6 * 2}
 
 
+# Order, evaluations, those that only output within the step takes, and brackets of a stage.
+NAMED = {
+    "RKMK5": (cfjax.RKMK5, diffrax.Tsit5, 5, 6, 0, 2),
+    "RKMK8": (cfjax.RKMK8, diffrax.Dopri8, 8, 13, 4, 6),
+}
+
+
+@pytest.mark.parametrize("name", NAMED)
+def test_a_named_method_is_that_of_its_tableau(name):
+    cls, plain, order, evaluations, within, brackets = NAMED[name]
+    solver, same = cls(), cfjax.RKMK(plain.tableau)
+    for row in "a", "b", "b_error", "c":
+        assert getattr(solver, row) == getattr(same, row)
+    assert solver.order(None) == order
+    assert solver == cls() != cls(estimate="group")
+    assert cls(estimate=None).estimate is None
+    # As its docstring says.
+    stages = evaluations + within
+    cost = {"evaluations": stages, "flows": stages, "brackets": (stages - 1) * brackets}
+    assert count_step(solver.without_estimate(), jnp.ones((4, 4))) == cost
+
+
+@pytest.mark.parametrize("name", NAMED)
+def test_a_named_method_turns_a_symmetric_body_with_its_order(name):
+    """Its momentum m turns about the third axis at the rate r = m3 (1 / I3 - 1 / I1).
+
+    Its attitude is exp(t m(0) / I1) exp(t r e3).
+    """
+    cls, _, order, *_ = NAMED[name]
+    inertia, m0, t1 = np.array([1.0, 1.0, 0.4]), np.array([0.8, 0.3, 0.5]), 4.0
+
+    def field(t, y, args):
+        w = y["m"] / inertia
+        q = cfjax.QuaternionRotation(w, frame="body", order="wxyz")
+        return {"q": q, "m": cfjax.Rotation(-w)}
+
+    def turn(w):
+        angle = np.linalg.norm(w)
+        return np.array([np.cos(angle / 2), *(np.sin(angle / 2) * w / angle)])
+
+    rate = m0[2] * (1 / inertia[2] - 1 / inertia[0])
+    p, q = turn(t1 * m0 / inertia[0]), turn(t1 * rate * np.array([0.0, 0.0, 1.0]))
+    exact = np.array(
+        [p[0] * q[0] - p[1:] @ q[1:], *(p[0] * q[1:] + q[0] * p[1:] + np.cross(p[1:], q[1:]))]
+    )
+    y0 = {"q": jnp.eye(4)[0], "m": jnp.asarray(m0)}
+
+    def off(n):
+        end = cfjax.integrate(cfjax.LieTerm(field), cls(), 0.0, t1, y0, num_steps=n).ys["q"][-1]
+        return np.abs(np.asarray(end) - exact).max()
+
+    # The largest that are small enough: the errors are still a hundred roundings.
+    steps = {5: (32, 64), 8: (8, 16)}[order]
+    found = np.array(list(map(off, steps)))
+    assert found[1] > 1e-13
+    # With the next order's term, which adds a step size times a number of the problem.
+    assert abs(problems.slope(steps, found) - order) < 0.4
+
+
 # Refusals
 
 
