@@ -123,8 +123,9 @@ def test_the_initial_state_is_saved_on_request(save_every):
         return sol.ts, sol.ys
 
     def loss(y0, **more):
-        weights = jnp.arange(1.0, 4.0)
-        return solve(y0, 0.25, **more)[1] @ weights
+        ys = solve(y0, 0.25, **more)[1]
+        assert ys is not None
+        return ys @ jnp.arange(1.0, 4.0)
 
     ts, ys = jax.jit(lambda y0: solve(y0, 0.25, save_initial=True))(Y0)
     without = jax.jit(lambda y0: solve(y0, 0.25))(Y0)
