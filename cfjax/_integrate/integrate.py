@@ -13,6 +13,7 @@ from jax import lax
 from jax.core import Tracer
 from jaxtyping import Array, Bool, Int, PyTree, Real
 
+from .._numerics.squaring import max_over_batch
 from .._solvers.base import AbstractLieSolver, State
 from .._xla import repeat
 
@@ -168,7 +169,9 @@ def equal_steps(
     nonfinite: Any = diffrax.RESULTS.nonfinite
     result = diffrax.RESULTS.where(is_lost, nonfinite, result)
     if throw:
-        ys = result.error_if(ys, result != diffrax.RESULTS.successful)
+        # equinox takes the largest number of a result, and an empty batch has none.
+        worst = jtu.tree_map(max_over_batch, result)
+        ys = worst.error_if(ys, result != diffrax.RESULTS.successful)
     return diffrax.Solution(
         t0=t0,
         t1=t1,
