@@ -276,7 +276,7 @@ def check_own_tolerances(solver: Any) -> None:
 def as_state(y0: PyTree) -> PyTree:
     """The state as arrays, in a precision in which one can integrate.
 
-    **Raises** `TypeError` for leaves that are no numbers.
+    **Raises** `TypeError` for leaves that are not numbers.
     """
 
     def as_array(path: Any, leaf: Any) -> Array:
