@@ -162,6 +162,12 @@ class BorderedSkew(AbstractSkewElement):
             return pair[0].bracket(pair[1])
         return _spanned(self).bracket(other)
 
+    def dexpinv(self, other: Any, degree: int) -> Any:
+        if self.gamma.ndim > 2:
+            pair: list[Any] = [elementwise(field, self.gamma.ndim - 2) for field in (self, other)]
+            return pair[0].dexpinv(pair[1], degree)
+        return super().dexpinv(other, degree)
+
     def enter(self, point: Any, earlier: Sequence[Any]) -> tuple[AbstractFrozenField, Any]:
         if self.gamma.ndim > 2:
             return elementwise(self, self.gamma.ndim - 2).enter(point, earlier)

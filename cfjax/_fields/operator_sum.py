@@ -293,6 +293,12 @@ def _precision(operators: Sequence[Any]) -> Any:
         shape = _shape(operator)
         if shape is None:
             continue
+        if _is_bcoo(operator) and (operator.n_batch or operator.n_dense):
+            raise ValueError(
+                f"operators[{k}] must be a BCOO without batch and dense dimensions, got "
+                f"n_batch={operator.n_batch} and n_dense={operator.n_dense}. Write "
+                "jax.experimental.sparse.bcoo_update_layout(operator, n_batch=0, n_dense=0)."
+            )
         if not (len(shape) == 1 or (len(shape) == 2 and shape[0] == shape[1])):
             raise ValueError(
                 f"operators[{k}] must have shape (n, n), or (n,) for a diagonal, got {shape}."

@@ -3,8 +3,10 @@
 import contextlib
 import functools
 import hashlib
+import json
 import math
 import os
+import warnings
 from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -19,7 +21,7 @@ from jax.experimental import multihost_utils
 from jax.sharding import Mesh, NamedSharding, PartitionSpec
 from jaxtyping import Array, Bool, Int, PyTree
 
-from .fingerprint import digest, fingerprint
+from .fingerprint import digest, environment, fingerprint
 from .integrate import count
 from .progress import progress_bar
 
@@ -66,11 +68,14 @@ def map_batch(
     - `chunk_size`: how many members are solved at once, rounded up to a multiple of the number of
       devices.
     - `folder`: where finished chunks are kept, one file each, written atomically. After an
-      interruption the same call goes on where it stopped: a file of the same members and the same
-      computation is read instead of computed, anything else in its place, or damaged, is computed
-      again. To the computation belong all constants that `solve` captures, wherever, the versions
-      of cfjax and jax, and the kind of device, but no functions of the host, whose code jax does
-      not see: `solve` must not take values from one. What it prints does not count.
+      interruption the same call goes on where it stopped: what is there is read instead of
+      computed. A folder belongs to one batch. If it holds chunks of other members, of another
+      `chunk_size` or of another computation, the call is an error, and leaves them as they are. To
+      the computation belong all constants that `solve` captures, wherever, the versions of cfjax
+      and jax, and the kind of device, but no functions of the host, whose code jax does not see:
+      `solve` must not take values from one. What it prints does not count. A file that is damaged
+      is computed again, with a warning. `batch.json` in the folder says how to read the files
+      without this function; the page on batches shows how.
     - `mesh`: a `jax.sharding.Mesh`, over all of whose axes each chunk is spread. With several
       processes (`jax.distributed`) every process makes the same call and gets the whole result;
       process 0 alone reads and writes files. By default one device.
@@ -78,9 +83,10 @@ def map_batch(
       and without it there is none.
 
     **Raises** `TypeError` or `ValueError` if members are not arrays or differ in length, for
-    an empty batch, for `chunk_size < 1`, if `mesh` is not a `Mesh`, and for a `folder` with a
-    `solve` that calls a function of the host, as `jax.pure_callback` and progress meters do;
-    `OSError` if the folder cannot be made or written to.
+    an empty batch, for `chunk_size < 1`, if `mesh` is not a `Mesh`, for a `folder` that holds
+    another batch, and for one with a `solve` that calls a function of the host, as
+    `jax.pure_callback` and progress meters do; `OSError` if the folder cannot be made or written
+    to.
     """
     size = _batch_size(members)
     if not isinstance(mesh, Mesh | None):
@@ -88,7 +94,7 @@ def map_batch(
     devices = 1 if mesh is None else mesh.size
     chunk_size = -(-min(count("chunk_size", chunk_size), size) // devices) * devices
     program = _Program(solve, members, chunk_size, mesh)
-    store = None if folder is None else _Store(Path(folder), program)
+    store = None if folder is None else _Store(Path(folder), program, size)
     chunks: list[list[np.ndarray]] = []
     with progress_bar(progress and jax.process_index() == 0, "Solving", size) as update:
         for number, start in enumerate(range(0, size, chunk_size)):
@@ -128,10 +134,14 @@ def _batch_size(members: PyTree) -> int:
 
 
 def _is_of_jax(dtype: Any) -> bool:
-    """Whether jax has arrays of it. Of NumPy's numbers it lacks those of extended precision."""
-    kinds = np.bool_, np.number, jax.dtypes.prng_key
-    lacking = np.longdouble, np.clongdouble
-    return any(jnp.issubdtype(dtype, kind) for kind in kinds) and dtype not in lacking
+    """Whether jax has arrays of it. Of NumPy's numbers it lacks those of extended precision.
+
+    Not by the names of these: on some machines `np.longdouble` is a double.
+    """
+    if jnp.issubdtype(dtype, jax.dtypes.prng_key):
+        return True
+    is_number = any(jnp.issubdtype(dtype, kind) for kind in (np.bool_, np.number))
+    return is_number and dtype.itemsize <= (16 if jnp.issubdtype(dtype, np.complexfloating) else 8)
 
 
 def _is_key(leaf: Any) -> bool:
@@ -200,9 +210,13 @@ class _Program:
         # Where all chunks are read, nothing is compiled.
         return self.lowered.compile()
 
-    def fingerprint(self) -> bytes:
+    @property
+    def environment(self) -> dict[str, Any]:
         devices = jnp.zeros(()).devices() if self.mesh is None else self.mesh.devices.flat
-        return fingerprint(self.traced, self.lowered, devices)
+        return environment(devices)
+
+    def fingerprint(self) -> bytes:
+        return fingerprint(self.traced, self.lowered, self.environment)
 
     def inputs(self, start: int, stop: int) -> list[np.ndarray]:
         """The members of one chunk. The last chunk repeats its last member until it is full."""
@@ -228,27 +242,84 @@ class _Program:
 
 
 class _Store:
-    """Finished chunks as files: the bytes of the results, after a digest of what they belong to.
+    """Finished chunks as files, and a file that says how to read them and what they belong to.
 
-    The digest is of the computation, the members and the results, so that no damage goes unseen.
+    The file of a chunk has a digest of the computation and the members, then one of all else in the
+    file, so that no damage goes unseen, then the bytes of the results.
     """
 
-    def __init__(self, folder: Path, program: _Program):
+    FORMAT = "cfjax.map_batch 1"
+    START = 2 * hashlib.sha256().digest_size
+
+    def __init__(self, folder: Path, program: _Program, size: int):
         self.folder, self.outputs = folder, program.outputs
         self.fingerprint = program.fingerprint()
-        if jax.process_index() == 0:
-            folder.mkdir(parents=True, exist_ok=True)
+        self.description = {
+            "format": self.FORMAT,
+            "members": size,
+            "chunk_size": program.chunk_size,
+            "computation": self.fingerprint.hex(),
+            **program.environment,
+            "arrays": self._arrays(program),
+        }
+        _of_first_process(self._open)
+
+    def _arrays(self, program: _Program) -> list[dict[str, Any]]:
+        """Where each array of a chunk is in its file."""
+        structure, offset, arrays = program.structure, self.START, []
+        tree = structure.treedef.unflatten(self.outputs)
+        paths = [jtu.keystr(path) for path, _ in jtu.tree_leaves_with_path(tree)]
+        for path, kind, a in zip(paths, structure.kinds, self.outputs, strict=True):
+            # With the order of bytes, for dtypes that NumPy knows.
+            dtype = a.dtype.str if a.dtype.isbuiltin == 1 else a.dtype.name
+            arrays.append({"path": path, "dtype": dtype, "shape": a.shape[1:], "offset": offset})
+            if kind is not None:
+                arrays[-1]["key"] = str(kind)
+            offset += math.prod(a.shape) * a.dtype.itemsize
+        return arrays
+
+    def _open(self) -> None:
+        """Makes the folder, or sees that what it holds is of this batch."""
+        self.folder.mkdir(parents=True, exist_ok=True)
+        path, text = self.folder / "batch.json", json.dumps(self.description, indent=2)
+        found = path.read_text() if path.exists() else None
+        if found == text:
+            return
+        if any(self.folder.glob("chunk_*.bin")):
+            what = f"chunks, but no {path.name}" if found is None else self._differences(found)
+            raise ValueError(self._other(what))
+        self._write(path, text.encode())
+
+    def _differences(self, text: str) -> str:
+        try:
+            found = json.loads(text)
+            names = [name for name in self.description if name not in ("computation", "arrays")]
+            texts = [
+                f"{name} {found[name]!r} where {self.description[name]!r} is expected"
+                for name in names
+                if found[name] != self.description[name]
+            ]
+        except (ValueError, TypeError, KeyError):
+            return "a batch.json that is damaged"
+        # That of another chunk size is another one in any case.
+        return ", ".join(texts) or (
+            "the results of another computation: another solve, another constant that it captures, "
+            "or another setting of jax"
+        )
+
+    def _other(self, what: str) -> str:
+        return (
+            f"folder must be empty or hold this batch, but {str(self.folder)!r} holds {what}. It "
+            "is left as it is. Make the call that it was made with, give another folder, or remove "
+            "this one."
+        )
 
     def read(self, number: int, inputs: Sequence[np.ndarray]) -> list[np.ndarray] | None:
-        """The outputs of a chunk, or None where there is no whole file of just these inputs."""
-        data = self._read(number, inputs) if jax.process_index() == 0 else None
-        if jax.process_count() > 1:
-            # All processes must go the same way.
-            if not multihost_utils.broadcast_one_to_all(np.asarray(data is not None)):
-                return None
-            size = sum(math.prod(a.shape) * a.dtype.itemsize for a in self.outputs)
-            sent = np.zeros(size, np.uint8) if data is None else np.frombuffer(data, np.uint8)
-            data = np.asarray(multihost_utils.broadcast_one_to_all(sent)).tobytes()
+        """The outputs of a chunk, or None where there is no whole file.
+
+        **Raises** `ValueError` for a whole file of other inputs.
+        """
+        data = _of_first_process(lambda: self._read(number, inputs))
         if data is None:
             return None
         arrays, start = [], 0
@@ -258,30 +329,40 @@ class _Store:
         return arrays
 
     def _read(self, number: int, inputs: Sequence[np.ndarray]) -> bytes | None:
+        path = self._path(number)
         try:
-            content = self._path(number).read_bytes()
-        except OSError:
+            content = path.read_bytes()
+        except FileNotFoundError:
             return None
-        start = hashlib.sha256().digest_size
-        data = content[start:]
-        return data if content[:start] == self._digest(inputs, data) else None
+        except OSError:
+            content = b""
+        middle = self.START // 2
+        belongs, whole, data = content[:middle], content[middle : self.START], content[self.START :]
+        if whole != _digest(belongs, data):
+            warnings.warn(f"{path} is damaged, and is computed again.", stacklevel=6)
+            return None
+        if belongs != _digest(self.fingerprint, *inputs):
+            raise ValueError(self._other(f"the results of other members in {path.name}"))
+        return data
 
     def write(
         self, number: int, inputs: Sequence[np.ndarray], outputs: Sequence[np.ndarray]
     ) -> None:
-        if jax.process_index() != 0:
-            return
-        data = b"".join(a.tobytes() for a in outputs)
-        path = self._path(number)
-        # One name for each chunk: what a killed process leaves is written over.
+        if jax.process_index() == 0:
+            data = b"".join(a.tobytes() for a in outputs)
+            belongs = _digest(self.fingerprint, *inputs)
+            self._write(self._path(number), belongs + _digest(belongs, data) + data)
+
+    def _write(self, path: Path, content: bytes) -> None:
+        # One name for each file: what a killed process leaves is written over.
         part = path.with_suffix(".part")
         try:
             with open(part, "wb") as file:
-                file.write(self._digest(inputs, data) + data)
+                file.write(content)
                 file.flush()
                 os.fsync(file.fileno())
             # The file gets its name when it is whole and on the disk. It is there under it already
-            # where another process has computed the same chunk just now.
+            # where another process has written the same just now.
             with contextlib.suppress(FileNotFoundError):
                 os.replace(part, path)
         except BaseException:
@@ -292,8 +373,32 @@ class _Store:
     def _path(self, number: int) -> Path:
         return self.folder / f"chunk_{number:06}.bin"
 
-    def _digest(self, inputs: Sequence[np.ndarray], data: bytes) -> bytes:
-        return digest([np.frombuffer(x, np.uint8) for x in (self.fingerprint, data)] + list(inputs))
+
+def _digest(*parts: bytes | np.ndarray) -> bytes:
+    return digest([np.frombuffer(x, np.uint8) if isinstance(x, bytes) else x for x in parts])
+
+
+def _of_first_process(fun: Callable[[], bytes | None]) -> bytes | None:
+    """What `fun` returns in process 0, or an error in all of them where it raises one there."""
+    data, error = None, None
+    if jax.process_index() == 0:
+        try:
+            data = fun()
+        except (ValueError, OSError) as raised:
+            error = raised
+    if jax.process_count() > 1:
+        # All processes must go the same way.
+        sent = data if error is None else str(error).encode()
+        facts = np.asarray([error is not None, sent is not None, len(sent or b"")])
+        failed, is_some, size = multihost_utils.broadcast_one_to_all(facts)
+        content = np.zeros(size, np.uint8) if not sent else np.frombuffer(sent, np.uint8)
+        content = np.asarray(multihost_utils.broadcast_one_to_all(content)).tobytes()
+        data = content if is_some else None
+        if failed and error is None:
+            error = ValueError(content.decode())
+    if error is not None:
+        raise error
+    return data
 
 
 def _sync(folder: Path) -> None:

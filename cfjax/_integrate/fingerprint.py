@@ -24,7 +24,19 @@ _HOST_NUMBER = re.compile(r"(@\w*python\w*callback.*?)\{index = \d+ : ui64\}")
 _EQUINOX_CHECK = re.compile(r"branched_error_if_impl(_\d+)?")
 
 
-def fingerprint(traced: Traced, lowered: Lowered, devices: Iterable[Any]) -> bytes:
+def environment(devices: Iterable[Any]) -> dict[str, Any]:
+    """Versions and kinds of device, as to which one text of a program may mean other arithmetic."""
+    from .. import __version__  # Here, as it is there last.
+
+    return {
+        "cfjax": __version__,
+        "jax": jax.__version__,
+        "jaxlib": jaxlib.version.__version__,
+        "devices": sorted({f"{device.platform} {device.device_kind}" for device in devices}),
+    }
+
+
+def fingerprint(traced: Traced, lowered: Lowered, environment: dict[str, Any]) -> bytes:
     """A digest of all that decides the values of a program, given its inputs.
 
     It is that of the text which is compiled. A jaxpr will not do: constants hide in nested ones, in
@@ -34,8 +46,7 @@ def fingerprint(traced: Traced, lowered: Lowered, devices: Iterable[Any]) -> byt
     names and order, depends on what jax remembers from other programs: so a call counts as the
     text that it calls.
 
-    To it come versions and kinds of device, as to which the same text may mean other arithmetic.
-    Flags of the compiler are no part of it.
+    To it comes the environment. Flags of the compiler are no part of it.
 
     **Raises** `ValueError` if the program takes values from a function of the host, of which it
     knows nothing. A print gives no value, and of equinox's checks nothing is kept but success.
@@ -57,11 +68,7 @@ def fingerprint(traced: Traced, lowered: Lowered, devices: Iterable[Any]) -> byt
         inner = lambda symbol: content(symbol[1]) if symbol[1] in bodies else symbol[0]  # noqa: E731
         return hashlib.sha256(_SYMBOL.sub(inner, bodies[name]).encode()).hexdigest()
 
-    kinds = sorted({f"{device.platform} {device.device_kind}" for device in devices})
-    from .. import __version__  # Here, as it is there last.
-
-    versions = [__version__, jax.__version__, jaxlib.version.__version__]
-    text = "\n".join([*versions, *kinds, rest, content("main")])
+    text = "\n".join([repr(environment), rest, content("main")])
     return digest([np.frombuffer(text.encode(), np.uint8), *_arrays(traced.jaxpr)])
 
 

@@ -13,6 +13,7 @@ from jax import lax
 from jax.core import Tracer
 from jaxtyping import Array, Bool, Int, PyTree, Real
 
+from .._numerics.squaring import max_over_batch
 from .._solvers.base import AbstractLieSolver, State
 from .._xla import repeat
 
@@ -27,6 +28,7 @@ def integrate(
     *,
     num_steps: int | np.integer,
     save_every: int | np.integer | None = None,
+    save_initial: bool = False,
     checkpoint_every: int | np.integer | None = None,
     throw: bool = True,
 ) -> diffrax.Solution:
@@ -43,9 +45,12 @@ def integrate(
       integers, booleans or half precision become the default floating dtype. (`diffeqsolve`
       promotes them to the dtype of the times.) Python floats in `args` are traced; a Python int or
       bool is part of the program, as in equinox.
-    - `num_steps`: how many steps, at least 1.
+    - `num_steps`: how many steps, at least 1, and not so many that a step would be shorter than
+      the rounding of a time: in float32 at most 2^24, and fewer for times far from zero.
     - `save_every`: saves the state after every so many steps; must divide `num_steps`. By default
       only the final state is saved.
+    - `save_initial`: whether `t0` and the initial state are saved too, before all others, as with
+      `diffrax.SaveAt(t0=True)`.
     - `checkpoint_every`: for reverse mode with little memory. It then keeps one state in so many
       steps and computes the steps between again, a second time. About `sqrt(num_steps)` is best,
       and makes the memory proportional to `sqrt(num_steps)` states.
@@ -54,11 +59,12 @@ def integrate(
 
     **Returns:** a `diffrax.Solution`. Its `ts` has shape `(num_saves,)`, and each leaf of `ys` has
     one more axis of that length in front; the last entry is the state at `t1`. The initial state
-    is not repeated there.
+    is there with `save_initial` only.
 
     **Raises:** `TypeError` or `ValueError` for arguments of wrong type or value. A runtime error if
     `y0` or a saved state has an entry that is not finite, if `y0` is off the manifold that a field
-    acts on, if a time is NaN, or if the solver reports a failure.
+    acts on, if a time is NaN, if a step is shorter than the rounding of a time, or if the solver
+    reports a failure.
     """
     check_term_and_solver(term, solver)
     check_own_tolerances(solver)
@@ -68,13 +74,20 @@ def integrate(
     save_every = None if save_every is None else count("save_every", save_every)
     if save_every is not None and num_steps % save_every:
         raise ValueError(f"save_every must divide num_steps={num_steps}, got {save_every}.")
+    if not isinstance(save_initial, bool):
+        raise TypeError(f"save_initial must be a bool, got {save_initial!r}.")
     if checkpoint_every is not None:
         checkpoint_every = count("checkpoint_every", checkpoint_every)
     dtype = time_dtype(y0)
+    if num_steps > _most_steps(dtype):
+        raise ValueError(
+            f"num_steps must be at most {_most_steps(dtype)} where times are {dtype}, as those of "
+            f"more steps do not differ, got {num_steps}. Make y0 float64."
+        )
     t0, t1 = time_scalar("t0", t0, dtype), time_scalar("t1", t1, dtype)
     args = jtu.tree_map(lambda x: jnp.asarray(x) if isinstance(x, float | complex) else x, args)
     return equal_steps(
-        term, solver, t0, t1, y0, args, num_steps, save_every, checkpoint_every, throw
+        term, solver, t0, t1, y0, args, num_steps, save_every, save_initial, checkpoint_every, throw
     )
 
 
@@ -88,6 +101,7 @@ def equal_steps(
     args: PyTree,
     num_steps: int | Int[Array, ""],
     save_every: int | None,
+    save_initial: bool,
     checkpoint_every: int | None,
     throw: bool,
 ) -> diffrax.Solution:
@@ -106,6 +120,7 @@ def equal_steps(
         n, intervals = jnp.asarray(0, jnp.int32 if num_steps < 2**31 else int), num_steps
     else:
         n, intervals = jnp.zeros_like(num_steps), num_steps.astype(t0.dtype)
+    t1 = _with_room_for_steps(t0, t1, intervals)
 
     def time(n):
         # From the step's number, so that rounding does not add up, and t1 is met exactly.
@@ -154,6 +169,9 @@ def equal_steps(
         if save_every is None
         else n + save_every * jnp.arange(1, num_saves + 1, dtype=n.dtype)
     )
+    if save_initial:
+        prepend = lambda first, rest: jnp.concatenate([first[None], rest])  # noqa: E731
+        ts, ys = jtu.tree_map(prepend, (t0, y0), (ts, ys))
     result = carry[3]
     # Of the saved states alone, outside the loop: sums and products keep infinity and NaN, so a
     # blow-up shows in what is saved after it.
@@ -161,7 +179,9 @@ def equal_steps(
     nonfinite: Any = diffrax.RESULTS.nonfinite
     result = diffrax.RESULTS.where(is_lost, nonfinite, result)
     if throw:
-        ys = result.error_if(ys, result != diffrax.RESULTS.successful)
+        # equinox takes the largest number of a result, and an empty batch has none.
+        worst = jtu.tree_map(max_over_batch, result)
+        ys = worst.error_if(ys, result != diffrax.RESULTS.successful)
     return diffrax.Solution(
         t0=t0,
         t1=t1,
@@ -174,6 +194,31 @@ def equal_steps(
         controller_state=None,
         made_jump=None,
         event_mask=None,
+    )
+
+
+def _most_steps(dtype: Any) -> int:
+    """How many steps can be counted in the dtype of the times."""
+    return 2 ** (jnp.finfo(dtype).nmant + 1)
+
+
+def _with_room_for_steps(
+    t0: Real[Array, ""], t1: Real[Array, ""], num_steps: int | Real[Array, ""]
+) -> Real[Array, ""]:
+    """`t1`, or an error if a step is shorter than a unit of rounding of the times.
+
+    Of such steps some would have length zero and others twice the length or more.
+    """
+    start, end = lax.stop_gradient((t0, t1))
+    largest = jnp.maximum(jnp.abs(start), jnp.abs(end))
+    unit = largest - jnp.nextafter(largest, jnp.zeros_like(largest))
+    is_short = (start != end) & (jnp.abs(end - start) / num_steps < unit)
+    return eqx.error_if(
+        t1,
+        is_short | (num_steps > _most_steps(t0.dtype)),
+        "num_steps must leave each step longer than the rounding of t0 and t1, and of so many "
+        f"steps the times do not differ in {t0.dtype}. Take fewer steps, shift the times towards "
+        "zero, or make y0 float64.",
     )
 
 
@@ -222,16 +267,19 @@ def check_term_and_solver(term: Any, solver: Any) -> None:
 
 def check_own_tolerances(solver: Any) -> None:
     """An implicit solver cannot have those of a step size controller where there is none."""
+    while isinstance(solver, diffrax.AbstractWrappedSolver):
+        solver = solver.solver
     if isinstance(solver, diffrax.AbstractImplicitSolver):
         finder = solver.root_finder
         # By default a marker: they are to be those of the step size controller.
         own = [getattr(finder, name, None) for name in ("rtol", "atol")]
         if not all(map(eqx.is_inexact_array_like, own)):
             name = type(solver).__name__
+            place = "diffrax." if getattr(diffrax, name, None) is type(solver) else ""
             raise ValueError(
                 "solver must have tolerances of its own, as equal steps have none to give it, got "
-                f"{name} without. Write diffrax.{name}(diffrax.VeryChord(rtol=1e-8, atol=1e-8, "
-                "norm=optimistix.rms_norm))."
+                f"{name} without. Write {place}{name}(root_finder=diffrax.VeryChord(rtol=1e-8, "
+                "atol=1e-8, norm=optimistix.rms_norm))."
             )
 
 

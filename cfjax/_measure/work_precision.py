@@ -349,7 +349,9 @@ def take_turns(
 
 def _equal_steps(problem: Problem, num_steps: Int[Array, ""]) -> tuple:
     term, solver, t0, t1, _, y0, args = problem
-    solution = equal_steps(term, solver, t0, t1, y0, args, num_steps, None, None, throw=False)
+    solution = equal_steps(
+        term, solver, t0, t1, y0, args, num_steps, None, False, None, throw=False
+    )
     return _end(solution, num_steps, 0)
 
 

@@ -1,4 +1,10 @@
-"""Attitudes as unit quaternions and as matrices."""
+"""Attitudes as unit quaternions and as matrices.
+
+A solver of linear spaces lets a quaternion drift off length 1. It still has one direction, and so
+it means one rotation: what takes a quaternion divides by its length. One that is far off was hardly
+meant as an attitude, and is an error. So is a matrix that is not orthogonal, which means no
+rotation in particular.
+"""
 
 from collections.abc import Sequence
 
@@ -14,24 +20,25 @@ from .quaternion import Order, check_choice, from_parts, parts
 def quaternion_to_matrix(
     q: Float[Array | np.ndarray, "*batch 4"], *, order: Order
 ) -> Float[Array, "*batch 3 3"]:
-    """The rotation matrix of a unit quaternion: with `x_fixed = matrix @ x_body` for an attitude.
+    """The rotation matrix of a quaternion: with `x_fixed = matrix @ x_body` for an attitude.
 
-    It has the products of two entries of q, so q and -q give one matrix.
+    The matrix is that of `q / |q|`, as a solver of linear spaces lets the length of q drift. So the
+    derivative along q is zero. q and -q give one matrix.
 
     **Arguments:** `q`, shape `(*batch, 4)`, float32 or float64; `order`, `"wxyz"` or `"xyzw"`, how
     q is stored, where w is its scalar part.
 
     **Returns:** shape `(*batch, 3, 3)`.
 
-    **Raises** `ValueError` for another shape or order, `TypeError` for another dtype. A length that
-    is off 1 by more than 1e-6 (float32: 3.5e-4) is an error; within a step of a small system, where
-    the solve has checked its start, it is not looked at.
+    **Raises** `ValueError` for another shape or order, `TypeError` for another dtype. A squared
+    length that is off 1 by more than 0.1, as that of zero, is an error; within a step of a small
+    system it gives NaN. Divide such a q by its length.
     """
-    w, x, y, z = parts(_checked_quaternion(q, order), order)
+    (w, x, y, z), c = _quaternion(q, order)
     rows = [
-        [1 - 2 * (y * y + z * z), 2 * (x * y - w * z), 2 * (x * z + w * y)],
-        [2 * (x * y + w * z), 1 - 2 * (x * x + z * z), 2 * (y * z - w * x)],
-        [2 * (x * z - w * y), 2 * (y * z + w * x), 1 - 2 * (x * x + y * y)],
+        [1 - c * (y * y + z * z), c * (x * y - w * z), c * (x * z + w * y)],
+        [c * (x * y + w * z), 1 - c * (x * x + z * z), c * (y * z - w * x)],
+        [c * (x * z - w * y), c * (y * z + w * x), 1 - c * (x * x + y * y)],
     ]
     return pack([pack(row, axis=w.ndim) for row in rows], axis=w.ndim)
 
@@ -42,9 +49,10 @@ def quaternion_rotate(
     *,
     order: Order,
 ) -> Float[Array, "*#batch 3"]:
-    """A vector turned by a unit quaternion: `(0, x)` becomes `q (0, x) / q`.
+    """A vector turned by a quaternion: `(0, x)` becomes `q (0, x) / q`.
 
-    An attitude turns body coordinates into fixed ones, and its conjugate does the reverse.
+    An attitude turns body coordinates into fixed ones, and its conjugate does the reverse. The
+    length of x stays, also where that of q has drifted, as in `quaternion_to_matrix`.
 
     **Arguments:** `q`, shape `(*batch, 4)`, float32 or float64; `x`, shape `(*batch, 3)` and of the
     same dtype, with as many axes; an axis of 1 is broadcast. `order` as in `quaternion_to_matrix`.
@@ -53,7 +61,8 @@ def quaternion_rotate(
 
     **Raises** as `quaternion_to_matrix`.
     """
-    q, x = _checked_quaternion(q, order), _array("x", x, (3,))
+    q, x = jnp.asarray(q), _array("x", x, (3,))
+    (w, *v), factor = _quaternion(q, order)
     if x.dtype != q.dtype:
         raise TypeError(f"x must have the dtype of q, {q.dtype}, got {x.dtype}.")
     fits = x.ndim == q.ndim and all(
@@ -63,9 +72,8 @@ def quaternion_rotate(
         raise ValueError(
             f"The leading axes of q and x must agree or be 1, got q {q.shape} and x {x.shape}."
         )
-    w, *v = parts(q, order)
     x0, x1, x2 = (x[..., k] for k in range(3))
-    twice = [2 * t for t in _cross(v, (x0, x1, x2))]
+    twice = [factor * t for t in _cross(v, (x0, x1, x2))]
     turned = zip((x0, x1, x2), twice, _cross(v, twice), strict=True)
     return pack([a + (w * b + c) for a, b, c in turned], axis=w.ndim, sums=True)
 
@@ -87,6 +95,8 @@ def quaternion_from_matrix(
     **Raises** `ValueError` for another shape or order, `TypeError` for another dtype. A matrix that
     is not orthogonal, by more than 1e-6 (float32: 3.5e-4) in an entry of
     `matrix.T @ matrix`, or has determinant -1 is an error; not so within a step of a small system.
+    A solver of linear spaces lets it drift. There are several rotations near it then, of which the
+    nearest is `u @ vh` for `u, _, vh = jnp.linalg.svd(matrix)`.
 
     Source: Shepperd, Quaternion from rotation matrix, J. Guid. Control 1 (1978),
     doi:10.2514/3.55767b.
@@ -118,14 +128,24 @@ def _cross(a: Sequence[Array], b: Sequence[Array]) -> list[Array]:
     return [a[k - 2] * b[k - 1] - a[k - 1] * b[k - 2] for k in range(3)]
 
 
-def _checked_quaternion(q: Array | np.ndarray, order: Order) -> Array:
+def _quaternion(q: Array | np.ndarray, order: Order) -> tuple[tuple[Array, ...], Array]:
+    """The parts of q, and `2 / |q|^2`."""
     check_choice("order", order)
-    q = _array("q", q, (4,))
-    off = jnp.abs(jnp.sum(q * q, axis=-1) - 1)
-    least = _tolerance(q)
-    return _error_unless(
-        off <= 2 * least, q, f"q must have length 1, and is off by more than {least:.2g}."
+    w, x, y, z = parts(_array("q", q, (4,)), order)
+    # Without a division, at which XLA breaks a step of a small system into several functions: it
+    # took 2.4 times as long. The product of all `1 + off^(2^k)` is `1 / (1 - off)`; of these four
+    # it is so to rounding, and its derivative to 2e-14.
+    off = 1 - ((w * w + x * x) + (y * y + z * z))
+    off2 = off * off
+    off4 = off2 * off2
+    inverse = (1 + off) * (1 + off2) * (1 + off4) * (1 + off4 * off4)
+    is_near = jnp.abs(off) <= 0.1
+    inverse = _error_unless(
+        is_near,
+        jnp.where(is_near, inverse, jnp.nan),
+        "q must have length 1, and is off by more than 0.1 in q @ q. Divide it by its length.",
     )
+    return (w, x, y, z), 2 * inverse
 
 
 def _checked_matrix(matrix: Array) -> Array:
@@ -133,12 +153,13 @@ def _checked_matrix(matrix: Array) -> Array:
     square = jnp.sum(matrix[..., :, None] * matrix[..., None, :], axis=-3)
     one = jnp.broadcast_to(jnp.eye(3, dtype=matrix.dtype), matrix.shape)
     off = jnp.max(jnp.abs(square - one), axis=(-2, -1))
-    least = _tolerance(matrix)
+    least = max(1e-6, float(jnp.finfo(matrix.dtype).eps) ** 0.5)
     matrix = _error_unless(
         off <= least,
         matrix,
         "matrix must be orthogonal, and is off by more than "
-        f"{least:.2g} in an entry of matrix.T @ matrix.",
+        f"{least:.2g} in an entry of matrix.T @ matrix. The nearest rotation is u @ vh for "
+        "u, _, vh = jnp.linalg.svd(matrix).",
     )
     (a, b, c), *others = ([matrix[..., j, k] for k in range(3)] for j in range(3))
     x, y, z = _cross(*others)
@@ -147,10 +168,6 @@ def _checked_matrix(matrix: Array) -> Array:
         matrix,
         "matrix must be a rotation, of determinant 1, and is a reflection, of determinant -1.",
     )
-
-
-def _tolerance(x: Array) -> float:
-    return max(1e-6, float(jnp.finfo(x.dtype).eps) ** 0.5)
 
 
 def _error_unless(holds: Bool[Array, "*batch"], x: Array, message: str) -> Array:

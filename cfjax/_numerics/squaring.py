@@ -47,7 +47,7 @@ def max_over_batch(s: Array) -> Array:
 @max_over_batch.def_vmap
 def _(axis_size: int, in_batched: list[bool], s: Array) -> tuple[Array, bool]:
     del axis_size, in_batched
-    return max_over_batch(jnp.max(s)), False
+    return max_over_batch(jnp.max(s, initial=0)), False
 
 
 def repeat(step: Callable[[T], T], x: T, s: Array) -> T:

@@ -15,6 +15,7 @@ from jax.core import Tracer
 from jaxtyping import Array, Inexact, PyTree, Real
 
 from .._field import Incremented, flow, is_field, is_incremented, value
+from .._numerics.squaring import max_over_batch
 from .._term import product
 from .._xla import by_components, is_rewritten, once_in_rows, once_together
 from .dense import Interpolation, Path
@@ -247,7 +248,9 @@ def _admitted(t0: Array, t1: Any, field: PyTree, y0: PyTree) -> Real[Array, ""]:
             for x in levels
         ]
         # NaN has an error of its own.
-        zero = eqxi.branched_error_if(zero, off > least, jnp.maximum(level - 1, 0), messages)
+        # Of the worst in a batch, which may be empty.
+        level = max_over_batch(jnp.maximum(level - 1, 0))
+        zero = eqxi.branched_error_if(zero, off > least, level, messages)
     return zero
 
 

@@ -9,8 +9,8 @@ import jax.tree_util as jtu
 from jax import lax
 from jaxtyping import Array, PyTree, Real
 
-from .._field import flow, tangent
-from .._integrate.integrate import as_state, time_dtype
+from .._field import describe, flow, tangent
+from .._integrate.integrate import as_state, check_term_and_solver, time_dtype, time_scalar
 from .._term import LieTerm
 
 
@@ -27,7 +27,8 @@ class ErrorNorm(eqx.Module):
     state's: one for each part, in its unit.
 
     **Raises** `ValueError` for a scale that is not a scalar, or a structure that is no prefix of
-    the state's; a runtime error for a scale that is not positive.
+    the state's; `TypeError` for a scale that is not real; a runtime error for a scale that is not
+    positive.
     """
 
     scales: PyTree
@@ -37,6 +38,10 @@ class ErrorNorm(eqx.Module):
             if jnp.shape(scale) != ():
                 raise ValueError(
                     f"scales{jtu.keystr(path)} must be a scalar, got shape {jnp.shape(scale)}."
+                )
+            if not eqx.is_array_like(scale) or jnp.iscomplexobj(scale):
+                raise TypeError(
+                    f"scales{jtu.keystr(path)} must be a real number, got {describe(scale)}."
                 )
         self.scales = jtu.tree_map(_checked, scales)
 
@@ -77,45 +82,57 @@ def starting_step(
     From the velocity v at the start and its rate of change r along a small flow, the step h whose
     error, taken as `h |v| (h r)^order`, is `atol / 100`. It costs 2 evaluations and 1 flow.
 
+    The small flow moves the state by a hundredth of its own size. A state at or near zero has none:
+    then its size is taken as the geometric mean of `atol` and of how far v leads until `t1`. A
+    state that starts at rest moves for a hundredth of the interval.
+
     **Arguments:** `term`, `solver`, `t0`, `t1`, `y0`, `args` as for `diffrax.diffeqsolve`; the
-    solver's order is used. `atol` and `norm` as for `diffrax.PIDController`, with `rtol=0`.
+    solver's order is used. `atol`, positive, and `norm` as for `diffrax.PIDController`, with
+    `rtol=0`.
 
-    **Returns:** a scalar with the sign of `t1 - t0`, at most as long.
+    **Returns:** a scalar with the sign of `t1 - t0`, at most as long. It scales with the unit of
+    time, and does not change with the unit of the state and `atol`.
 
-    **Raises** `TypeError` if the term is not a `cfjax.LieTerm` or `diffrax.ODETerm`.
+    **Raises** `TypeError` if the term is not a `cfjax.LieTerm` or `diffrax.ODETerm`, the solver no
+    instance of a diffrax solver, or `t0`, `t1` or `atol` no real scalar; a runtime error if `atol`
+    is not positive.
 
     Source: the algorithm of Hairer, Norsett & Wanner, Solving Ordinary Differential Equations I,
-    Section II.4, with an error that scales with the unit of time.
+    Section II.4, with an error and a small flow that scale with the unit of time.
     """
     if not isinstance(term, LieTerm | diffrax.ODETerm):
         raise TypeError(
             f"term must be a cfjax.LieTerm or a diffrax.ODETerm, got {type(term).__name__}."
         )
+    check_term_and_solver(term, solver)
     norm = (lambda y: jnp.sqrt(_mean_square(y))) if norm is None else norm
     y0 = as_state(y0)
     dtype = time_dtype(y0)
-    t0, t1, atol = (jnp.asarray(x, dtype) for x in (t0, t1, atol))
+    times = {"t0": t0, "t1": t1, "atol": atol}
+    t0, t1, unit = (time_scalar(name, x, dtype) for name, x in times.items())
+    unit = eqx.error_if(unit, ~(unit > 0), "atol must be positive.")
     longest = jnp.abs(t1 - t0)
     sign = jnp.sign(t1 - t0)
 
     def scaled(y):
-        return norm(jtu.tree_map(lambda leaf: leaf / atol.astype(leaf.dtype), y))
+        return norm(jtu.tree_map(lambda leaf: leaf / unit.astype(leaf.dtype), y))
 
     f0 = term.vf(t0, y0, args)
     v0 = tangent(f0, y0)
-    d0, d1 = scaled(y0), scaled(v0)
-    moves = d1 > 0
-    d1 = jnp.where(moves, d1, 1)
-    # A hundredth of the time in which the state would move by its own size.
-    h0 = jnp.minimum(jnp.where(moves, 0.01 * d0 / d1, longest), longest)
-    h0 = jnp.where(h0 > 0, h0, longest).astype(dtype)
+    # In units of atol.
+    size, speed = scaled(y0), scaled(v0)
+    way = jnp.where(jnp.isfinite(longest), speed * longest, 1)
+    size = jnp.maximum(size, jnp.sqrt(way))
+    time = jnp.where(speed > 0, size / jnp.where(speed > 0, speed, 1), longest)
+    h0 = (0.01 * jnp.minimum(time, longest)).astype(dtype)
     y1 = flow(term.prod(f0, sign * h0), y0)
     v1 = tangent(term.vf(t0 + sign * h0, y1, args), y1)
-    change = jtu.tree_map(jnp.subtract, v1, v0)
+    change = scaled(jtu.tree_map(jnp.subtract, v1, v0))
+    speed = jnp.maximum(speed, scaled(v1))
     # How fast the velocity changes, as a rate: derivatives are taken to grow by it.
-    rate = scaled(change) / (jnp.where(h0 > 0, h0, 1) * d1)
+    rate = change / (jnp.where(h0 > 0, h0, 1) * jnp.where(speed > 0, speed, 1))
     order = solver.order(term) or 1
-    error = jnp.where(moves, d1 * rate**order, 0)
+    error = speed * rate**order
     h1 = jnp.where(error > 0, (0.01 / jnp.where(error > 0, error, 1)) ** (1 / (order + 1)), longest)
-    step = jnp.minimum(jnp.minimum(100 * h0, h1), longest)
+    step = jnp.minimum(jnp.where(speed > 0, jnp.minimum(100 * h0, h1), longest), longest)
     return lax.stop_gradient((sign * step).astype(dtype))

@@ -34,7 +34,8 @@ class AbstractMagnus(AbstractLieSolver):
     Where the nodes have both ends of the step, its last evaluation is the first one of the next.
 
     **Raises** `TypeError` when the program is traced if the field depends on the state, be it that
-    it is frozen there as `cfjax.LowRankSkew` is; `ValueError` for another `estimate`.
+    it is frozen there as `cfjax.LowRankSkew` is, or gives the state to a function of the host that
+    `jax.vmap` does not take; `ValueError` for another `estimate`.
     """
 
     is_of_state: ClassVar[bool] = False
@@ -63,9 +64,21 @@ class AbstractMagnus(AbstractLieSolver):
         def field(y):
             return product(terms, terms.vf(t0, y, args), terms.contr(t0, t1))
 
-        found = _varying(field, y0)
+        name = type(self).__name__
+        try:
+            found = _varying(field, y0)
+        except Exception as error:
+            # What is wrong with the field itself, it says itself.
+            eqx.filter_eval_shape(field, y0)
+            raise TypeError(
+                f"{name} takes fields that depend on time alone, and the field gives the state to "
+                "an operation that jax.vmap does not take, such as a function of the host "
+                "(jax.pure_callback) without vmap_method. What that returns counts as dependent on "
+                "the state: give it the time alone, or use another method, for example "
+                "cfjax.CF4()."
+            ) from error
         if found:
-            raise TypeError(_depends_on_state(type(self).__name__, *found[0]))
+            raise TypeError(_depends_on_state(name, *found[0]))
         return super().init(terms, t0, t1, y0, args)
 
     def move(self, field, y0):

@@ -103,7 +103,8 @@ def operation(
     before = None
     if plain is not None and is_closed:
         before = _Plain(of_plain_leaves, _structs(code.invars))
-    outs = operation_p.bind(*made.consts, *leaves, program=program, kind=kind, plain=before)
+    consts = map(jnp.asarray, made.consts)
+    outs = operation_p.bind(*consts, *leaves, program=program, kind=kind, plain=before)
     return jtu.tree_unflatten(out_structure, outs)
 
 

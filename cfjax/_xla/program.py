@@ -185,14 +185,16 @@ def trace(fun: Callable[[PyTree], PyTree], y: PyTree, place: Place) -> Program |
         with rewriting(False):
             rolled, shape = jax.make_jaxpr(fun, return_shape=True)(y)
         before = rolled if jtu.tree_structure(shape) == structure else before
-    unknown = {id(x): x for x in (*jaxpr.consts, *before.consts) if _constant(x) is None}
+    unknown = {id(x): x for x in jaxpr.consts if _constant(x) is None}
+    unknown |= {id(x): x for x in before.consts if isinstance(x, Tracer)}
     number = {key: k for k, key in enumerate(unknown)}
 
     def values(consts: Sequence[Any], parameters: PyTree) -> list[Any]:
-        return [parameters[number[id(x)]] if id(x) in number else _constant(x) for x in consts]
+        return [parameters[number[id(x)]] if id(x) in number else x for x in consts]
 
     def apart(y: PyTree, parameters: PyTree) -> PyTree:
-        first, moving = values(jaxpr.consts, parameters), jtu.tree_leaves(y, is_leaf=_is_apart)
+        first = [x if _constant(x) is None else _constant(x) for x in jaxpr.consts]
+        first, moving = values(first, parameters), jtu.tree_leaves(y, is_leaf=_is_apart)
         fixed = [True] * len(first) + [False] * len(moving)
         form = _Form(rows, num_operations > _SHORT, has_reciprocals(code, fixed))
         outs, _ = _evaluate(code, (*first, *moving), fixed, form)

@@ -187,6 +187,132 @@ def test_gradients(name):
     np.testing.assert_allclose(together[1], sum(by_scale), rtol=1e-11)
 
 
+# Batches without members: whatever is asked of them is an empty array.
+
+EMPTY = {name: FIELDS[name][0] for name in FIELDS} | {
+    "SphereRotation of space": lambda t, x: cfjax.SphereRotation(jnp.cos(t) * x),
+    "Congruence without source": lambda t, x: of_matrices(cfjax.Congruence, x, t),
+    "RightMatrix of long vectors": lambda t, x: cfjax.RightMatrix(jnp.outer(x, jnp.cos(x + t))),
+    "QuaternionRotation": lambda t, x: cfjax.QuaternionRotation(
+        jnp.cos(t) * x[:3], frame="body", order="wxyz"
+    ),
+    "RigidMotion": lambda t, x: cfjax.RigidMotion(omega=jnp.cos(t) * x[:3], v=x[4:], frame="body"),
+    "RigidMotion of matrices": lambda t, x: cfjax.RigidMotion(
+        omega=jnp.cos(t) * x[0, :3], v=x[:3, 3], frame="fixed"
+    ),
+    "PlanarMotion": lambda t, x: cfjax.PlanarMotion(
+        omega=jnp.cos(t) * x[0], v=x[2:], frame="fixed"
+    ),
+    "translation": lambda t, x: jnp.cos(t) * x,
+}
+SHAPES = {
+    "SphereRotation of space": (3,),
+    "Congruence without source": (3, 3),
+    "RightMatrix of long vectors": (20,),
+    "QuaternionRotation": (4,),
+    "RigidMotion": (7,),
+    "RigidMotion of matrices": (4, 4),
+    "PlanarMotion": (4,),
+    "translation": (3,),
+}
+
+
+def empty(name):
+    """The field of all members of an empty batch, and their states."""
+    if name in FIELDS:
+        return of_all(name), jax.tree.map(lambda x: x[:0], points(name))
+    return lambda t, y, args: jax.vmap(lambda x: EMPTY[name](t, x))(y), jnp.zeros(
+        (0, *SHAPES[name])
+    )
+
+
+def assert_empty_like(found, expected):
+    jax.tree.map(lambda a, b: np.testing.assert_array_equal(a, b, strict=True), found, expected)
+
+
+@pytest.mark.parametrize("name", EMPTY)
+def test_the_motions_of_an_empty_batch(name):
+    field, y = empty(name)
+    a, b = field(0.0, y, None), field(0.4, y, None)
+    assert_empty_like(cfjax.flow(a, y), y)
+    assert_empty_like(cfjax.tangent(a, y), y)
+    if isinstance(a, cfjax.AbstractAlgebraElement):
+        for made in (cfjax.bracket(a, b), a.dexpinv(b, 4)):
+            assert_empty_like(cfjax.tangent(made, y), y)
+            assert_empty_like(cfjax.flow(made, y), y)
+
+    def total(y, weight):
+        moved = cfjax.flow(cfjax.combine((weight,), (field(0.0, y, None),)), y)
+        return sum(map(jnp.sum, jax.tree.leaves(moved)))
+
+    by_start, by_weight = jax.grad(total, argnums=(0, 1))(y, 1.0)
+    assert_empty_like(by_start, y)
+    assert by_weight == 0
+
+
+@pytest.mark.representatives(3)
+@pytest.mark.parametrize("name", EMPTY)
+def test_solves_of_an_empty_batch(name):
+    field, y0 = empty(name)
+    term = cfjax.LieTerm(field)
+    saved = jax.tree.map(lambda y: jnp.zeros((2, *y.shape)), y0)
+
+    @eqx.filter_jit
+    def solve(y0, controller=None):
+        if controller is None:
+            return cfjax.integrate(term, cfjax.CF4(), 0.0, 1.0, y0, num_steps=4, save_every=2).ys
+        return diffrax.diffeqsolve(
+            term,
+            cfjax.CF4(),
+            0.0,
+            1.0,
+            0.25,
+            y0,
+            stepsize_controller=controller,
+            saveat=diffrax.SaveAt(ts=jnp.asarray([0.3, 1.0])),
+        ).ys
+
+    controllers = [
+        None,
+        diffrax.ConstantStepSize(),
+        diffrax.PIDController(rtol=0.0, atol=1e-6),
+    ]
+    for controller in controllers:
+
+        def total(y0, controller=controller):
+            ys = solve(y0, controller)
+            return sum(map(jnp.sum, jax.tree.leaves(ys))), ys
+
+        by_start, ys = jax.grad(total, has_aux=True)(y0)
+        assert_empty_like(ys, saved)
+        assert_empty_like(by_start, y0)
+
+
+@pytest.mark.representatives(2)
+@pytest.mark.parametrize("solver", [x for x in SOLVERS if x not in ("CF4", "CayleyRK4")])
+@pytest.mark.parametrize("name", ["Rotation", "LeftMatrix", "QuaternionRotation"])
+def test_an_empty_batch_by_other_methods(name, solver):
+    field, y0 = empty(name)
+    ys = cfjax.integrate(cfjax.LieTerm(field), SOLVERS[solver], 0.0, 1.0, y0, num_steps=2).ys
+    assert_empty_like(ys, y0[None])
+
+
+@pytest.mark.representatives(3)
+@pytest.mark.parametrize("name", [name for name in EMPTY if not name.startswith("elementwise")])
+def test_an_empty_batch_of_solves(name):
+    """By `jax.vmap`, each solve with its checks of the start and of the end."""
+    _, y0 = empty(name)
+    term = cfjax.LieTerm(lambda t, y, args: EMPTY[name](t, y))
+
+    def total(y0):
+        ys = cfjax.integrate(term, cfjax.CF4(), 0.0, 1.0, y0, num_steps=2).ys
+        return jnp.sum(ys), ys
+
+    by_start, ys = jax.vmap(jax.grad(total, has_aux=True))(y0)
+    assert_empty_like(by_start, y0)
+    assert_empty_like(ys, y0[:, None])
+
+
 # Leading axes of the coordinates say how many there are; those of 1 are broadcast.
 
 

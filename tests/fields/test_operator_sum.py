@@ -9,7 +9,7 @@ import lineax as lx
 import numpy as np
 import pytest
 import scipy.linalg
-from jax.experimental.sparse import BCOO
+from jax.experimental.sparse import BCOO, bcoo_update_layout
 
 import cfjax
 from cfjax import OperatorSum
@@ -279,6 +279,17 @@ A = MATRICES[0]
 def test_wrong_arguments(arguments, error, message, no_shape_hook):
     with pytest.raises(error, match=message):
         OperatorSum(*arguments)
+
+
+@pytest.mark.parametrize("layout", [{"n_batch": 1}, {"n_dense": 1}])
+def test_a_sparse_operator_of_another_layout(layout, no_shape_hook):
+    operator = BCOO.fromdense(jnp.asarray(MATRICES[1]), **layout)
+    with pytest.raises(ValueError, match=r"operators\[0\] must be a BCOO without batch and dense"):
+        cfjax.OperatorSum([1.0], [operator])
+    plain = bcoo_update_layout(operator, n_batch=0, n_dense=0)  # As the message says.
+    x = jnp.ones(len(MATRICES[1]), plain.dtype)
+    found = cfjax.OperatorSum([1.0], [plain]).tangent(x)
+    np.testing.assert_allclose(found, MATRICES[1] @ np.ones(len(x)), rtol=0, atol=1e-14)
 
 
 def test_what_is_not_skew(no_shape_hook):

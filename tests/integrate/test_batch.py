@@ -1,5 +1,7 @@
 """Large batches: chunks, files, devices, processes."""
 
+import json
+import math
 import os
 import socket
 import stat
@@ -198,7 +200,7 @@ def test_what_is_finished_is_read_and_not_computed_again(tmp_path, computed):
     folder = tmp_path / "some" / "results"
     first, _ = cfjax.map_batch(solve, members(), chunk_size=CHUNK, folder=folder)
     assert len(computed) == 5
-    assert sorted(os.listdir(folder)) == [f"chunk_{i:06}.bin" for i in range(5)]
+    assert sorted(os.listdir(folder)) == ["batch.json", *(f"chunk_{i:06}.bin" for i in range(5))]
     again, _ = cfjax.map_batch(solve, members(), chunk_size=CHUNK, folder=str(folder))
     assert len(computed) == 5
     np.testing.assert_array_equal(again, first)
@@ -215,7 +217,8 @@ def test_an_interrupted_batch_goes_on_where_it_stopped(tmp_path, computed, monke
     with monkeypatch.context() as patch, pytest.raises(KeyboardInterrupt):
         patch.setattr(_batch._Store, "write", interrupted)
         cfjax.map_batch(solve, members(), chunk_size=CHUNK, folder=tmp_path)
-    assert sorted(os.listdir(tmp_path)) == ["chunk_000000.bin", "chunk_000001.bin"]
+    chunks = ["chunk_000000.bin", "chunk_000001.bin"]
+    assert sorted(os.listdir(tmp_path)) == ["batch.json", *chunks]
     values, _ = cfjax.map_batch(solve, members(), chunk_size=CHUNK, folder=tmp_path)
     y0 = members()[0][:, 0]
     assert computed == list(y0[[0, 5, 10, 10, 15, 20]])
@@ -239,7 +242,8 @@ def test_a_damaged_file_is_computed_again(tmp_path, computed):
     path = tmp_path / "chunk_000003.bin"
     content = path.read_bytes()
     path.write_bytes(content[:-1] + bytes([content[-1] ^ 1]))
-    again, _ = cfjax.map_batch(solve, members(), chunk_size=CHUNK, folder=tmp_path)
+    with pytest.warns(UserWarning, match=r"chunk_000003\.bin is damaged, and is computed again"):
+        again, _ = cfjax.map_batch(solve, members(), chunk_size=CHUNK, folder=tmp_path)
     assert computed == [members()[0][15, 0]]
     np.testing.assert_array_equal(again, first)
     cfjax.map_batch(solve, members(), chunk_size=CHUNK, folder=tmp_path)
@@ -249,7 +253,7 @@ def test_a_damaged_file_is_computed_again(tmp_path, computed):
 def test_no_damage_is_taken_for_results(tmp_path):
     x = np.arange(3.0)
     program = _batch._Program(lambda x: (x, x > 1), x, 3, None)
-    store = _batch._Store(tmp_path, program)
+    store = _batch._Store(tmp_path, program, 3)
     outputs = program([x])
     store.write(0, [x], outputs)
     path = tmp_path / "chunk_000000.bin"
@@ -262,13 +266,17 @@ def test_no_damage_is_taken_for_results(tmp_path):
         damaged.append(bytes(changed))
     for wrong in damaged:
         path.write_bytes(wrong)
-        assert store.read(0, [x]) is None
+        with pytest.warns(UserWarning, match="is damaged"):
+            assert store.read(0, [x]) is None
     path.unlink()
-    path.mkdir()
     assert store.read(0, [x]) is None
+    path.mkdir()
+    with pytest.warns(UserWarning, match="is damaged"):
+        assert store.read(0, [x]) is None
     path.rmdir()
     path.write_bytes(content)
-    assert store.read(0, [x + 1]) is None
+    with pytest.raises(ValueError, match="other members"):
+        store.read(0, [x + 1])
     for read, output in zip(store.read(0, [x]), outputs, strict=True):
         np.testing.assert_array_equal(read, output)
 
@@ -305,20 +313,28 @@ def test_what_a_killed_process_leaves_is_written_over(tmp_path):
 import os, signal, sys
 import numpy as np
 import cfjax
-os.fsync = lambda descriptor: os.kill(os.getpid(), signal.SIGKILL)
+replace = os.replace
+def killed(part, path):
+    if sys.argv[2] in os.path.basename(path):
+        os.kill(os.getpid(), signal.SIGKILL)
+    replace(part, path)
+os.replace = killed
 cfjax.map_batch(lambda x: x, np.ones(3, np.float32), folder=sys.argv[1])
 """
-    process = subprocess.run([sys.executable, "-c", killed, str(tmp_path)])
-    assert process.returncode == -9
-    assert len(os.listdir(tmp_path)) == 1
-    cfjax.map_batch(lambda x: x, np.ones(3), folder=tmp_path)
-    assert os.listdir(tmp_path) == ["chunk_000000.bin"]
+    for name, left in [("batch", ["batch.part"]), ("chunk", ["batch.json", "chunk_000000.part"])]:
+        folder = tmp_path / name
+        process = subprocess.run([sys.executable, "-c", killed, str(folder), name])
+        assert process.returncode == -9
+        assert sorted(os.listdir(folder)) == left
+        # Another batch too may have a folder in which no chunk is finished.
+        cfjax.map_batch(lambda x: x, np.ones(3), folder=folder)
+        assert sorted(os.listdir(folder)) == ["batch.json", "chunk_000000.bin"]
 
 
 def test_another_process_writes_the_same_chunk_at_the_same_time(tmp_path, monkeypatch):
     x = np.arange(3.0)
     program = _batch._Program(lambda x: 2 * x, x, 3, None)
-    store = _batch._Store(tmp_path, program)
+    store = _batch._Store(tmp_path, program, 3)
     sync, others = os.fsync, [store]
 
     def other_comes_between(descriptor):
@@ -328,7 +344,7 @@ def test_another_process_writes_the_same_chunk_at_the_same_time(tmp_path, monkey
 
     monkeypatch.setattr(os, "fsync", other_comes_between)
     store.write(0, [x], [2 * x])
-    assert os.listdir(tmp_path) == ["chunk_000000.bin"]
+    assert sorted(os.listdir(tmp_path)) == ["batch.json", "chunk_000000.bin"]
     np.testing.assert_array_equal(store.read(0, [x])[0], 2 * x)
 
 
@@ -348,7 +364,8 @@ def test_the_name_of_a_file_is_on_the_disk_too(tmp_path, monkeypatch):
     monkeypatch.setattr(os, "fsync", spied_sync)
     monkeypatch.setattr(os, "replace", spied_replace)
     cfjax.map_batch(lambda x: x, np.ones(3), folder=tmp_path)
-    assert events == ["file", "name", "folder"]
+    # The description, then the chunk.
+    assert events == 2 * ["file", "name", "folder"]
 
     def no_folders(path, *arguments, **options):
         if os.path.isdir(path):
@@ -356,36 +373,112 @@ def test_the_name_of_a_file_is_on_the_disk_too(tmp_path, monkeypatch):
         return open_(path, *arguments, **options)
 
     monkeypatch.setattr(os, "open", no_folders)
-    cfjax.map_batch(lambda x: x, np.zeros(3), folder=tmp_path)
-    assert events[3:] == ["file", "name"]
+    cfjax.map_batch(lambda x: x, np.ones(3), folder=tmp_path / "other")
+    assert events[6:] == 2 * ["file", "name"]
 
 
-def test_results_of_other_members_or_another_solve_are_not_taken(tmp_path, computed):
-    def scaled(factor):
-        return lambda member: factor * solve(member)
+def scaled(factor):
+    return lambda member: factor * solve(member)
 
-    factor = jnp.asarray(2.0)
-    cfjax.map_batch(scaled(factor), members(), chunk_size=CHUNK, folder=tmp_path)
-    for constant in (2.5, jnp.asarray(3.0)):
-        del computed[:]
-        values, _ = cfjax.map_batch(scaled(constant), members(), chunk_size=CHUNK, folder=tmp_path)
-        assert len(computed) == 5
-        expected, _ = cfjax.map_batch(scaled(constant), members(), chunk_size=CHUNK)
-        np.testing.assert_array_equal(values, expected)
+
+# What another call may have, and what is said of it.
+OTHERS = {
+    "constant": ({"solve": scaled(2.5)}, "the results of another computation.*"),
+    "constant in an array": (
+        {"solve": scaled(jnp.asarray(3.0))},
+        "the results of another computation.*",
+    ),
+    "chunk_size": ({"chunk_size": 10}, "chunk_size 5 where 10 is expected"),
+    "number": ({"members": members(30)}, "members 23 where 30 is expected"),
+    "all": (
+        {"members": members(30), "chunk_size": 10},
+        "members 23 where 30 is expected, chunk_size 5 where 10 is expected",
+    ),
+}
+
+
+def contents(folder):
+    return {path.name: path.read_bytes() for path in folder.iterdir()}
+
+
+@pytest.mark.parametrize("other", OTHERS)
+def test_a_folder_belongs_to_one_batch(tmp_path, computed, other):
+    """Nothing is read from another batch, nothing overwritten, and the way out is said."""
+    call = {"solve": scaled(jnp.asarray(2.0)), "members": members(), "chunk_size": CHUNK}
+    cfjax.map_batch(**call, folder=tmp_path)
+    before = contents(tmp_path)
+    del computed[:]
+    changes, message = OTHERS[other]
+    expected = rf"folder must be empty or hold this batch, but .* holds {message}\. It is left as"
+    with pytest.raises(ValueError, match=expected):
+        cfjax.map_batch(**(call | changes), folder=tmp_path)
+    assert computed == []
+    assert contents(tmp_path) == before
+
+
+def test_a_folder_of_other_values_of_members(tmp_path, computed):
+    cfjax.map_batch(solve, members(), chunk_size=CHUNK, folder=tmp_path)
+    before = contents(tmp_path)
     del computed[:]
     y0, inertia = members()
     y0[7, 0] += 1
-    cfjax.map_batch(scaled(jnp.asarray(3.0)), (y0, inertia), chunk_size=CHUNK, folder=tmp_path)
-    assert computed == [y0[5, 0]]
+    with pytest.raises(ValueError, match=r"holds the results of other members in chunk_000001"):
+        cfjax.map_batch(solve, (y0, inertia), chunk_size=CHUNK, folder=tmp_path)
+    assert computed == []
+    assert contents(tmp_path) == before
 
 
-def test_results_of_another_parameter_of_the_field_are_not_taken(tmp_path):
-    for inertia in (jnp.asarray([7 / 8, 5 / 8, 1 / 4]), jnp.asarray([2.0, 1.0, 0.5])):
-        y0, _ = members()
-        solve = SOLVES["array in the field"](inertia)
-        values, _ = cfjax.map_batch(solve, y0, folder=tmp_path)
-        expected, _ = cfjax.map_batch(solve, y0)
-        np.testing.assert_array_equal(values, expected)
+def test_a_folder_of_another_version(tmp_path, monkeypatch):
+    run = lambda: cfjax.map_batch(lambda x: x, np.ones(3), folder=tmp_path)  # noqa: E731
+    with monkeypatch.context() as patch:
+        patch.setattr(cfjax, "__version__", "0.1.0")
+        run()
+    with pytest.raises(ValueError, match=f"holds cfjax '0.1.0' where '{cfjax.__version__}' is"):
+        run()
+
+
+@pytest.mark.parametrize(
+    ("text", "message"),
+    [(None, "chunks, but no batch.json"), ("{", "a batch.json that is damaged"), ("[]", "damaged")],
+)
+def test_a_folder_whose_description_is_lost(tmp_path, text, message):
+    run = lambda: cfjax.map_batch(lambda x: x, np.ones(3), folder=tmp_path)  # noqa: E731
+    run()
+    if text is None:
+        (tmp_path / "batch.json").unlink()
+    else:
+        (tmp_path / "batch.json").write_text(text)
+    with pytest.raises(ValueError, match=message):
+        run()
+
+
+def test_what_the_files_hold_can_be_read_without_the_function(tmp_path):
+    """The description says where each array is."""
+    x = np.arange(SIZE)
+    expected = cfjax.map_batch(every_kind, x, chunk_size=CHUNK, folder=tmp_path).values
+    batch = json.loads((tmp_path / "batch.json").read_text())
+    assert batch["members"] == SIZE and batch["chunk_size"] == CHUNK
+    found = {}
+    for array in batch["arrays"]:
+        dtype, shape = jnp.dtype(array["dtype"]), array["shape"]
+        chunks = [
+            np.fromfile(path, dtype, CHUNK * math.prod(shape), offset=array["offset"])
+            for path in sorted(tmp_path.glob("chunk_*.bin"))
+        ]
+        # -1 says nothing of an array without entries.
+        size = len(chunks) * CHUNK
+        found[array["path"]] = np.concatenate(chunks).reshape(size, *shape)[:SIZE]
+    assert sorted(found) == [
+        f"[{name!r}]" for name in sorted(expected) if expected[name] is not None
+    ]
+    (key,) = [array for array in batch["arrays"] if "key" in array]
+    found["['key']"] = jax.random.wrap_key_data(found["['key']"], impl=key["key"])
+    for name, values in found.items():
+        kept = expected[name[2:-2]]
+        assert values.dtype == kept.dtype and values.shape == kept.shape
+        if name == "['key']":
+            values, kept = jax.random.key_data(values), jax.random.key_data(kept)
+        assert np.asarray(values).tobytes() == np.asarray(kept).tobytes()
 
 
 # A folder's key: each of these captures its parameter in another place.
@@ -555,7 +648,8 @@ def test_a_key_knows_versions_precision_device_and_mesh(monkeypatch, no_shape_ho
     class Other:
         platform, device_kind = "gpu", "H100"
 
-    keys.append(_fingerprint.fingerprint(program.traced, program.lowered, [Other()]))
+    other = _fingerprint.environment([Other()])
+    keys.append(_fingerprint.fingerprint(program.traced, program.lowered, other))
     assert len(set(keys)) == len(keys)
 
 
@@ -616,7 +710,7 @@ def test_prints_and_checks_of_equinox_give_no_values(tmp_path, capfd):
         np.testing.assert_array_equal(values[0], np.full((2, 1), 2.0))
     assert capfd.readouterr().out == 2 * "y = [1.]\n"
     with pytest.raises(Exception, match="negative"):
-        cfjax.map_batch(solve, -np.ones((2, 1)), folder=tmp_path)
+        cfjax.map_batch(solve, -np.ones((2, 1)), folder=tmp_path / "other")
 
 
 # Members in files.
@@ -660,6 +754,9 @@ x = np.arange(test_batch.SIZE)
 for _ in range(2):
     result = cfjax.map_batch(test_batch.every_kind, x, mesh=mesh, folder=sys.argv[3] + "_of_kinds")
     test_batch.check_every_kind(result, x)
+# Every process says so, though one alone looks.
+with test_batch.pytest.raises(ValueError, match="holds members 23 where 8 is expected"):
+    cfjax.map_batch(lambda x: x, np.ones(8), mesh=mesh, folder=sys.argv[3])
 """
 
 
@@ -685,7 +782,8 @@ def test_eight_devices(tmp_path, shape):
     process = start(8, tmp_path / "values.npy", shape, tmp_path / "chunks")
     _, error = process.communicate(timeout=300)
     assert process.returncode == 0, error
-    assert len(os.listdir(tmp_path / "chunks")) == 3  # Of eight members instead of five.
+    # Of eight members instead of five.
+    assert len(list((tmp_path / "chunks").glob("chunk_*.bin"))) == 3
     check_against_one_device(tmp_path / "values.npy")
 
 
@@ -701,7 +799,7 @@ def test_two_processes(tmp_path):
     for process in processes:
         _, error = process.communicate(timeout=300)
         assert process.returncode == 0, error
-    assert len(os.listdir(tmp_path / "chunks")) == 3
+    assert len(list((tmp_path / "chunks").glob("chunk_*.bin"))) == 3
     for i in range(2):
         check_against_one_device(tmp_path / f"values{i}.npy")
 
@@ -722,6 +820,7 @@ def test_two_processes(tmp_path):
         ((np.array([None]),), TypeError, r"members\[0\] must be an array of numbers"),
         ((np.ones(2, "M8[s]"),), TypeError, r"members\[0\] must be an array of numbers"),
         ((np.ones(2, np.longdouble),), TypeError, r"members\[0\] must be an array of numbers"),
+        ((np.ones(2, np.clongdouble),), TypeError, r"members\[0\] must be an array of numbers"),
         ([1.0, 2.0], TypeError, r"members\[0\] must be an array of numbers.*got 1\.0"),
         ((np.ma.masked_less(np.ones(2), 2),), TypeError, r"members\[0\] must not be masked"),
     ],
@@ -729,6 +828,20 @@ def test_two_processes(tmp_path):
 def test_wrong_members(wrong, kind, message):
     with pytest.raises(kind, match=message):
         cfjax.map_batch(lambda x: x, wrong)
+
+
+def test_members_in_dtypes_that_jax_knows_by_another_name(monkeypatch):
+    """`np.longdouble` is a double on macOS on ARM and on Windows; `np.longlong` is one everywhere.
+
+    What jax takes has at most 64 bits, and in complex numbers twice as many.
+    """
+    x = np.arange(3, dtype=np.longlong)
+    np.testing.assert_array_equal(cfjax.map_batch(lambda x: 2 * x, x).values, [0, 2, 4])
+    monkeypatch.setattr(np, "longdouble", np.float64)
+    monkeypatch.setattr(np, "clongdouble", np.complex128)
+    for dtype in (np.float64, np.complex128):
+        x = np.arange(3).astype(dtype)
+        np.testing.assert_array_equal(cfjax.map_batch(lambda x: 2 * x, x).values, [0, 2, 4])
 
 
 @pytest.mark.parametrize("chunk_size", [0, -1, 2.0, True])

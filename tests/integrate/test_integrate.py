@@ -1,5 +1,6 @@
 """The fixed-step loop: agreement with diffrax, output, tracing, memory, and what it refuses."""
 
+import re
 from typing import Any
 
 import diffrax
@@ -13,6 +14,7 @@ import problems
 import pytest
 
 import cfjax
+from cfjax._integrate import integrate as _integrate
 
 Y0 = jnp.asarray(problems.MOMENTUM)
 ARGS = jnp.asarray(problems.INERTIA)
@@ -108,6 +110,48 @@ def test_what_is_saved_is_every_nth_state():
     # One step is one program in all of them, but fusion may differ in the last bits.
     close(third.ys, every.ys[2::3], atol=1e-15 * 12)
     close(last.ys, every.ys[-1:], atol=1e-15 * 12)
+
+
+@pytest.mark.representatives(1)
+@pytest.mark.parametrize("save_every", [3, None])
+def test_the_initial_state_is_saved_on_request(save_every):
+    """As by diffrax, with its derivative, and in a batch."""
+    options = {"num_steps": 12, "save_every": save_every}
+
+    def solve(y0, t0, **more):
+        sol = cfjax.integrate(TERM, cfjax.CF4(), t0, 1.0, y0, ARGS, **options, **more)
+        return sol.ts, sol.ys
+
+    def loss(y0, **more):
+        ys = solve(y0, 0.25, **more)[1]
+        assert ys is not None
+        return ys @ jnp.arange(1.0, 4.0)
+
+    ts, ys = jax.jit(lambda y0: solve(y0, 0.25, save_initial=True))(Y0)
+    without = jax.jit(lambda y0: solve(y0, 0.25))(Y0)
+    assert ts[0] == 0.25
+    np.testing.assert_array_equal(ys[0], Y0)
+    np.testing.assert_array_equal(ts[1:], without[0])
+    # One step is one program in both, but fusion may differ in the last bits.
+    close(ys[1:], without[1], atol=1e-15 * 12)
+    # Its derivative is the identity, and those of the others are as before.
+    jacobian = jax.jit(jax.jacrev(lambda y0: loss(y0, save_initial=True)))(Y0)
+    np.testing.assert_array_equal(jacobian[0], jnp.arange(1.0, 4.0))
+    close(jacobian[1:], jax.jit(jax.jacrev(loss))(Y0), atol=1e-14)
+    # A batch of starts and of initial times.
+    y0s, t0s = jnp.stack([Y0, -Y0]), jnp.asarray([0.25, 0.5])
+    many = jax.vmap(lambda y0, t0: solve(y0, t0, save_initial=True))(y0s, t0s)
+    np.testing.assert_array_equal(many[0][:, 0], t0s)
+    np.testing.assert_array_equal(many[1][:, 0], y0s)
+    close(many[1][0], ys, atol=1e-14)
+
+
+@pytest.mark.parametrize("save_initial", [None, 1, "yes"])
+def test_a_mistaken_wish_for_the_initial_state(save_initial, no_shape_hook):
+    with pytest.raises(TypeError, match="save_initial must be a bool, got"):
+        cfjax.integrate(
+            TERM, cfjax.CF4(), 0.0, 1.0, Y0, ARGS, num_steps=2, save_initial=save_initial
+        )
 
 
 def test_many_steps_reach_the_end_of_the_time():
@@ -465,6 +509,55 @@ def test_a_mistaken_time(time):
             )
 
 
+# Steps shorter than the rounding of a time would have length zero or twice their own.
+Y0_SINGLE, ARGS_SINGLE = Y0.astype(np.float32), ARGS.astype(np.float32)
+
+
+@pytest.mark.parametrize("num_steps", [2**24 + 1, 10**9])
+def test_more_steps_than_can_be_counted_in_the_dtype_of_the_times(num_steps):
+    with pytest.raises(ValueError, match=rf"num_steps must be at most 16777216 .*got {num_steps}"):
+        cfjax.integrate(TERM, cfjax.CF4(), -1, 1, Y0_SINGLE, ARGS_SINGLE, num_steps=num_steps)
+
+
+def test_more_traced_steps_than_can_be_counted():
+    """`work_precision` traces the number of steps."""
+
+    @eqx.filter_jit
+    def end(num_steps):
+        time = jnp.zeros((), np.float32)
+        return _integrate.equal_steps(
+            TERM, cfjax.LieEuler(), time - 1, time + 1, Y0_SINGLE, ARGS_SINGLE, num_steps,
+            None, False, None, throw=False,
+        ).ys  # fmt: skip
+
+    assert np.isfinite(end(jnp.asarray(3))).all()
+    with pytest.raises(eqx.EquinoxRuntimeError, match="num_steps must leave each step longer"):
+        # Not run: the error comes before the first step.
+        jax.block_until_ready(end(jnp.asarray(2**24 + 2)))
+
+
+@pytest.mark.parametrize("dtype", [np.float32, np.float64])
+def test_steps_shorter_than_the_rounding_of_the_times(dtype):
+    y0, args = Y0.astype(dtype), ARGS.astype(dtype)
+    t0 = 1000.0
+    # The distance of neighbours just below t1, of which there are 4 in the interval.
+    length = 4 * np.spacing(dtype(t0))
+
+    @eqx.filter_jit
+    def times(t0, t1, num_steps, sign=1):
+        return cfjax.integrate(
+            TERM, cfjax.LieEuler(), t0, t1, y0, args, num_steps=num_steps, save_every=1
+        ).ts
+
+    for a, b in [(t0, t0 + length), (t0 + length, t0), (-t0, -t0 - length)]:
+        steps = np.diff(np.asarray(times(a, b, 4)), prepend=dtype(a))
+        np.testing.assert_array_equal(steps, (b - a) / 4)
+        with pytest.raises(eqx.EquinoxRuntimeError, match="num_steps must leave each step longer"):
+            jax.block_until_ready(times(a, b, 5))
+    # Of no time at all every step has length zero, and nothing moves.
+    np.testing.assert_array_equal(times(t0, t0, 5), np.full(5, t0))
+
+
 @pytest.mark.parametrize("save_every", [0, -1, 5, 24, 1.0, True, False])
 def test_a_mistaken_number_of_steps_between_saves(save_every):
     with pytest.raises((ValueError, TypeError), match="save_every"):
@@ -566,10 +659,50 @@ def test_terms_of_another_form(term, solver, form):
         cfjax.integrate(term, solver, 0.0, 1.0, Y0, ARGS, num_steps=2)
 
 
-def test_an_implicit_solver_needs_tolerances_of_its_own():
+IMPLICIT = [
+    *("ImplicitEuler", "Kvaerno3", "Kvaerno4", "Kvaerno5"),
+    *("KenCarp3", "KenCarp4", "KenCarp5", "Sil3"),
+]
+
+
+def test_these_are_the_implicit_solvers_of_diffrax():
+    found = [
+        name
+        for name, cls in vars(diffrax).items()
+        if isinstance(cls, type)
+        and issubclass(cls, diffrax.AbstractImplicitSolver)
+        and not name.startswith("Abstract")
+    ]
+    assert sorted(found) == sorted(IMPLICIT)
+
+
+@pytest.mark.representatives(3)
+@pytest.mark.parametrize("name", IMPLICIT)
+def test_what_is_said_of_an_implicit_solver_without_tolerances_can_be_pasted(name):
+    is_split = name in ("KenCarp3", "KenCarp4", "KenCarp5", "Sil3")
     term = diffrax.ODETerm(lambda t, y, args: -y)
-    with pytest.raises(ValueError, match=r"tolerances of its own.*got Kvaerno3 without"):
-        cfjax.integrate(term, diffrax.Kvaerno3(), 0.0, 1.0, Y0, num_steps=2)
+    if is_split:
+        term = diffrax.MultiTerm(diffrax.ODETerm(lambda t, y, args: 0 * y), term)
+    solver = getattr(diffrax, name)()
+
+    def solve(solver):
+        return cfjax.integrate(term, solver, 0.0, 0.1, Y0, num_steps=2)
+
+    with pytest.raises(ValueError, match=f"tolerances of its own.*got {name} without") as raised:
+        solve(solver)
+    advice = re.search(r"Write (.*)\.$", str(raised.value))
+    assert advice is not None
+    pasted = eval(advice[1], {"diffrax": diffrax, "optimistix": optx})
+    assert type(pasted) is type(solver)
+    # The first order method: 2 steps of error (h^2 / 2) exp(-0.1).
+    np.testing.assert_allclose(solve(pasted).ys[-1], Y0 * np.exp(-0.1), rtol=3e-3)
+
+
+@pytest.mark.parametrize("wrap", [diffrax.HalfSolver, cfjax.Richardson])
+def test_a_wrapped_implicit_solver_needs_tolerances_too(wrap):
+    term = diffrax.ODETerm(lambda t, y, args: -y)
+    with pytest.raises(ValueError, match=r"got Kvaerno3 without. Write diffrax\.Kvaerno3\("):
+        cfjax.integrate(term, wrap(diffrax.Kvaerno3()), 0.0, 1.0, Y0, num_steps=2)
 
 
 @pytest.mark.parametrize("solver", [None, cfjax.CF4, cfjax.CF4.tableau, "CF4"])

@@ -97,6 +97,11 @@ def test_mistaken_scales():
         cfjax.ErrorNorm({"a": jnp.ones(3)})
     with pytest.raises(Exception, match="scales must be positive"):
         cfjax.ErrorNorm(-1.0)
+    for scale in (2j, jnp.asarray(1 + 0j), "1"):
+        with pytest.raises(TypeError, match=r"scales\['a'\] must be a real number, got"):
+            cfjax.ErrorNorm({"a": scale, "b": 1.0})
+    with pytest.raises(TypeError, match=r"scales must be a real number, got 2j"):
+        cfjax.ErrorNorm(2j)
     with pytest.raises(ValueError):
         cfjax.ErrorNorm({"a": 1.0})((jnp.ones(3),))
 
@@ -132,6 +137,94 @@ def test_a_first_step_is_accepted_and_not_far_too_short(speed, direction):
     assert steps[0] == pytest.approx(abs(float(dt0)), rel=1e-12)
     # Hairer, Norsett & Wanner aim at an error 100 times smaller than is allowed.
     assert 1 / 30 < abs(float(dt0)) / np.median(steps) < 2
+
+
+BLOCH = jnp.asarray([[-0.1, 1.0, 0.0], [-1.0, -0.1, 0.5], [0.0, -0.5, -0.05]])
+# Each has the unit of time as its own, and starts at zero, near zero or at rest.
+FROM_NOTHING = {
+    "translation": (lambda t, y: jnp.cos(t) * jnp.ones(1), jnp.zeros(1)),
+    "near zero": (lambda t, y: jnp.cos(t) * jnp.ones(1), jnp.full(1, 1e-12)),
+    "at rest": (lambda t, y: jnp.sin(t) * jnp.ones(1), jnp.ones(1)),
+    "at zero and at rest": (lambda t, y: jnp.sin(t) * jnp.ones(1), jnp.zeros(1)),
+    "LinearAffine": (
+        lambda t, y: cfjax.LinearAffine(BLOCH, jnp.asarray([0.0, jnp.sin(1.0), 1.0])),
+        jnp.zeros(3),
+    ),
+    "Affine": (lambda t, y: cfjax.Affine(1.0, jnp.cos(y), -jnp.ones(3)), jnp.zeros(3)),
+    "Congruence": (
+        lambda t, y: cfjax.Congruence(BLOCH, jnp.eye(3)),
+        jnp.zeros((3, 3)),
+    ),
+    "PlanarMotion": (
+        lambda t, y: cfjax.PlanarMotion(omega=jnp.cos(t), v=jnp.asarray([1.0, 0.0]), frame="fixed"),
+        jnp.zeros(2),
+    ),
+    "a pendulum at rest": (
+        lambda t, y: {"angle": y["rate"], "rate": -jnp.sin(y["angle"])},
+        {"angle": jnp.asarray(1.0), "rate": jnp.asarray(0.0)},
+    ),
+}
+
+
+@pytest.mark.parametrize("interval", [1.0, -20 * np.pi, 1e3])
+@pytest.mark.parametrize("name", FROM_NOTHING)
+def test_a_first_step_from_a_state_at_zero_or_at_rest(name, interval):
+    """Such a state says nothing of how fast it changes."""
+    field, y0 = FROM_NOTHING[name]
+    term = cfjax.LieTerm(lambda t, y, args: field(t, y))
+    step = cfjax.starting_step(term, cfjax.CF4(), 0.0, interval, y0, atol=1e-6)
+    assert np.sign(step) == np.sign(interval)
+    # In its unit of time a method of order 4 makes an error of h^5, which is to be 1e-8: h = 0.025.
+    # The way to it is a guess, which may be off by 30: a controller makes up for that in two steps.
+    assert 0.025 / 30 < abs(float(step)) < 0.025 * 30
+
+
+@pytest.mark.parametrize("name", ["translation", "at rest", "LinearAffine"])
+def test_a_first_step_does_not_depend_on_units(name):
+    field, y0 = FROM_NOTHING[name]
+
+    def step(time, length):
+        def in_units(t, y, args):
+            part = cfjax.tangent(field(t / time, y / length), y / length)
+            return part * (length / time)
+
+        term = cfjax.LieTerm(in_units)
+        found = cfjax.starting_step(
+            term, cfjax.CF4(), 0.0, 60.0 * time, y0 * length, atol=1e-6 * length
+        )
+        return float(found) / time
+
+    # Rounding of a difference of velocities: 1e-16 of a velocity over one of 1e-5.
+    assert step(1e4, 1.0) == pytest.approx(step(1.0, 1.0), rel=1e-10)
+    assert step(1e-4, 1e-3) == pytest.approx(step(1.0, 1.0), rel=1e-10)
+
+
+def test_a_first_step_of_an_endless_solve():
+    """As one that ends with an event."""
+    for y0 in (jnp.zeros(1), jnp.ones(1)):
+        term = cfjax.LieTerm(lambda t, y, args: jnp.cos(y))
+        step = cfjax.starting_step(term, cfjax.CF4(), 0.0, jnp.inf, y0, atol=1e-6)
+        # From zero the only scale is atol: the cap is the time in which the state moves by it.
+        assert 0.9e-6 < float(step) < 0.1
+
+
+@pytest.mark.parametrize("atol", [0.0, -1e-6, np.nan, jnp.asarray(-1.0)])
+def test_a_first_step_needs_a_positive_tolerance(atol):
+    term = cfjax.LieTerm(problems.rigid_body)
+    with pytest.raises(Exception, match="atol must be positive"):
+        cfjax.starting_step(term, cfjax.CF4(), 0.0, 1.0, Y0, INERTIA, atol=atol)
+
+
+def test_a_first_step_needs_a_solver_and_real_scalars(no_shape_hook):
+    term = cfjax.LieTerm(problems.rigid_body)
+    for solver in (cfjax.CF4, None, 4):
+        with pytest.raises(TypeError, match=r"solver must be a diffrax solver.*got"):
+            cfjax.starting_step(term, solver, 0.0, 1.0, Y0, INERTIA, atol=1e-6)
+    for name in ("t0", "t1", "atol"):
+        for value in (None, 1j, jnp.ones(3), "1"):
+            options = {"t0": 0.0, "t1": 1.0, "atol": 1e-6, name: value}
+            with pytest.raises(TypeError, match=f"{name} must be a real scalar, got"):
+                cfjax.starting_step(term, cfjax.CF4(), y0=Y0, args=INERTIA, **options)
 
 
 def test_a_first_step_where_nothing_moves_and_in_other_precision():

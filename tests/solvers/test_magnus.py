@@ -302,6 +302,44 @@ def test_it_is_seen_within_other_solvers_and_transformations():
         jax.jit(jax.vmap(jax.grad(end)))(jnp.ones((2, 3)))
 
 
+def on_host(*operands, **options):
+    """A generator that jax does not see through."""
+    shape = jax.ShapeDtypeStruct((2, 2), np.float64)
+    generator = np.array([[0.0, 1.0], [-1.0, 0.0]])
+    return jax.pure_callback(lambda t, *_: t * generator, shape, *operands, **options)
+
+
+def solve_on_host(field):
+    y0 = jnp.asarray([1.0, 0.0])
+    return cfjax.integrate(cfjax.LieTerm(field), cfjax.Magnus4(), 0.0, 1.0, y0, num_steps=2).ys[-1]
+
+
+def test_a_function_of_the_host_may_take_the_time():
+    y1 = solve_on_host(lambda t, y, args: cfjax.LeftMatrix(on_host(t)))
+    # An angle of 1/2, to rounding: the generators at all times commute.
+    np.testing.assert_allclose(y1, [np.cos(0.5), -np.sin(0.5)], rtol=0, atol=1e-15)
+
+
+@pytest.mark.parametrize(
+    ("options", "message"),
+    [
+        ({}, r"time alone, and the field gives the state to an operation that jax\.vmap"),
+        ({"vmap_method": "sequential"}, "LeftMatrix, depends on the state"),
+    ],
+)
+def test_a_function_of_the_host_may_not_take_the_state(options, message):
+    with pytest.raises(TypeError, match=message):
+        solve_on_host(lambda t, y, args: cfjax.LeftMatrix(on_host(t, y, **options)))
+
+
+def test_a_mistake_in_the_field_has_its_own_message():
+    def field(t, y, args):
+        raise NotImplementedError("the field's own")
+
+    with pytest.raises(NotImplementedError, match="the field's own"):
+        solve_on_host(field)
+
+
 def test_shape_and_dtype_of_the_state_are_no_dependence():
     def field(t, y, args):
         w = jnp.zeros_like(y[0]) + jnp.full(y.shape[1:], args, y.dtype)

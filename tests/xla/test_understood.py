@@ -1,0 +1,221 @@
+"""Rules look at every parameter of what they take apart: programs that once gave other numbers."""
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from jax import lax
+
+import cfjax
+from cfjax._xla.program import by_components, trace
+from cfjax._xla.understood import is_readable, is_understood
+
+pytestmark = pytest.mark.usefixtures("rewritten")
+
+TABLE = np.arange(10.0)
+SIX = np.array([0.3, -0.7, 1.1, 0.4, -0.2, 0.9])
+SEVEN = np.array([1.0, 2.0, 3.0, 4.0, 5.0, 6.0, 7.0])
+M = np.array([[0.2, -1.0], [0.7, 0.3]])
+SPINS = np.random.default_rng(0).normal(size=(100, 3))
+
+SMALL = {
+    "reshape in Fortran's order": (
+        lambda y: (jnp.asarray(M) @ y.reshape((2, 3), order="F")).ravel(order="F"),
+        SIX,
+    ),
+    "lax.reshape with dimensions": (
+        lambda y: lax.reshape(jnp.outer(y, y), (9, 4), dimensions=(1, 0)),
+        SIX,
+    ),
+    "fill out of bounds": (
+        lambda y: y.at[jnp.array([1, 2, 3])].get(mode="fill", fill_value=0.0),
+        SIX[:3],
+    ),
+    "take out of bounds": (lambda y: jnp.nan_to_num(jnp.take(y, jnp.array([0, 5]))), SIX[:3]),
+    "promise that is not kept": (lambda y: y[np.array([0, 5])], SIX[:3]),
+    "largest, at ties": (lambda y: jnp.max(y) * y, np.array([1.0, 1.0, 1.0])),
+    "smallest, at ties": (lambda y: jnp.min(y.reshape(2, 3), axis=1), np.array([1.0] * 6)),
+    "interior padding": (lambda y: lax.pad(y, 0.5, [(1, -1, 2)]), SIX),
+    "convolution and update in one": (
+        lambda y: jnp.convolve(lax.dynamic_update_slice(y, y[:2] * y[1], (3,)), y[:3]),
+        SIX,
+    ),
+    "nothing beside something": (lambda y: jnp.concatenate([y[:0], y, y[3:3]]), SIX),
+    "key": (lambda y: jax.random.normal(jax.random.key(0), (6,)) * y, SIX),
+    "permutation by a key": (lambda y: jax.random.permutation(jax.random.key(1), y), SIX),
+}
+# On the numbers above JAX has no other derivative.
+SAME_GRADIENT = [name for name in SMALL if name != "take out of bounds"]
+
+
+def grad(fun, y):
+    return jax.grad(lambda y: sum(jnp.sum(jnp.sin(x)) for x in jax.tree.leaves(fun(y))))(y)
+
+
+@pytest.mark.parametrize("name", SMALL)
+def test_values(name):
+    fun, y = SMALL[name][0], jnp.asarray(SMALL[name][1])
+    # Each entry is the same few operations in one order or another.
+    np.testing.assert_allclose(by_components(fun, y), fun(y), rtol=1e-15, atol=1e-15)
+
+
+@pytest.mark.parametrize("name", SAME_GRADIENT)
+def test_gradients(name):
+    fun, y = SMALL[name]
+    y = jnp.asarray(y)
+    ours = grad(lambda y: by_components(fun, y), y)
+    # Sums of up to 36 products.
+    np.testing.assert_allclose(ours, grad(fun, y), rtol=1e-14, atol=1e-14)
+
+
+def test_apply():
+    # Its derivative JAX does not have.
+    ours = by_components(lambda y: y.at[1].apply(jnp.exp), jnp.asarray(SIX))
+    np.testing.assert_allclose(ours, np.where(np.arange(6) == 1, np.exp(SIX), SIX), rtol=1e-15)
+
+
+@pytest.mark.parametrize(
+    "fun",
+    [
+        lambda y, a: jnp.floor(y / a),
+        lambda y, a: jnp.asarray(TABLE)[(y / a).astype(int)],
+        lambda y, a: (y / a >= 1).astype(float),
+        lambda y, a: jnp.sign(jnp.cumsum(y / a) - 1),
+    ],
+)
+def test_a_quotient_is_exact_where_its_last_bit_counts(fun):
+    y = jnp.full(7, 49.0)
+    assert np.float64(49.0) * (1 / np.float64(49.0)) < 1  # or this would test nothing
+    ours = jax.jit(lambda y, a: by_components(lambda y: fun(y, a), y))(y, y)
+    np.testing.assert_array_equal(ours, fun(np.asarray(y), np.asarray(y)))
+
+
+def divisions(fun, y, a):
+    program = jax.make_jaxpr(lambda y, a: by_components(lambda y: fun(y, a), y))(y, a)
+    return str(program).count(" div ")
+
+
+def test_a_quotient_is_a_product_where_all_is_smooth():
+    y, a = jnp.asarray(SEVEN), jnp.asarray(SEVEN)
+    assert divisions(lambda y, a: jnp.sin(y / a) @ y, y, a) == 0
+    assert divisions(lambda y, a: jnp.floor(jnp.sin(y / a)), y, a) == 7
+    # A rotation compares its angle with that of a full turn, and is smooth there.
+    # (It divides by two, which is exact.)
+    assert divisions(lambda y, a: cfjax.Rotation(y / a).flow(y), y[:3], a[:3]) == 1
+    # What a step of integers gives is not.
+    assert divisions(lambda y, a: cfjax.Rotation(jnp.round(y / a)).flow(y), y[:3], a[:3]) == 4
+
+
+LATTICES = {
+    "shifted by a number of the program": lambda s, k: s.at[1:].set(
+        lax.dynamic_slice_in_dim(s, k - 5, 99, 0)
+    ),
+    "one added to some": lambda s, k: s.at[:10].add(s[k]),
+    "one set": lambda s, k: s.at[k].set(s[k - 1]),
+    "largest of all": lambda s, k: s * jnp.max(jnp.round(s)),
+}
+
+
+@pytest.mark.parametrize("name", LATTICES)
+def test_solves_of_lattices(name):
+    """XLA updates arrays in place, and reads what it has overwritten if these have two shapes."""
+    k = jnp.asarray(5)
+    term = cfjax.LieTerm(lambda t, s, k: cfjax.Rotation(LATTICES[name](s, k)))
+
+    def solve(s):
+        return cfjax.integrate(term, cfjax.CF4(), 0.0, 0.1, s, k, num_steps=2).ys[-1]
+
+    s = jnp.asarray(SPINS)
+    ours, ours_grad = solve(s), grad(solve, s)
+    with cfjax.rewriting(False):
+        # Tens of operations on numbers of size 1 in two steps.
+        np.testing.assert_allclose(ours, solve(s), rtol=0, atol=1e-13)
+        np.testing.assert_allclose(ours_grad, grad(solve, s), rtol=0, atol=1e-12)
+
+
+SHAPES = {
+    "sides of length 1": (
+        lambda t, s, a: {
+            "s": cfjax.Rotation(s["s"] * s["n"][..., None]),
+            "n": -s["n"] * s["s"].sum(-1),
+        },
+        {"s": SPINS[:70].reshape(70, 1, 3), "n": SPINS[:70, :1]},
+    ),
+    "a chain": (
+        lambda t, s, a: cfjax.Rotation(jnp.roll(s, 1, 0) + jnp.roll(s, -1, 0) + jnp.roll(s, 1, 1)),
+        SPINS.reshape(100, 1, 3),
+    ),
+    "a chain in the second place": (
+        lambda t, s, a: cfjax.Rotation(jnp.roll(s, 1, 0) + jnp.roll(s, -1, 1)),
+        SPINS.reshape(1, 100, 3),
+    ),
+}
+
+
+@pytest.mark.parametrize("name", SHAPES)
+def test_lattices_with_sides_of_length_1(name):
+    field, y0 = SHAPES[name]
+    y0 = jax.tree.map(jnp.asarray, y0)
+
+    def solve(y0):
+        term = cfjax.LieTerm(field)
+        return cfjax.integrate(term, cfjax.CF3(), 0.0, 0.1, y0, num_steps=2, save_every=1).ys
+
+    ours, ours_grad = solve(y0), grad(solve, y0)
+    with cfjax.rewriting(False):
+        jax.tree.map(
+            # As above.
+            lambda a, b: np.testing.assert_allclose(a, b, rtol=0, atol=1e-12),
+            (ours, ours_grad),
+            (solve(y0), grad(solve, y0)),
+        )
+
+
+def equation(fun, *args):
+    return jax.make_jaxpr(fun)(*args).jaxpr.eqns[-1]
+
+
+def test_parameters():
+    y = jnp.asarray(SIX)
+    assert is_understood(equation(lambda y: lax.reshape(y, (2, 3)), y))
+    known = equation(lambda y: lax.reshape(y, (2, 3)), y)
+    assert not is_understood(known.replace(params=known.params | {"dimensions": (1, 0)}))
+    # As a newer version of JAX may have.
+    assert not is_understood(known.replace(params=known.params | {"new": None}))
+    exact = equation(lambda y: lax.dot_general(y, y, (((0,), (0,)), ((), ()))), y)
+    rounded = exact.params | {"precision": lax.DotAlgorithmPreset.BF16_BF16_F32}
+    assert is_understood(exact) and not is_understood(exact.replace(params=rounded))
+    assert not is_understood(equation(lambda y: lax.sort(y), y))
+
+
+def test_advice_to_the_compiler():
+    def advised(y):
+        with jax.experimental.xla_metadata.set_xla_metadata(some="advice"):
+            return jnp.sin(y)
+
+    assert not is_readable(jax.make_jaxpr(advised)(jnp.asarray(SIX)).jaxpr)
+    assert is_readable(jax.make_jaxpr(jnp.sin)(jnp.asarray(SIX)).jaxpr)
+
+
+def test_updates_in_place_that_have_no_rule_are_left_alone():
+    y, k = jnp.asarray(SIX), jnp.asarray(2)
+    assert trace(lambda y: y.at[2].set(y[3]), y, "step") is not None
+    made = []
+    jax.make_jaxpr(lambda k: made.append(trace(lambda y: y.at[k].set(y[3]), y, "step")) or k)(k)
+    assert made == [None]
+
+
+@jax.jit
+def helper(y, inertia):
+    return -y / inertia
+
+
+def test_a_field_with_a_jitted_helper_is_rewritten():
+    """JAX keeps what it has traced of the helper, first outside of a step that is rewritten."""
+    term = cfjax.LieTerm(lambda t, y, inertia: cfjax.Rotation(helper(y, inertia)))
+
+    def solve(y):
+        inertia = jnp.array([0.9, 0.6, 0.3])
+        return cfjax.integrate(term, cfjax.CF3(), 0.0, 1.0, y, inertia, num_steps=3).ys
+
+    assert "cfjax_operation" in str(jax.make_jaxpr(solve)(jnp.asarray(SIX[:3])))
