@@ -87,6 +87,22 @@ def product(terms: diffrax.AbstractTerm, value: PyTree, control: PyTree) -> PyTr
         ) from error
 
 
+def velocity(terms: diffrax.AbstractTerm, value: PyTree, y: PyTree) -> PyTree:
+    """The velocity at `y` of what a term's vector field returned there, shaped like the state.
+
+    That of a `diffrax.MultiTerm` is the sum. Where a term has a control of another kind than time
+    there is no velocity, and this is the value itself, as in diffrax's own solvers.
+    """
+    if isinstance(terms, diffrax.MultiTerm):
+        parts = [velocity(*each, y) for each in zip(terms.terms, value, strict=True)]
+        if all(struct(part) == struct(y) for part in parts):
+            return combine([1.0] * len(parts), parts)
+        return value
+    if any(map(is_field, jtu.tree_leaves(value, is_leaf=is_field))):
+        return tangent(value, y)
+    return value
+
+
 def _checked(field: PyTree, y: PyTree) -> PyTree:
     parts, treedef = jtu.tree_flatten_with_path(field, is_leaf=is_field)
     try:

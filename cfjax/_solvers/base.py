@@ -15,7 +15,7 @@ from jax.core import Tracer
 from jaxtyping import Array, Inexact, PyTree, Real
 
 from .._field import Incremented, flow, is_field, is_incremented, value
-from .._term import product
+from .._term import product, velocity
 from .._xla import by_components, is_rewritten, once_in_rows, once_together
 from .dense import Interpolation, Path
 from .failure import result_of
@@ -161,7 +161,8 @@ class AbstractLieSolver(diffrax.AbstractSolver):
         return y1, error, dict(path=path), State(new_lost, last, solver_state.zero), result_of(y1)
 
     def func(self, terms, t0, y0, args) -> Any:
-        return terms.vf(t0, y0, args)
+        """The velocity at `y0`, shaped like it. A control that is not time has diffrax's own."""
+        return velocity(terms, terms.vf(t0, y0, args), y0)
 
 
 class Move(eqx.Module):
