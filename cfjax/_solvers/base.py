@@ -12,13 +12,12 @@ import jax.tree_util as jtu
 import numpy as np
 from jax import lax
 from jax.core import Tracer
-from jaxtyping import Array, Inexact, PyTree, Real
+from jaxtyping import Array, Bool, Inexact, PyTree, Real
 
 from .._field import Incremented, flow, is_field, is_incremented, value
 from .._term import product, velocity
 from .._xla import by_components, is_rewritten, once_in_rows, once_together
 from .dense import Interpolation, Path
-from .failure import result_of
 
 
 class _OfInstances(property):
@@ -175,6 +174,18 @@ class Move(eqx.Module):
     path: Path
     error: PyTree = None
     is_shared: bool = eqx.field(static=True, default=False)
+
+
+def is_finite(y: PyTree) -> Bool[Array, ""]:
+    return jnp.asarray([jnp.all(jnp.isfinite(leaf)) for leaf in jtu.tree_leaves(y)], bool).all()
+
+
+def result_of(y: PyTree) -> diffrax.RESULTS:
+    """A step that ends in infinity or NaN is a failure."""
+    if not jtu.tree_leaves(y):
+        return diffrax.RESULTS.successful
+    nonfinite: Any = diffrax.RESULTS.nonfinite
+    return diffrax.RESULTS.where(is_finite(y), diffrax.RESULTS.successful, nonfinite)
 
 
 def _select(made_jump: Any, anew: Callable[[], PyTree], kept: PyTree) -> PyTree:
