@@ -11,9 +11,10 @@ import jax.tree_util as jtu
 import numpy as np
 from jax import lax
 from jax.core import Tracer
-from jaxtyping import Array, Bool, Int, PyTree, Real
+from jaxtyping import Array, Int, PyTree, Real
 
-from .._solvers.base import AbstractLieSolver, State
+from .._numerics.checks import checked, error_if, needing
+from .._solvers.base import AbstractLieSolver, State, is_finite, result_of
 from .._xla import repeat
 
 
@@ -100,7 +101,7 @@ def equal_steps(
     throw = throw and bool(jtu.tree_leaves(y0))
     if throw:
         message = "y0 must be finite, got an entry that is not."
-        y0 = eqx.error_if(y0, ~_is_finite(y0), message)
+        y0 = error_if(y0, lambda y0: ~is_finite(y0), message)
 
     if isinstance(num_steps, int):
         n, intervals = jnp.asarray(0, jnp.int32 if num_steps < 2**31 else int), num_steps
@@ -144,14 +145,15 @@ def equal_steps(
 
     num_saves: Any = 1 if save_every is None else num_steps // save_every
     carry, (ts, ys) = lax.scan(steps_and_save, carry, length=num_saves)
-    result = carry[3]
     # Of the saved states alone, outside the loop: sums and products keep infinity and NaN, so a
     # blow-up shows in what is saved after it.
-    is_lost = (result == diffrax.RESULTS.successful) & ~_is_finite(ys)
-    nonfinite: Any = diffrax.RESULTS.nonfinite
-    result = diffrax.RESULTS.where(is_lost, nonfinite, result)
-    if throw:
-        ys = result.error_if(ys, result != diffrax.RESULTS.successful)
+    result = result_of(ys)
+    if is_ours:
+        ys = checked(ys, lambda ys: _error_of(result_of(ys))) if throw else ys
+    else:
+        is_known = carry[3] != diffrax.RESULTS.successful
+        result = diffrax.RESULTS.where(is_known, carry[3], result)
+        ys = needing(_error_of(result), ys) if throw else ys
     return diffrax.Solution(
         t0=t0,
         t1=t1,
@@ -165,6 +167,11 @@ def equal_steps(
         made_jump=None,
         event_mask=None,
     )
+
+
+def _error_of(result: diffrax.RESULTS) -> Real[Array, ""]:
+    """Zero, or the error that a result is."""
+    return result.error_if(jnp.zeros(()), result != diffrax.RESULTS.successful)
 
 
 def without_estimate(solver: Any) -> diffrax.AbstractSolver:
@@ -187,10 +194,6 @@ def time_scalar(name: str, t: Any, dtype: Any) -> Real[Array, ""]:
     if not is_real or jnp.shape(t):
         raise TypeError(f"{name} must be a real scalar, got {eqx.tree_pformat(t)}.")
     return jnp.asarray(t, dtype)
-
-
-def _is_finite(y: PyTree) -> Bool[Array, ""]:
-    return jnp.asarray([jnp.all(jnp.isfinite(leaf)) for leaf in jtu.tree_leaves(y)], bool).all()
 
 
 def check_term_and_solver(term: Any, solver: Any) -> None:

@@ -15,6 +15,7 @@ from jax.core import Tracer
 from jaxtyping import Array, Bool, Inexact, PyTree, Real
 
 from .._field import Incremented, flow, is_field, is_incremented, value
+from .._numerics.checks import needing
 from .._term import product, velocity
 from .._xla import by_components, is_rewritten, once_in_rows, once_together
 from .dense import Interpolation, Path
@@ -213,7 +214,7 @@ class State(eqx.Module):
         arrays, structure = jtu.tree_flatten((lost, first))
         if not arrays:
             return cls(lost, first, zero)
-        arrays[0] = _with(zero, arrays[0])
+        arrays[0] = needing(zero, arrays[0])
         lost, first = jtu.tree_unflatten(structure, arrays)
         return cls(lost, first, None)
 
@@ -225,13 +226,8 @@ class State(eqx.Module):
         """The start, with the checks in it, and a state for steps that do not know of them."""
         zero = self.zero
         if zero is not None:
-            y0 = jtu.tree_map(lambda y: _with(zero, y), y0)
+            y0 = needing(zero, y0)
         return y0, State(self.lost, self.first, None)
-
-
-def _with(zero: Real[Array, ""], x: Array) -> Array:
-    """The same array, which the program cannot have without the zero."""
-    return jnp.where(zero == 0, x, zero.astype(x.dtype))
 
 
 # By how much a start is off, in the message. The error itself may be in a compiled program.
@@ -240,7 +236,7 @@ _LEVELS = (1e-7, 1e-6, 1e-5, 1e-4, 1e-3, 1e-2, 0.1, 1.0, 10.0)
 
 def _admitted(t0: Array, t1: Any, field: PyTree, y0: PyTree) -> Real[Array, ""]:
     """Zero, or an error if a time is NaN or `y0` off the manifold of `field`, given by shape."""
-    zero = jnp.zeros_like(t0)
+    zero = jnp.zeros((), t0.dtype)
     is_nan = jnp.isnan(t0) | jnp.isnan(t1)
     zero = eqx.error_if(zero, is_nan, "t0, t1 and dt0 must be numbers, got NaN.")
     parts, treedef = jtu.tree_flatten_with_path(field, is_leaf=is_field)
