@@ -37,7 +37,8 @@ class LieTerm(diffrax.AbstractTerm):
     With frozen fields diffrax's own solvers either refuse it (Tsit5, Dopri5 and most others) or
     make ordinary steps in the ambient space, which leave the manifold (Euler, Heun, Midpoint,
     Ralston, LeapfrogMidpoint, ImplicitEuler): `vf_prod` is the tangent vector there. So
-    `diffrax.BacksolveAdjoint(solver=diffrax.Tsit5())` works.
+    `diffrax.BacksolveAdjoint()` works, backwards in the ambient space, where the solver of the
+    solve is a Runge-Kutta method, and so does another one given to it.
     """
 
     field: Callable[[Any, Any, Any], PyTree]
