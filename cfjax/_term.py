@@ -37,7 +37,8 @@ class LieTerm(diffrax.AbstractTerm):
     With frozen fields diffrax's own solvers either refuse it (Tsit5, Dopri5 and most others) or
     make ordinary steps in the ambient space, which leave the manifold (Euler, Heun, Midpoint,
     Ralston, LeapfrogMidpoint, ImplicitEuler): `vf_prod` is the tangent vector there. So
-    `diffrax.BacksolveAdjoint(solver=diffrax.Tsit5())` works.
+    `diffrax.BacksolveAdjoint()` works, backwards in the ambient space, where the solver of the
+    solve is a Runge-Kutta method, and so does another one given to it.
     """
 
     field: Callable[[Any, Any, Any], PyTree]
@@ -85,6 +86,22 @@ def product(terms: diffrax.AbstractTerm, value: PyTree, control: PyTree) -> PyTr
             f"{describe(control)}: use cfjax.LieTerm(field). A diffrax.ControlTerm multiplies "
             "arrays only. To drive a field by x(t), multiply it by dx/dt in a LieTerm."
         ) from error
+
+
+def velocity(terms: diffrax.AbstractTerm, value: PyTree, y: PyTree) -> PyTree:
+    """The velocity at `y` of what a term's vector field returned there, shaped like the state.
+
+    That of a `diffrax.MultiTerm` is the sum. Where a term has a control of another kind than time
+    there is no velocity, and this is the value itself, as in diffrax's own solvers.
+    """
+    if isinstance(terms, diffrax.MultiTerm):
+        parts = [velocity(*each, y) for each in zip(terms.terms, value, strict=True)]
+        if all(struct(part) == struct(y) for part in parts):
+            return combine([1.0] * len(parts), parts)
+        return value
+    if any(map(is_field, jtu.tree_leaves(value, is_leaf=is_field))):
+        return tangent(value, y)
+    return value
 
 
 def _checked(field: PyTree, y: PyTree) -> PyTree:

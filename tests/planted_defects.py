@@ -131,6 +131,20 @@ DEFECTS = [
     ),
     Defect(
         "_solvers/base.py",
+        "return velocity(terms, terms.vf(t0, y0, args), y0)",
+        "return terms.vf(t0, y0, args)",
+        "a frozen field in place of the velocity, for diffrax's events",
+        "solvers/test_events.py -k func",
+    ),
+    Defect(
+        "_xla/pack.py",
+        "(*spec[:axis], None, *spec[axis:])",
+        "(None, *spec)",
+        "entries of a batch spread along another axis than the batch",
+        "test_sharding.py",
+    ),
+    Defect(
+        "_solvers/base.py",
         "t = t1 if c == 1 else t0 + c * (t1 - t0)",
         "t = t0 + c * (t1 - t0)",
         "a last stage behind the end of the step by rounding",

@@ -10,6 +10,7 @@ import numpy as np
 from jaxtyping import Array, Inexact
 
 from .._field import AbstractAlgebraElement, Weight, combine, describe, struct
+from .._numerics.checks import needing
 from .._numerics.phi import phi_1
 from .._numerics.transforms import DTYPES, AbstractTransform, TensorTransform
 
@@ -158,12 +159,13 @@ def _of_one_operator(fields: Sequence[Affine]) -> list[Array]:
         b = other.b
         # Most fields close over one array, and need no check of its values.
         if other.spectrum is not first.spectrum:
-            b = eqx.error_if(
-                b,
+            zero = eqx.error_if(
+                jnp.zeros(()),
                 jnp.any(other.spectrum != first.spectrum),
                 "Affine fields that are added must have one spectrum: it may not depend on time or "
                 "state, and the terms of a diffrax.MultiTerm must share it.",
             )
+            b = needing(zero, b)
         checked.append(b)
     return checked
 

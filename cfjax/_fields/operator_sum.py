@@ -16,6 +16,7 @@ from jax.core import Tracer
 from jaxtyping import Array, Inexact, PyTree, Real
 
 from .._field import AbstractFrozenField, Weight, combine, describe, struct
+from .._numerics.checks import needing
 from .._numerics.expm_multiply import expm_minus_one_multiply, row_norm
 from .._numerics.matmul import by_columns, matmul, promoted
 from .._numerics.transforms import DTYPES
@@ -497,11 +498,12 @@ def _of_the_same_operators(fields: Sequence[OperatorSum]) -> list[Array]:
         # Most fields close over the same arrays, and need no check of their values.
         different = [jnp.any(a != b) for a, b in pairs if a is not b]
         if different:
-            c = eqx.error_if(
-                c,
+            zero = eqx.error_if(
+                jnp.zeros(()),
                 jnp.any(jnp.stack(different)),
                 "OperatorSum fields that are added must have the same operators: these may not "
                 "depend on time or state.",
             )
+            c = needing(zero, c)
         checked.append(c)
     return checked

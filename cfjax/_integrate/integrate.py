@@ -11,10 +11,11 @@ import jax.tree_util as jtu
 import numpy as np
 from jax import lax
 from jax.core import Tracer
-from jaxtyping import Array, Bool, Int, PyTree, Real
+from jaxtyping import Array, Int, PyTree, Real
 
+from .._numerics.checks import checked, error_if, needing
 from .._numerics.squaring import max_over_batch
-from .._solvers.base import AbstractLieSolver, State
+from .._solvers.base import AbstractLieSolver, State, is_finite, result_of
 from .._xla import repeat
 
 
@@ -114,7 +115,7 @@ def equal_steps(
     throw = throw and bool(jtu.tree_leaves(y0))
     if throw:
         message = "y0 must be finite, got an entry that is not."
-        y0 = eqx.error_if(y0, ~_is_finite(y0), message)
+        y0 = error_if(y0, lambda y0: ~is_finite(y0), message)
 
     if isinstance(num_steps, int):
         n, intervals = jnp.asarray(0, jnp.int32 if num_steps < 2**31 else int), num_steps
@@ -172,16 +173,15 @@ def equal_steps(
     if save_initial:
         prepend = lambda first, rest: jnp.concatenate([first[None], rest])  # noqa: E731
         ts, ys = jtu.tree_map(prepend, (t0, y0), (ts, ys))
-    result = carry[3]
     # Of the saved states alone, outside the loop: sums and products keep infinity and NaN, so a
     # blow-up shows in what is saved after it.
-    is_lost = (result == diffrax.RESULTS.successful) & ~_is_finite(ys)
-    nonfinite: Any = diffrax.RESULTS.nonfinite
-    result = diffrax.RESULTS.where(is_lost, nonfinite, result)
-    if throw:
-        # equinox takes the largest number of a result, and an empty batch has none.
-        worst = jtu.tree_map(max_over_batch, result)
-        ys = worst.error_if(ys, result != diffrax.RESULTS.successful)
+    result = result_of(ys)
+    if is_ours:
+        ys = checked(ys, lambda ys: _error_of(result_of(ys))) if throw else ys
+    else:
+        is_known = carry[3] != diffrax.RESULTS.successful
+        result = diffrax.RESULTS.where(is_known, carry[3], result)
+        ys = needing(_error_of(result), ys) if throw else ys
     return diffrax.Solution(
         t0=t0,
         t1=t1,
@@ -222,6 +222,13 @@ def _with_room_for_steps(
     )
 
 
+def _error_of(result: diffrax.RESULTS) -> Real[Array, ""]:
+    """Zero, or the error that a result is."""
+    # equinox takes the largest number of a result, and an empty batch has none.
+    worst = jtu.tree_map(max_over_batch, result)
+    return worst.error_if(jnp.zeros(()), result != diffrax.RESULTS.successful)
+
+
 def without_estimate(solver: Any) -> diffrax.AbstractSolver:
     """The same method for steps that nobody controls, where the solver offers it."""
     # Not by the class: for diffrax a wrapped solver is an instance of what it wraps.
@@ -242,10 +249,6 @@ def time_scalar(name: str, t: Any, dtype: Any) -> Real[Array, ""]:
     if not is_real or jnp.shape(t):
         raise TypeError(f"{name} must be a real scalar, got {eqx.tree_pformat(t)}.")
     return jnp.asarray(t, dtype)
-
-
-def _is_finite(y: PyTree) -> Bool[Array, ""]:
-    return jnp.asarray([jnp.all(jnp.isfinite(leaf)) for leaf in jtu.tree_leaves(y)], bool).all()
 
 
 def check_term_and_solver(term: Any, solver: Any) -> None:

@@ -12,14 +12,14 @@ import jax.tree_util as jtu
 import numpy as np
 from jax import lax
 from jax.core import Tracer
-from jaxtyping import Array, Inexact, PyTree, Real
+from jaxtyping import Array, Bool, Inexact, PyTree, Real
 
 from .._field import Incremented, flow, is_field, is_incremented, value
+from .._numerics.checks import needing
 from .._numerics.squaring import max_over_batch
-from .._term import product
+from .._term import product, velocity
 from .._xla import by_components, is_rewritten, once_in_rows, once_together
 from .dense import Interpolation, Path
-from .failure import result_of
 
 
 class _OfInstances(property):
@@ -162,7 +162,8 @@ class AbstractLieSolver(diffrax.AbstractSolver):
         return y1, error, dict(path=path), State(new_lost, last, solver_state.zero), result_of(y1)
 
     def func(self, terms, t0, y0, args) -> Any:
-        return terms.vf(t0, y0, args)
+        """The velocity at `y0`, shaped like it. A control that is not time has diffrax's own."""
+        return velocity(terms, terms.vf(t0, y0, args), y0)
 
 
 class Move(eqx.Module):
@@ -175,6 +176,18 @@ class Move(eqx.Module):
     path: Path
     error: PyTree = None
     is_shared: bool = eqx.field(static=True, default=False)
+
+
+def is_finite(y: PyTree) -> Bool[Array, ""]:
+    return jnp.asarray([jnp.all(jnp.isfinite(leaf)) for leaf in jtu.tree_leaves(y)], bool).all()
+
+
+def result_of(y: PyTree) -> diffrax.RESULTS:
+    """A step that ends in infinity or NaN is a failure."""
+    if not jtu.tree_leaves(y):
+        return diffrax.RESULTS.successful
+    nonfinite: Any = diffrax.RESULTS.nonfinite
+    return diffrax.RESULTS.where(is_finite(y), diffrax.RESULTS.successful, nonfinite)
 
 
 def _select(made_jump: Any, anew: Callable[[], PyTree], kept: PyTree) -> PyTree:
@@ -202,7 +215,7 @@ class State(eqx.Module):
         arrays, structure = jtu.tree_flatten((lost, first))
         if not arrays:
             return cls(lost, first, zero)
-        arrays[0] = _with(zero, arrays[0])
+        arrays[0] = needing(zero, arrays[0])
         lost, first = jtu.tree_unflatten(structure, arrays)
         return cls(lost, first, None)
 
@@ -214,13 +227,8 @@ class State(eqx.Module):
         """The start, with the checks in it, and a state for steps that do not know of them."""
         zero = self.zero
         if zero is not None:
-            y0 = jtu.tree_map(lambda y: _with(zero, y), y0)
+            y0 = needing(zero, y0)
         return y0, State(self.lost, self.first, None)
-
-
-def _with(zero: Real[Array, ""], x: Array) -> Array:
-    """The same array, which the program cannot have without the zero."""
-    return jnp.where(zero == 0, x, zero.astype(x.dtype))
 
 
 # By how much a start is off, in the message. The error itself may be in a compiled program.
@@ -229,7 +237,7 @@ _LEVELS = (1e-7, 1e-6, 1e-5, 1e-4, 1e-3, 1e-2, 0.1, 1.0, 10.0)
 
 def _admitted(t0: Array, t1: Any, field: PyTree, y0: PyTree) -> Real[Array, ""]:
     """Zero, or an error if a time is NaN or `y0` off the manifold of `field`, given by shape."""
-    zero = jnp.zeros_like(t0)
+    zero = jnp.zeros((), t0.dtype)
     is_nan = jnp.isnan(t0) | jnp.isnan(t1)
     zero = eqx.error_if(zero, is_nan, "t0, t1 and dt0 must be numbers, got NaN.")
     parts, treedef = jtu.tree_flatten_with_path(field, is_leaf=is_field)

@@ -190,7 +190,9 @@ def _like(first: PyTree, value: PyTree) -> PyTree:
 
 def _stack(tree: PyTree, n: int) -> PyTree:
     """The first of n."""
-    return jtu.tree_map(lambda x: jnp.zeros((n, *jnp.shape(x)), x.dtype).at[0].set(x), tree)
+    # Spread over a mesh as it is.
+    pad = lambda x: [(0, n - 1, 0), *[(0, 0, 0)] * jnp.ndim(x)]  # noqa: E731
+    return jtu.tree_map(lambda x: lax.pad(x[None], jnp.zeros((), x.dtype), pad(x)), tree)
 
 
 def _combination(row: Array, fields: Array) -> Array:

@@ -13,7 +13,7 @@ from jax.extend.core import Primitive
 from jax.interpreters import ad, batching, mlir
 from jaxtyping import Array, PyTree
 
-from .pack import pack, unpack
+from .pack import pack, sharding, unpack
 from .scope import MAX_SIZE, has_rows, is_short, where
 
 # XLA takes what more entries are made of apart, and computes all that leads there for each of them.
@@ -102,8 +102,8 @@ def _held_impl(*entries, in_batches, alone, now, is_cut, has_calls=False):
     groups: dict[Any, list[int]] = {}
     for k, x in enumerate(entries):
         if jnp.issubdtype(x.dtype, jnp.inexact):
-            groups.setdefault((x.shape, x.dtype), []).append(k)
-    for (shape, _), places in groups.items():
+            groups.setdefault((x.shape, x.dtype, sharding(x)), []).append(k)
+    for (shape, *_), places in groups.items():
         # Who asks for batches has scalars.
         is_batch = in_batches and shape != ()
         if has_calls if is_batch else alone:

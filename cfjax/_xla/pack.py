@@ -6,13 +6,15 @@ scalars into many small ones. Here each of the two is the transpose of the other
 """
 
 from collections.abc import Sequence
+from typing import Any
 
-import jax.core
+import jax
 import jax.numpy as jnp
 import numpy as np
 from jax import lax
 from jax.extend.core import Primitive
 from jax.interpreters import ad, batching, mlir
+from jax.sharding import PartitionSpec
 from jaxtyping import Array
 
 
@@ -21,12 +23,43 @@ def pack(entries: Sequence[Array], axis: int = 0, sums: bool = False) -> Array:
 
     With `sums` the transpose takes the entries out as sums, which XLA computes once for all uses.
     """
-    return pack_p.bind(*entries, axis=axis, sums=sums)
+    return pack_p.bind(*_varying_alike(entries), axis=axis, sums=sums)
 
 
 def unpack(x: Array, axis: int = 0) -> list[Array]:
     """`jnp.unstack`."""
     return unpack_p.bind(x, axis=axis)
+
+
+def _varying_alike(entries: Sequence[Array]) -> Sequence[Array]:
+    """The same, varying along the same axes within `jax.shard_map`, as JAX's operations want it."""
+    each = [_varying(x) for x in entries]
+    together = frozenset().union(*each)
+    if all(axes == together for axes in each):
+        return entries
+    return [
+        lax.pcast(x, tuple(together - axes), to="varying") if together - axes else x
+        for x, axes in zip(entries, each, strict=True)
+    ]
+
+
+def _varying(x: Array) -> frozenset[str]:
+    """The axes of a mesh that it varies along within `jax.shard_map`."""
+    aval: Any = jax.typeof(x)
+    # Older versions of JAX have it right there.
+    return aval.manual_axis_type.varying if hasattr(aval, "manual_axis_type") else aval.vma
+
+
+def sharding(x: Array) -> Any:
+    """Along which axes of a mesh it is spread; None without a mesh."""
+    found = jax.typeof(x).sharding
+    return None if found.mesh.empty else found
+
+
+def _with_shape(x: Any, shape: Sequence[int], spec: Sequence[Any]) -> Any:
+    """An array that is like x in all but its shape, for abstract evaluation."""
+    spread = x.sharding.update(spec=PartitionSpec(*spec))
+    return x.update(shape=tuple(shape), sharding=spread, weak_type=False)
 
 
 pack_p = Primitive("cfjax_pack")
@@ -38,10 +71,12 @@ unpack_p.multiple_results = True
 def _pack_impl(*entries, axis, sums=False):
     shape = (*entries[0].shape[:axis], len(entries), *entries[0].shape[axis:])
     rest = [n for n in range(len(shape)) if n != axis]
-    parts = [lax.broadcast_in_dim(entry, shape, rest) for entry in entries]
+    # Spread over a mesh as the entries are.
+    spread = sharding(lax.expand_dims(entries[0], [axis]))
+    parts = [lax.broadcast_in_dim(entry, shape, rest, out_sharding=spread) for entry in entries]
     # By the bits of the place: XLA keeps each comparison of places as an array, outside of a loop,
     # and a loop that reads too many is not one function.
-    place, bit = lax.broadcasted_iota(np.int32, shape, axis), 1
+    place, bit = lax.broadcasted_iota(np.int32, shape, axis, out_sharding=spread), 1
     while len(parts) > 1:
         is_odd = place & bit != 0
         pairs = [lax.select(is_odd, b, a) for a, b in zip(parts[::2], parts[1::2], strict=False)]
@@ -56,14 +91,18 @@ def _unpack_impl(x, *, axis):
 
 @pack_p.def_abstract_eval
 def _(*entries, axis, sums):
-    shape = entries[0].shape
-    return jax.core.ShapedArray((*shape[:axis], len(entries), *shape[axis:]), entries[0].dtype)
+    x = entries[0]
+    shape, spec = x.shape, x.sharding.spec
+    return _with_shape(
+        x, (*shape[:axis], len(entries), *shape[axis:]), (*spec[:axis], None, *spec[axis:])
+    )
 
 
 @unpack_p.def_abstract_eval
 def _(x, *, axis):
-    shape = (*x.shape[:axis], *x.shape[axis + 1 :])
-    return [jax.core.ShapedArray(shape, x.dtype)] * x.shape[axis]
+    rest = [n for n in range(x.ndim) if n != axis]
+    shape, spec = x.shape, x.sharding.spec
+    return [_with_shape(x, [shape[n] for n in rest], [spec[n] for n in rest])] * shape[axis]
 
 
 def _pack_jvp(entries, tangents, **params):
@@ -80,7 +119,9 @@ def _pack_transpose(cotangent, *entries, axis, sums):
     if type(cotangent) is ad.Zero:
         return [None] * len(entries)
     if sums:
-        place = lax.broadcasted_iota(np.int32, cotangent.shape, axis)
+        place = lax.broadcasted_iota(
+            np.int32, cotangent.shape, axis, out_sharding=sharding(cotangent)
+        )
         return [
             jnp.sum(jnp.where(place == n, cotangent, 0), axis=axis) for n in range(len(entries))
         ]
@@ -94,10 +135,14 @@ def _unpack_transpose(cotangents, x, *, axis):
 
 
 def _pack_batch(entries, dims, *, axis, sums):
-    (size,) = {x.shape[d] for x, d in zip(entries, dims, strict=True) if d is not None}
+    moved = [x if d is None else jnp.moveaxis(x, d, 0) for x, d in zip(entries, dims, strict=True)]
+    # One that others are to be like, in how they are spread over a mesh too.
+    like = next(x for x, d in zip(moved, dims, strict=True) if d is not None)
     entries = [
-        lax.broadcast(x, (size,)) if d is None else jnp.moveaxis(x, d, 0)
-        for x, d in zip(entries, dims, strict=True)
+        lax.broadcast_in_dim(x, like.shape, range(1, like.ndim), out_sharding=sharding(like))
+        if d is None
+        else x
+        for x, d in zip(moved, dims, strict=True)
     ]
     return pack_p.bind(*entries, axis=axis + 1, sums=sums), 0
 

@@ -104,7 +104,7 @@ def test_a_solution_of_diffrax_and_members_that_fail():
 
 
 def test_a_blow_up_with_constant_steps_is_a_failure_and_room_left_is_none():
-    """Of these diffrax gives no result for each member, and fills 2 of 10 places with infinity."""
+    """Each member has a result of its own, and diffrax fills 2 of 10 places with infinity."""
     y0 = np.full((SIZE, 1), 0.1)
     y0[[4, 17]] = 3.0
 
@@ -118,10 +118,13 @@ def test_a_blow_up_with_constant_steps_is_a_failure_and_room_left_is_none():
             y0,
             saveat=diffrax.SaveAt(subs=diffrax.SubSaveAt(steps=True)),
             max_steps=10,
+            throw=False,
         )
 
     values, failed = cfjax.map_batch(solve, y0, chunk_size=CHUNK)
     np.testing.assert_array_equal(failed, [4, 17])
+    is_bad = np.asarray(values.result != diffrax.RESULTS.successful)
+    np.testing.assert_array_equal(np.flatnonzero(is_bad), [4, 17])
     assert np.isinf(values.ts[0, 8:]).all()
     # The error of CF4 is some 1e-9 here.
     np.testing.assert_allclose(values.ys[0, 7], 0.1 / 0.9, rtol=1e-7)

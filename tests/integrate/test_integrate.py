@@ -787,6 +787,37 @@ def test_in_a_batch_the_result_tells_which_blew_up():
         jax.block_until_ready(eqx.filter_vmap(explosion)(starts).ys)
 
 
+def linear(t, y, args):
+    """Of an array and a matrix: linear in the state, and not symmetric."""
+    a = jnp.asarray([[0.1, 1.0, -0.3], [-2.0, 0.2, 0.5], [0.4, 0.7, -0.1]])
+    return {"x": cfjax.LeftMatrix(a * jnp.cos(t)), "y": y["x"][:, 0] - 2.0 * y["y"]}
+
+
+@pytest.mark.representatives(1)
+@pytest.mark.parametrize("rewrite", [False, True], ids=["as it is", "rewritten"])
+@pytest.mark.parametrize("throw", [True, False], ids=["throw", "result"])
+@pytest.mark.parametrize("solver", [cfjax.CF4(), cfjax.Magnus4()], ids=["CF4", "Magnus4"])
+def test_the_transpose_of_a_solve_that_is_linear_in_its_start(solver, throw, rewrite):
+    """The checks are of the values of what is linear, and in the way of it they are not."""
+    field = linear if isinstance(solver, cfjax.CF4) else lambda t, y, args: linear(t, Y, args)["x"]
+    Y = {"x": jnp.ones((3, 2)), "y": jnp.ones(3)}
+    start = Y if isinstance(solver, cfjax.CF4) else Y["x"]
+
+    def end(y0):
+        sol = cfjax.integrate(
+            cfjax.LieTerm(field), solver, 0.0, 1.0, y0, num_steps=4, save_every=2, throw=throw
+        )
+        return jtu.tree_map(lambda y: y[-1], sol.ys)
+
+    y, w = problems.random_like(start, 1), problems.random_like(start, 2)
+    with cfjax.rewriting(rewrite):
+        (back,) = jax.linear_transpose(end, start)(w)
+        # What a transpose is. Some thousand products of numbers below 10.
+        expected = problems.inner(w, end(y))
+        assert abs(expected) > 0.1
+        np.testing.assert_allclose(problems.inner(back, y), expected, rtol=0, atol=1e-12)
+
+
 def test_a_start_that_is_not_finite_is_in_the_result():
     assert explosion(np.nan, throw=False).result == diffrax.RESULTS.nonfinite
 
