@@ -39,7 +39,13 @@ def rewriting(on: bool) -> contextlib.AbstractContextManager:
 
 
 def is_on() -> bool:
-    return _is_on.value
+    return _is_on.value and not _is_spread()
+
+
+def _is_spread() -> bool:
+    """Whether values say how they are spread over a mesh, which nothing here hands on."""
+    mesh = jax.sharding.get_abstract_mesh()
+    return any(kind != jax.sharding.AxisType.Auto for kind in mesh.axis_types or ())
 
 
 def unread(error: Exception) -> None:

@@ -103,7 +103,8 @@ def test_a_quotient_is_a_product_where_all_is_smooth():
     # (It divides by two, which is exact.)
     assert divisions(lambda y, a: cfjax.Rotation(y / a).flow(y), y[:3], a[:3]) == 1
     # What a step of integers gives is not.
-    assert divisions(lambda y, a: cfjax.Rotation(jnp.round(y / a)).flow(y), y[:3], a[:3]) == 4
+    rounded = divisions(lambda y, a: cfjax.Rotation(jnp.round(y / a)).flow(y), y[:3], a[:3])
+    assert rounded - divisions(lambda y, a: cfjax.Rotation(jnp.round(y)).flow(y), y[:3], a[:3]) == 3
 
 
 LATTICES = {
