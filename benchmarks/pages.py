@@ -218,6 +218,21 @@ def gradients() -> list[list[str]]:
 
 
 @table
+def fits() -> list[list[str]]:
+    rows = load("fits")["rows"]
+    problems, forms = values(rows, "problem"), values(rows, "saved")
+    table = [["", "saved", *(f"{p}, {what}" for p in problems for what in ("compile", "gradient"))]]
+    for solver, form in itertools.product(values(rows, "solver"), forms):
+        found = [one(rows, problem=p, solver=solver, saved=form) for p in problems]
+        cells = [
+            (f"{two_digits(row['compile, seconds'])} s", in_units(row["gradient, seconds"][2]))
+            for row in found
+        ]
+        table.append([code(solver), form, *itertools.chain(*cells)])
+    return table
+
+
+@table
 def batch() -> list[list[str]]:
     rows = load("batch")["rows"]
     programs = {"chunks of 10000": "chunks of 10 000", "one jax.vmap": "one `jax.vmap`"}

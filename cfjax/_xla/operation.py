@@ -81,19 +81,29 @@ def operation(
         out, out_structure = jtu.tree_flatten(jtu.tree_map(jnp.asarray, out))
         return out
 
+    made = jax.make_jaxpr(of_leaves)(*leaves)
+    operands = [*map(jnp.asarray, made.consts), *leaves]
+    code = made.jaxpr.replace(
+        constvars=[],
+        invars=[*made.jaxpr.constvars, *made.jaxpr.invars],
+        debug_info=made.jaxpr.debug_info.with_unknown_names(),
+    )
+    # Integers, as the number of a step, are on their own: no derivative and no transpose is of them.
+    smooth, whole = (
+        [k for k, v in enumerate(code.outvars) if _is_inexact(v.aval) is x] for x in (True, False)
+    )
+    outs: list[Any] = [None] * len(code.outvars)
+    exact, takes = _narrowed(ClosedJaxpr(code, []), whole)
+    outs = _with(outs, whole, jaxpr_as_fun(exact)(*(operands[k] for k in takes)))
+
     def of_plain_leaves(*operands):
         # What comes first are constants of the program that was taken apart.
         leaves = operands[len(operands) - structure.num_leaves :]
-        return jtu.tree_leaves(plain(*jtu.tree_unflatten(structure, leaves)))
+        outs = jtu.tree_leaves(plain(*jtu.tree_unflatten(structure, leaves)))
+        return [outs[k] for k in smooth]
 
     kind = _Kind(place, is_batch=is_batch, last=order)
-    made = jax.make_jaxpr(of_leaves)(*leaves)
-    jaxpr = without_dead_code(made.jaxpr)
-    code = jaxpr.replace(
-        constvars=[],
-        invars=[*jaxpr.constvars, *jaxpr.invars],
-        debug_info=jaxpr.debug_info.with_unknown_names(),
-    )
+    code = without_dead_code(code.replace(outvars=[code.outvars[k] for k in smooth]))
     program = ClosedJaxpr(code, [])
     ends = _places(code)
     if len(ends) > 2:
@@ -103,8 +113,9 @@ def operation(
     before = None
     if plain is not None and is_closed:
         before = _Plain(of_plain_leaves, _structs(code.invars))
-    consts = map(jnp.asarray, made.consts)
-    outs = operation_p.bind(*consts, *leaves, program=program, kind=kind, plain=before)
+    outs = _with(
+        outs, smooth, operation_p.bind(*operands, program=program, kind=kind, plain=before)
+    )
     return jtu.tree_unflatten(out_structure, outs)
 
 
