@@ -78,9 +78,7 @@ def measure(quick: bool) -> Iterator[results.Row]:
             for form, (is_on, save_every) in FORMS.items():
                 with cfjax.rewriting(is_on):
                     begin = time.process_time()
-                    run = results.compiled(
-                        fit(field, solver, save_every), *start, repeats=REPEATS
-                    )
+                    run = results.compiled(fit(field, solver, save_every), *start, repeats=REPEATS)
                     seconds[form] = time.process_time() - begin
                 runs.append(run)
             times = take_turns(runs, repeats=5 if quick else 25) / REPEATS

@@ -88,19 +88,14 @@ def operation(
         invars=[*made.jaxpr.constvars, *made.jaxpr.invars],
         debug_info=made.jaxpr.debug_info.with_unknown_names(),
     )
-    # Integers, as the number of a step, are on their own: no derivative and no transpose is of them.
-    smooth, whole = (
-        [k for k, v in enumerate(code.outvars) if _is_inexact(v.aval) is x] for x in (True, False)
-    )
+    # Integers, as the number of a step, are on their own: no derivative is of them, and a transpose
+    # of what is linear has their values.
+    is_smooth = [_is_inexact(v.aval) for v in code.outvars]
+    smooth = [k for k, is_one in enumerate(is_smooth) if is_one]
+    whole = [k for k, is_one in enumerate(is_smooth) if not is_one]
     outs: list[Any] = [None] * len(code.outvars)
     exact, takes = _narrowed(ClosedJaxpr(code, []), whole)
     outs = _with(outs, whole, jaxpr_as_fun(exact)(*(operands[k] for k in takes)))
-
-    def of_plain_leaves(*operands):
-        # What comes first are constants of the program that was taken apart.
-        leaves = operands[len(operands) - structure.num_leaves :]
-        outs = jtu.tree_leaves(plain(*jtu.tree_unflatten(structure, leaves)))
-        return [outs[k] for k in smooth]
 
     kind = _Kind(place, is_batch=is_batch, last=order)
     code = without_dead_code(code.replace(outvars=[code.outvars[k] for k in smooth]))
@@ -112,6 +107,13 @@ def operation(
     is_closed = not any(isinstance(x, Tracer) for x in made.consts)
     before = None
     if plain is not None and is_closed:
+
+        def of_plain_leaves(*operands):
+            # What comes first are constants of the program that was taken apart.
+            leaves = operands[len(operands) - structure.num_leaves :]
+            outs = jtu.tree_leaves(plain(*jtu.tree_unflatten(structure, leaves)))
+            return [outs[k] for k in smooth]
+
         before = _Plain(of_plain_leaves, _structs(code.invars))
     outs = _with(
         outs, smooth, operation_p.bind(*operands, program=program, kind=kind, plain=before)
@@ -400,7 +402,7 @@ def evaluate(jaxpr: Jaxpr, eqn: JaxprEqn, values: Sequence[Any]) -> Sequence[Any
 operation_p.to_lojax = lambda *operands, program, **_: jaxpr_as_fun(program)(*operands)
 
 
-def _is_inexact(x: Array) -> bool:
+def _is_inexact(x: Any) -> bool:
     return jnp.issubdtype(x.dtype, jnp.inexact)
 
 

@@ -5,6 +5,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 from jax import lax
+from jax.experimental.xla_metadata import set_xla_metadata
 
 import cfjax
 from cfjax._xla.program import by_components, trace
@@ -191,7 +192,7 @@ def test_parameters():
 
 def test_advice_to_the_compiler():
     def advised(y):
-        with jax.experimental.xla_metadata.set_xla_metadata(some="advice"):
+        with set_xla_metadata(some="advice"):
             return jnp.sin(y)
 
     assert not is_readable(jax.make_jaxpr(advised)(jnp.asarray(SIX)).jaxpr)
