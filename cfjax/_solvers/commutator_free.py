@@ -24,7 +24,7 @@ from .._field import (
 from .._methods import pairs as _pairs
 from .._methods import tableau as _tableau
 from .._methods.continuous_extension import continuous_extension
-from .._methods.order_conditions import order
+from .._methods.proved import order_of
 from .._methods.tableau import Product, Row, Tableau
 from .._xla import cut, once_together
 from .base import AbstractLieSolver, Move
@@ -69,11 +69,11 @@ class AbstractCommutatorFree(AbstractLieSolver):
         return any(map(tableau.uses_last, (tableau.embedded, *continuous_extension(tableau))))
 
     def order(self, terms) -> int:
-        return order(self.tableau)
+        return order_of(self.tableau)
 
     def error_order(self, terms) -> int | None:
         embedded = self.tableau.embedded_method
-        return None if embedded is None else order(embedded) + 1
+        return None if embedded is None else order_of(embedded) + 1
 
     def element(self, rows: Product, fields: Sequence[PyTree], kept: dict[int, PyTree]) -> PyTree:
         """The field of the last of some rows; `kept` is for what is used again in the step."""

@@ -132,7 +132,7 @@ def test_the_order_conditions_of_the_continuous_extension(solver, order):
 def test_the_order_conditions_in_the_algebra(solver, order):
     """Those of continuous Runge-Kutta methods, tree by tree, at every stage by recursion."""
     a = solver.a[: len(solver.b)]
-    (powers,), more, times = runge_kutta_extension(a, solver.b)
+    (powers,), more, times = runge_kutta_extension(a, solver.b, solver.order(None))
     rows = (*a, *more)
     np.testing.assert_allclose([sum(row) for row in more], times, rtol=0, atol=1e-14)
 
