@@ -111,20 +111,10 @@ def elements(
     return [*known, *(_at(stages, k) for k in range(len(known), n))]
 
 
-def along(
-    rows: Sequence[Sequence[float | Real[Array, ""] | None]],
-    fields: Sequence[PyTree],
-    point: PyTree,
-) -> PyTree:
-    """Where flows of combinations of the fields lead, the first row first; None is no weight."""
-    n = len(fields)
-    dtype = jnp.result_type(next(w for row in rows for w in row if w is not None))
-    padded = ([*row, *[None] * n][:n] for row in rows)
-    weights = jnp.stack(
-        [jnp.stack([jnp.asarray(0.0 if w is None else w, dtype) for w in row]) for row in padded]
-    )
+def along(weights: Real[Array, "flows stages"], fields: Sequence[PyTree], point: PyTree) -> PyTree:
+    """Where flows of combinations of the first fields lead, that of the first row first."""
     # XLA computes what leads to each of the arrays that `jnp.stack` gets for itself.
-    stages = jtu.tree_map(lambda *leaves: pack(leaves), *fields)
+    stages = jtu.tree_map(lambda *leaves: pack(leaves), *fields[: weights.shape[1]])
 
     def body(point: PyTree, row: Array) -> Any:
         return flow(jtu.tree_map(lambda f: _combination(row, f), stages), point), None
