@@ -29,7 +29,7 @@ from .._methods.tableau import Product, Row, Tableau
 from .._xla import cut, once_together
 from .base import AbstractLieSolver, Move
 from .dense import Path
-from .stages import FieldVaries, Flow, can_loop, run
+from .stages import FieldVaries, Flow, can_loop, has_room, run
 
 
 class AbstractCommutatorFree(AbstractLieSolver):
@@ -105,15 +105,16 @@ class AbstractCommutatorFree(AbstractLieSolver):
         is_looped = False
         is_usual = type(self).element is AbstractCommutatorFree.element
         # Two stages at one point would be one flow with two times.
-        if is_usual and len({*stages[:-1]}) == len(times) and can_loop(fields[0], y0):
-            first = fields[0]
+        is_distinct = len({*stages[:-1]}) == len(times)
+        here = points[()]
+        if is_usual and is_distinct and (can_loop(fields[0], y0) or has_room(fields[0], here)):
 
-            def entered(c, here: PyTree) -> PyTree:
+            def entered(c, here: PyTree, earlier: PyTree) -> PyTree:
                 # What has entered as a field of another class does so at every stage.
-                return enter(field(c, leave(first, here)), here, [first])[0]
+                return enter(field(c, leave(earlier, here)), here, [earlier])[0]
 
             with contextlib.suppress(FieldVaries):
-                made, fields[:] = run(flows, len(times), first, points[()], entered)
+                made, fields[:] = run(flows, len(times), fields[0], here, entered)
                 points |= zip(_products(stages), made, strict=True)
                 is_looped = True
         if not is_looped:

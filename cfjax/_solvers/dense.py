@@ -83,7 +83,8 @@ class Path(eqx.Module):
         # Of small states too: an event's root finder differentiates it, and a loop of flows on
         # short vectors is as fast in batches.
         if self.move is flow and len(weights) > 1 and can_loop(fields[0], point):
-            return along(weights, fields, point)
+            # There may be no field at the end of the step, where it has no weight.
+            return along(weights[:, : len(fields)], fields, point)
 
         def end(arrays: tuple[Array | np.ndarray, ...]) -> PyTree:
             point, fields = self.parts(arrays)
