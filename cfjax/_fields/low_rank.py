@@ -309,11 +309,12 @@ class SpanSkew(AbstractSkewElement):
 
     def room(self, point: Any, num_fields: int) -> "Room | None":
         blocks = self.span.blocks
-        if len(blocks) != 2 or any(isinstance(block, _Corner) for block in blocks):
+        if any(isinstance(block, _Corner) for block in blocks):
             return None
-        n, p = point.blocks[0].shape
+        p = point.z.shape[1]
         m = (num_fields + 1) * p
-        columns = jnp.concatenate([*blocks, jnp.zeros((n, m - 2 * p), self.k.dtype)], axis=1)
+        rest = ((0, 0), (0, m - len(self.span.gram)))
+        columns = jnp.pad(jnp.concatenate(blocks, axis=1), rest)
         return Room(_Span((columns,), _padded(self.span.gram, m)), p, type(self))
 
 

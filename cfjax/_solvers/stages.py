@@ -18,9 +18,9 @@ from .._xla import is_rewritten, pack, table
 # that moves a vector, this takes longer than the flow.
 _SMALL = 100
 
-# Of what a field has in coordinates of the step, columns most of all. Where a loop is
-# differentiated, it keeps those of all stages for each of its turns.
-_SMALL_STEP = 4096
+# Of a point in coordinates of the step, with its columns. Where a loop is differentiated, it keeps
+# those of all stages for each of its turns.
+_SMALL_STEP = 2048
 
 # JAX traces anew where it changes.
 _is_written_out = jax.make_user_context(False)
@@ -73,8 +73,8 @@ def has_room(field: PyTree, point: PyTree) -> bool:
         not is_rewritten()
         and not _is_written_out.value
         and is_field(field)
-        and _size(field) <= _SMALL_STEP
-        and field.room(point, 1) is not None
+        and _size(point) <= _SMALL_STEP
+        and type(field).room is not AbstractFrozenField.room
     )
 
 
@@ -127,6 +127,49 @@ def elements(
         start = _put(start, k, _like(first, stage))
     stages, _ = lax.scan(body, start, xs)
     return [*known, *(_at(stages, k) for k in range(len(known), n))]
+
+
+def elements_in_room(
+    known: Sequence[Any],
+    rows: Sequence[Sequence[Any]],
+    times: Sequence[float],
+    start: Any,
+    field: Callable[[Real[Array, ""], Any, Any], Any],
+    element: Callable[[Any, Any], Any],
+) -> list[Any]:
+    """As `elements`, for a field whose coordinates of a step grow from stage to stage.
+
+    `field(c, here, earlier)` has entered at `here`, where the fields `earlier` have; the element is
+    made of the combination that leads there from `start`, and of it.
+
+    **Raises** `FieldVaries` where they cannot be in one array each.
+    """
+    if not rows:
+        return list(known)
+    first, n = known[-1], len(known) + len(rows)
+    if any(x.span is not first.span for x in known):
+        raise FieldVaries
+    room = first.room(start, n)
+    if room is None:
+        raise FieldVaries
+
+    def body(carry: Any, x: Any) -> Any:
+        room, stages = carry
+        k, row, c = x
+        u = _combination(row, stages)
+        along = room.field(u)
+        here = flow(along, start)
+        entered = field(c, here, [along])
+        if type(entered) is not type(first):
+            raise FieldVaries
+        room, new = room.extended(_like(room.kept(k), room.entered(entered)), here.z, k)
+        return (room, _put(stages, k, element(room.field(u), room.field(new)).k)), None
+
+    ks = [room.coordinates(x, start)[0] for x in known]
+    stages = jnp.zeros((n, *ks[0].shape), ks[0].dtype).at[: len(ks)].set(jnp.stack(ks))
+    xs = jnp.arange(len(known), n), _padded(rows, n), jnp.asarray(times)
+    (room, stages), _ = lax.scan(body, (room, stages), xs)
+    return [room.field(stages[k]) for k in range(n)]
 
 
 def along(weights: Real[Array, "flows stages"], fields: Sequence[PyTree], point: PyTree) -> PyTree:
@@ -190,6 +233,8 @@ def _run_in_room(
 ) -> tuple[list[Any], list[Any]]:
     """The same for a field whose coordinates of a step grow from stage to stage."""
     room = first.room(start, num_stages)
+    if room is None:
+        raise FieldVaries
 
     def body(carry: Any, x: Any) -> Any:
         room, points, fields = carry

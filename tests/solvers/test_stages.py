@@ -30,6 +30,7 @@ SOLVERS = {
     "CG3": cfjax.CG3(),
     "RKMK(Tsit5)": cfjax.RKMK(diffrax.Tsit5.tableau),
     "RKMK(Bosh3)": cfjax.RKMK(diffrax.Bosh3.tableau),
+    "RKMK(Dopri8)": cfjax.RKMK(diffrax.Dopri8.tableau),
 }
 
 
@@ -81,8 +82,8 @@ COLUMNS = problems.arrays(
 )
 
 
-@pytest.mark.representatives(2)
-@pytest.mark.parametrize("name", ["CF3", "CF4", "CF54", "CG3"])
+@pytest.mark.representatives(3)
+@pytest.mark.parametrize("name", SOLVERS)
 def test_a_step_in_coordinates_that_grow(name):
     """In a loop there is room for all of them from the start."""
     fun = lambda y0, args: moved(SOLVERS[name], columns, y0, args)  # noqa: E731
