@@ -308,7 +308,7 @@ class SpanSkew(AbstractSkewElement):
         return type(self)(k, matmul(k, span.gram), span)
 
     def room(self, point: Any, num_fields: int) -> "Room | None":
-        blocks = self.span.blocks
+        blocks: tuple[Any, ...] = self.span.blocks
         if any(isinstance(block, _Corner) for block in blocks):
             return None
         p = point.z.shape[1]
@@ -344,11 +344,12 @@ class Room(eqx.Module):
         Of the latter the last p are those with themselves.
         """
         m = len(self.span.gram)
-        return field.span.blocks[-1], field.span.gram[:, m:]
+        columns: Any = field.span.blocks[-1]
+        return columns, field.span.gram[:, m:]
 
     def kept(self, i: Any) -> tuple[Array, Array]:
         """The same of a field that is here, field i."""
-        g, gram = (self._block(x, i, 1) for x in (self.span.blocks[0], self.span.gram))
+        g, gram = (self._block(x, i, 1) for x in (self._columns, self.span.gram))
         return g, jnp.concatenate([gram, self._block(gram, i, 0)])
 
     def extended(
@@ -360,9 +361,13 @@ class Room(eqx.Module):
         products = self._with(products[:m], products[m:], i, 0)
         gram = self._with(self.span.gram, products, i, 1)
         gram = self._with(gram, products.T, i, 0)
-        columns = self._with(self.span.blocks[0], g, i, 1)
+        columns = self._with(self._columns, g, i, 1)
         half = self._with(jnp.zeros_like(gram), z, i, 1)
         return Room(_Span((columns,), gram), self.p, self.cls), half.T - half
+
+    @property
+    def _columns(self) -> Any:
+        return self.span.blocks[0]
 
     def _block(self, x: Array, i: Any, axis: int) -> Array:
         return lax.dynamic_slice_in_dim(x, (i + 1) * self.p, self.p, axis)

@@ -88,8 +88,9 @@ class Path(eqx.Module):
 
         def end(arrays: tuple[Array | np.ndarray, ...]) -> PyTree:
             point, fields = self.parts(arrays)
-            for j, is_used in enumerate(powers.any(axis=0)):
-                row = [(weights[j, k], fields[k]) for k in np.flatnonzero(is_used)]
+            for j in range(len(weights)):
+                used = np.flatnonzero(powers[:, j].any(axis=0))
+                row = [(weights[j, k], fields[k]) for k in used]
                 point = self.move(combine(*zip(*row, strict=True)), point)
             return leave(fields[0], point)
 
