@@ -420,6 +420,19 @@ def compiling() -> list[list[str]]:
     return table
 
 
+@table
+def first_call() -> list[list[str]]:
+    rows = load("first_call")["rows"]
+    methods = values(rows, "method")
+    table = [["", "", "diffrax, Tsit5", *(f"`{method}`" for method in methods[1:])]]
+    for problem, way in itertools.product(values(rows, "problem"), values(rows, "way")):
+        base, *others = (one(rows, problem=problem, way=way, method=m) for m in methods)
+        cells = [f"1 ({cell(base['CPU seconds'])} s)"]
+        cells += [f"{cell(r['over Tsit5'])}; {two_digits(r['CPU seconds'][2])} s" for r in others]
+        table.append([problem, way, *cells])
+    return table
+
+
 _OVER = "over the fastest of others"
 
 

@@ -15,28 +15,14 @@ from ._field import bracket as bracket
 from ._field import combine as combine
 from ._field import flow as flow
 from ._field import tangent as tangent
-from ._fields.affine import Affine as Affine
-from ._fields.check import check_field as check_field
-from ._fields.conjugation import Congruence as Congruence
-from ._fields.conjugation import Conjugation as Conjugation
 from ._fields.elementwise import elementwise as elementwise
-from ._fields.linear_affine import LinearAffine as LinearAffine
-from ._fields.low_rank import BorderedSkew as BorderedSkew
-from ._fields.low_rank import LowRankSkew as LowRankSkew
 from ._fields.matrix import LeftMatrix as LeftMatrix
 from ._fields.matrix import RightMatrix as RightMatrix
-from ._fields.operator_sum import OperatorSum as OperatorSum
 from ._fields.quaternion import QuaternionRotation as QuaternionRotation
-from ._fields.rigid_motion import PlanarMotion as PlanarMotion
-from ._fields.rigid_motion import RigidMotion as RigidMotion
 from ._fields.rotation import Rotation as Rotation
-from ._fields.sphere import SphereRotation as SphereRotation
-from ._integrate.batch import BatchResult as BatchResult
-from ._integrate.batch import map_batch as map_batch
 from ._integrate.integrate import integrate as integrate
 from ._methods.order_conditions import error_constant as error_constant
 from ._methods.order_conditions import order as order
-from ._methods.stability import stability_function as stability_function
 from ._methods.tableau import Tableau as Tableau
 from ._methods.tableau import third_order_a as third_order_a
 from ._methods.tableau import third_order_b as third_order_b
@@ -45,12 +31,6 @@ from ._numerics.attitude import quaternion_rotate as quaternion_rotate
 from ._numerics.attitude import quaternion_to_matrix as quaternion_to_matrix
 from ._numerics.expm import expm as expm
 from ._numerics.stumpff import stumpff as stumpff
-from ._numerics.transforms import AbstractTransform as AbstractTransform
-from ._numerics.transforms import CosineTransform as CosineTransform
-from ._numerics.transforms import FourierTransform as FourierTransform
-from ._numerics.transforms import RealFourierTransform as RealFourierTransform
-from ._numerics.transforms import SineTransform as SineTransform
-from ._numerics.transforms import TensorTransform as TensorTransform
 from ._solvers.commutator_free import CF2 as CF2
 from ._solvers.commutator_free import CF3 as CF3
 from ._solvers.commutator_free import CF4 as CF4
@@ -63,44 +43,98 @@ from ._solvers.commutator_free import CommutatorFree as CommutatorFree
 from ._solvers.commutator_free import LieEuler as LieEuler
 from ._solvers.error_control import ErrorNorm as ErrorNorm
 from ._solvers.error_control import starting_step as starting_step
-from ._solvers.low_storage import BWRRK33 as BWRRK33
-from ._solvers.low_storage import BWRRK53 as BWRRK53
-from ._solvers.low_storage import CFEES25 as CFEES25
-from ._solvers.low_storage import CFEES27 as CFEES27
-from ._solvers.low_storage import CK34 as CK34
-from ._solvers.low_storage import CK54 as CK54
-from ._solvers.low_storage import YRK135 as YRK135
-from ._solvers.low_storage import Luscher3 as Luscher3
-from ._solvers.low_storage import Williamson3 as Williamson3
-from ._solvers.magnus import Magnus2 as Magnus2
-from ._solvers.magnus import Magnus4 as Magnus4
-from ._solvers.magnus import Magnus4Lobatto as Magnus4Lobatto
-from ._solvers.magnus import Magnus6 as Magnus6
-from ._solvers.magnus import Magnus8 as Magnus8
-from ._solvers.magnus import Magnus10 as Magnus10
-from ._solvers.munthe_kaas import RKMK as RKMK
-from ._solvers.munthe_kaas import RKMK3 as RKMK3
-from ._solvers.munthe_kaas import RKMK4 as RKMK4
-from ._solvers.munthe_kaas import RKMK5 as RKMK5
-from ._solvers.munthe_kaas import RKMK8 as RKMK8
-from ._solvers.retraction import CayleyRK4 as CayleyRK4
-from ._solvers.richardson import Richardson as Richardson
 from ._term import LieTerm as LieTerm
 from ._xla import rewriting as rewriting
 
 if TYPE_CHECKING:
     from . import scenes as scenes
+    from ._fields.affine import Affine as Affine
+    from ._fields.check import check_field as check_field
+    from ._fields.conjugation import Congruence as Congruence
+    from ._fields.conjugation import Conjugation as Conjugation
+    from ._fields.linear_affine import LinearAffine as LinearAffine
+    from ._fields.low_rank import BorderedSkew as BorderedSkew
+    from ._fields.low_rank import LowRankSkew as LowRankSkew
+    from ._fields.operator_sum import OperatorSum as OperatorSum
+    from ._fields.rigid_motion import PlanarMotion as PlanarMotion
+    from ._fields.rigid_motion import RigidMotion as RigidMotion
+    from ._fields.sphere import SphereRotation as SphereRotation
+    from ._integrate.batch import BatchResult as BatchResult
+    from ._integrate.batch import map_batch as map_batch
     from ._measure.work_precision import WorkPrecision as WorkPrecision
     from ._measure.work_precision import work_precision as work_precision
+    from ._methods.stability import stability_function as stability_function
+    from ._numerics.transforms import AbstractTransform as AbstractTransform
+    from ._numerics.transforms import CosineTransform as CosineTransform
+    from ._numerics.transforms import FourierTransform as FourierTransform
+    from ._numerics.transforms import RealFourierTransform as RealFourierTransform
+    from ._numerics.transforms import SineTransform as SineTransform
+    from ._numerics.transforms import TensorTransform as TensorTransform
+    from ._solvers.low_storage import BWRRK33 as BWRRK33
+    from ._solvers.low_storage import BWRRK53 as BWRRK53
+    from ._solvers.low_storage import CFEES25 as CFEES25
+    from ._solvers.low_storage import CFEES27 as CFEES27
+    from ._solvers.low_storage import CK34 as CK34
+    from ._solvers.low_storage import CK54 as CK54
+    from ._solvers.low_storage import YRK135 as YRK135
+    from ._solvers.low_storage import Luscher3 as Luscher3
+    from ._solvers.low_storage import Williamson3 as Williamson3
+    from ._solvers.magnus import Magnus2 as Magnus2
+    from ._solvers.magnus import Magnus4 as Magnus4
+    from ._solvers.magnus import Magnus4Lobatto as Magnus4Lobatto
+    from ._solvers.magnus import Magnus6 as Magnus6
+    from ._solvers.magnus import Magnus8 as Magnus8
+    from ._solvers.magnus import Magnus10 as Magnus10
+    from ._solvers.munthe_kaas import RKMK as RKMK
+    from ._solvers.munthe_kaas import RKMK3 as RKMK3
+    from ._solvers.munthe_kaas import RKMK4 as RKMK4
+    from ._solvers.munthe_kaas import RKMK5 as RKMK5
+    from ._solvers.munthe_kaas import RKMK8 as RKMK8
+    from ._solvers.retraction import CayleyRK4 as CayleyRK4
+    from ._solvers.richardson import Richardson as Richardson
 
 __version__ = "0.2.0"
 
-# What measures, and the problems to measure on: nobody who solves should wait for their import.
-_LATER = {
-    "WorkPrecision": "._measure.work_precision",
-    "scenes": ".scenes",
-    "work_precision": "._measure.work_precision",
+# What not every solve uses is imported where it is first asked for: to make its classes and
+# coefficients takes longer than all the rest of this import.
+_NAMES_LATER = {
+    "_fields.affine": ("Affine",),
+    "_fields.check": ("check_field",),
+    "_fields.conjugation": ("Congruence", "Conjugation"),
+    "_fields.linear_affine": ("LinearAffine",),
+    "_fields.low_rank": ("BorderedSkew", "LowRankSkew"),
+    "_fields.operator_sum": ("OperatorSum",),
+    "_fields.rigid_motion": ("PlanarMotion", "RigidMotion"),
+    "_fields.sphere": ("SphereRotation",),
+    "_integrate.batch": ("BatchResult", "map_batch"),
+    "_measure.work_precision": ("WorkPrecision", "work_precision"),
+    "_methods.stability": ("stability_function",),
+    "_numerics.transforms": (
+        "AbstractTransform",
+        "CosineTransform",
+        "FourierTransform",
+        "RealFourierTransform",
+        "SineTransform",
+        "TensorTransform",
+    ),
+    "_solvers.low_storage": (
+        "BWRRK33",
+        "BWRRK53",
+        "CFEES25",
+        "CFEES27",
+        "CK34",
+        "CK54",
+        "Luscher3",
+        "Williamson3",
+        "YRK135",
+    ),
+    "_solvers.magnus": ("Magnus10", "Magnus2", "Magnus4", "Magnus4Lobatto", "Magnus6", "Magnus8"),
+    "_solvers.munthe_kaas": ("RKMK", "RKMK3", "RKMK4", "RKMK5", "RKMK8"),
+    "_solvers.retraction": ("CayleyRK4",),
+    "_solvers.richardson": ("Richardson",),
 }
+_LATER = {name: f".{module}" for module, names in _NAMES_LATER.items() for name in names}
+_LATER["scenes"] = ".scenes"
 
 
 def __getattr__(name: str) -> Any:

@@ -123,6 +123,15 @@ class AbstractFrozenField(eqx.Module):
         del earlier
         return self, point
 
+    def room(self, point: Any, num_fields: int) -> Any:
+        """Coordinates of the step with room for so many fields, of which this is the first.
+
+        For a loop over the stages, whose arrays must not grow: `cfjax._fields.low_rank.Room` is
+        one. None, the default, if it has none. `point` is the one where this field has entered.
+        """
+        del point, num_fields
+        return None
+
     def leave(self, point: Any) -> Any:
         """The state at a point of a step, for a field that has entered. By default the point."""
         return point

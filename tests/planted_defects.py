@@ -173,8 +173,8 @@ DEFECTS = [
     ),
     Defect(
         "_solvers/dense.py",
-        "total = (total + float(a)) * theta",
-        "total = total * theta + float(a)",
+        "total = (total + coefficients) * theta",
+        "total = total * theta + coefficients",
         "a missing factor theta within a step",
         "solvers/test_one_step.py",
     ),

@@ -9,6 +9,7 @@ import jax.numpy as jnp
 import jax.tree_util as jtu
 import numpy as np
 from jax import lax
+from jax.extend.core import jaxprs_in_params
 from scipy.integrate import solve_ivp
 
 import cfjax
@@ -150,6 +151,12 @@ def first_step(solver, term, t0, t1, y0, args) -> Any:
     """What `solver.step` returns for a step with a new state of the solver."""
     state = solver.init(term, t0, t1, y0, args)
     return solver.step(term, t0, t1, y0, args, state, made_jump=False)
+
+
+def num_operations(jaxpr: Any) -> int:
+    """Of a program as it is written, with those of its functions, loops and branches."""
+    inner = (x for eqn in jaxpr.eqns for x in jaxprs_in_params(eqn.params))
+    return len(jaxpr.eqns) + sum(map(num_operations, inner))
 
 
 def errors(field, solver, t1, y0, args, answer, steps: Sequence[int], **kwargs) -> np.ndarray:

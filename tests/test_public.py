@@ -1,9 +1,11 @@
 """The public face of the package: names, docstrings, and what an import does not do."""
 
+import ast
 import inspect
 import json
 import subprocess
 import sys
+from pathlib import Path
 
 import diffrax
 import pytest
@@ -82,6 +84,19 @@ def test_promised_names_exist(name):
     assert name in PUBLIC
 
 
+def test_type_checkers_see_the_names_that_are_imported_later():
+    """They do not read a table, and Python does not read what is written for them."""
+    tree = ast.parse(Path(cfjax.__file__).read_text())
+    (block,) = [x for x in tree.body if isinstance(x, ast.If) and "TYPE" in ast.unparse(x.test)]
+    seen = {
+        alias.asname: "." + (node.module or alias.name)
+        for node in block.body
+        if isinstance(node, ast.ImportFrom)
+        for alias in node.names
+    }
+    assert seen == cfjax._LATER
+
+
 @pytest.mark.parametrize("name", PUBLIC)
 def test_every_public_name_has_its_own_docstring(name):
     value = getattr(cfjax, name)
@@ -132,8 +147,7 @@ print(json.dumps({
     "changed": [k for k, v in jax.config.values.items() if settings.get(k) != str(v)],
     "x64": bool(jax.config.jax_enable_x64),
     "backends": len(xla_bridge._backends),
-    "modules": [m for m in ("matplotlib", "rich", "pytest", "hypothesis")
-                if m in sys.modules],
+    "modules": sorted(sys.modules),
 }))
 import numpy as np
 print(str(cfjax.Rotation(np.ones(3)).omega.dtype))
@@ -152,6 +166,12 @@ def test_import_changes_no_setting(fresh):
 
 def test_import_starts_no_backend(fresh):
     assert fresh["backends"] == 0
+
+
+def test_import_makes_few_of_the_methods(fresh):
+    """Their classes and coefficients take longer to make than the rest of the import."""
+    later = {f"cfjax{module}" for module in cfjax._LATER.values()}
+    assert not later & set(fresh["modules"])
 
 
 def test_import_loads_no_extra(fresh):

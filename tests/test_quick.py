@@ -16,7 +16,7 @@ import cfjax
 
 SOLVERS = {
     name: value
-    for name, value in vars(cfjax).items()
+    for name, value in inspect.getmembers(cfjax)
     if inspect.isclass(value)
     and issubclass(value, diffrax.AbstractSolver)
     and name not in ("CommutatorFree", "RKMK", "Richardson")
@@ -130,7 +130,7 @@ def test_every_field(name):
 def test_none_is_left_out():
     fields = {
         name
-        for name, value in vars(cfjax).items()
+        for name, value in inspect.getmembers(cfjax)
         if inspect.isclass(value) and issubclass(value, cfjax.AbstractFrozenField)
     }
     assert fields - {"AbstractFrozenField", "AbstractAlgebraElement"} == FIELDS.keys() - {"array"}

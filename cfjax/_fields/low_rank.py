@@ -296,7 +296,7 @@ class SpanSkew(AbstractSkewElement):
         """The same field on a span that has all its blocks."""
         if span is self.span:
             return self
-        m, p = len(span.gram), len(span.gram) // len(span.blocks)
+        m = len(span.gram)
         places = [span.position(block) for block in self.span.blocks]
         rest = m - len(self.k)
         if places == list(range(len(places))):
@@ -305,9 +305,85 @@ class SpanSkew(AbstractSkewElement):
             return type(self)(
                 k, jnp.pad(jnp.concatenate([self.a, new], 1), ((0, rest), (0, 0))), span
             )
-        index = np.concatenate([np.arange(p) + p * place for place in places])
+        widths = [
+            block.p if isinstance(block, _Corner) else block.shape[1] for block in span.blocks
+        ]
+        columns = np.split(np.arange(m), np.cumsum(widths)[:-1])
+        index = np.concatenate([columns[place] for place in places])
         k = jnp.zeros((m, m), self.k.dtype).at[np.ix_(index, index)].set(self.k)
         return type(self)(k, matmul(k, span.gram), span)
+
+    def room(self, point: Any, num_fields: int) -> "Room | None":
+        blocks: tuple[Any, ...] = self.span.blocks
+        if any(isinstance(block, _Corner) for block in blocks):
+            return None
+        p = point.z.shape[1]
+        m = (num_fields + 1) * p
+        rest = ((0, 0), (0, m - len(self.span.gram)))
+        columns = jnp.pad(jnp.concatenate(blocks, axis=1), rest)
+        return Room(_Span((columns,), _padded(self.span.gram, m)), p, type(self))
+
+
+class Room(eqx.Module):
+    """The span of a step with room for all of its fields, in arrays that do not grow.
+
+    The columns that are not there yet are zero, and so are the coefficients of these.
+    """
+
+    span: _Span
+    p: int = eqx.field(static=True)
+    cls: type[SpanSkew] = eqx.field(static=True)
+
+    def coordinates(self, field: SpanSkew, point: SpanPoint) -> tuple[Array, Array]:
+        m = len(self.span.gram)
+        return _padded(field.k, m), jnp.pad(point.z, ((0, m - len(point.z)), (0, 0)))
+
+    def field(self, k: Float[Array, "m m"]) -> SpanSkew:
+        return self.cls(k, matmul(k, self.span.gram), self.span)
+
+    def point(self, z: Float[Array, "m p"]) -> SpanPoint:
+        return SpanPoint(z, self.span.blocks)
+
+    def entered(self, field: SpanSkew) -> tuple[Array, Array]:
+        """Of a field that has entered here: its own columns, and their products with the others.
+
+        Of the latter the last p are those with themselves.
+        """
+        m = len(self.span.gram)
+        columns: Any = field.span.blocks[-1]
+        return columns, field.span.gram[:, m:]
+
+    def kept(self, i: Any) -> tuple[Array, Array]:
+        """The same of a field that is here, field i."""
+        g, gram = (self._block(x, i, 1) for x in (self._columns, self.span.gram))
+        return g, jnp.concatenate([gram, self._block(gram, i, 0)])
+
+    def extended(
+        self, new: tuple[Array, Array], z: Float[Array, "m p"], i: Any
+    ) -> tuple["Room", Array]:
+        """With field i, frozen at `z`; and its coordinates."""
+        g, products = new
+        m = len(self.span.gram)
+        products = self._with(products[:m], products[m:], i, 0)
+        gram = self._with(self.span.gram, products, i, 1)
+        gram = self._with(gram, products.T, i, 0)
+        columns = self._with(self._columns, g, i, 1)
+        half = self._with(jnp.zeros_like(gram), z, i, 1)
+        return Room(_Span((columns,), gram), self.p, self.cls), half.T - half
+
+    @property
+    def _columns(self) -> Any:
+        return self.span.blocks[0]
+
+    def _block(self, x: Array, i: Any, axis: int) -> Array:
+        return lax.dynamic_slice_in_dim(x, (i + 1) * self.p, self.p, axis)
+
+    def _with(self, x: Array, block: Array, i: Any, axis: int) -> Array:
+        return lax.dynamic_update_slice_in_dim(x, block, (i + 1) * self.p, axis)
+
+
+def _padded(x: Float[Array, "k k"], m: int) -> Float[Array, "m m"]:
+    return jnp.pad(x, (0, m - len(x)))
 
 
 def _spanned(field: Any) -> SpanSkew:

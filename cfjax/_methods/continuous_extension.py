@@ -11,12 +11,11 @@ import numpy as np
 from .order_conditions import (
     exact_tree_weight,
     exact_weight,
-    order,
-    runge_kutta_order,
     trees,
     word_weights,
     words,
 )
+from .proved import order_of
 from .tableau import ContinuousExtension, Tableau
 
 # The conditions of one order: what they multiply the coefficients of one power of theta with, and
@@ -45,7 +44,7 @@ def continuous_extension(tableau: Tableau) -> ContinuousExtension:
     if tableau.continuous_extension is not None:
         return tableau.continuous_extension
     found, reached = _solve(tableau.beta, _flow_conditions(tableau), _MAX_ORDER)
-    if reached < _MAX_ORDER and reached < order(tableau) - 1:
+    if reached < _MAX_ORDER and reached < order_of(tableau) - 1:
         with_end = Tableau((*tableau.alpha, tableau.beta), tableau.beta)
         found, _ = _solve(with_end.beta, _flow_conditions(with_end), _MAX_ORDER)
     return found
@@ -61,9 +60,9 @@ class RungeKuttaExtension(NamedTuple):
 
 @lru_cache
 def runge_kutta_extension(
-    a: tuple[tuple[float, ...], ...], b: tuple[float, ...]
+    a: tuple[tuple[float, ...], ...], b: tuple[float, ...], order: int
 ) -> RungeKuttaExtension:
-    """One of uniform order p - 1 in a linear space, for a Runge-Kutta method of order p.
+    """One of uniform order p - 1 in a linear space, for a Runge-Kutta method of order p, `order`.
 
     `a[i]` and `b[i]` belong to stage i. The method's own stages suffice up to order 5 with as few
     as diffrax has. `diffrax.Dopri8` takes 4 more, which evaluate the field at the end of the step
@@ -72,16 +71,15 @@ def runge_kutta_extension(
     """
     more = []
     found, reached = _solve((b,), _tree_conditions(a, len(b)), _MAX_POWER)
-    promised = runge_kutta_order(a[1:], b) - 1
-    if reached < promised:
+    if reached < order - 1:
         more.append((b, 1.0))
         points = [1.0]
         while points:
             stages = (*a, *(row for row, _ in more))
             padded = (*b, *[0.0] * (len(stages) - len(b)))
-            conditions = list(islice(_tree_conditions(stages, len(stages)), promised))
+            conditions = list(islice(_tree_conditions(stages, len(stages)), order - 1))
             found, reached = _solve((padded,), iter(conditions), _MAX_POWER)
-            if reached >= promised:
+            if reached >= order - 1:
                 break
             points, matrix, values = _points_of_order(conditions[: reached + 1])
             for c in points:

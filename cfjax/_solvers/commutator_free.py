@@ -24,12 +24,12 @@ from .._field import (
 from .._methods import pairs as _pairs
 from .._methods import tableau as _tableau
 from .._methods.continuous_extension import continuous_extension
-from .._methods.order_conditions import order
+from .._methods.proved import order_of
 from .._methods.tableau import Product, Row, Tableau
 from .._xla import cut, once_together
 from .base import AbstractLieSolver, Move
 from .dense import Path
-from .stages import FieldVaries, Flow, can_loop, run
+from .stages import FieldVaries, Flow, can_loop, has_room, run
 
 
 class AbstractCommutatorFree(AbstractLieSolver):
@@ -69,11 +69,11 @@ class AbstractCommutatorFree(AbstractLieSolver):
         return any(map(tableau.uses_last, (tableau.embedded, *continuous_extension(tableau))))
 
     def order(self, terms) -> int:
-        return order(self.tableau)
+        return order_of(self.tableau)
 
     def error_order(self, terms) -> int | None:
         embedded = self.tableau.embedded_method
-        return None if embedded is None else order(embedded) + 1
+        return None if embedded is None else order_of(embedded) + 1
 
     def element(self, rows: Product, fields: Sequence[PyTree], kept: dict[int, PyTree]) -> PyTree:
         """The field of the last of some rows; `kept` is for what is used again in the step."""
@@ -105,15 +105,16 @@ class AbstractCommutatorFree(AbstractLieSolver):
         is_looped = False
         is_usual = type(self).element is AbstractCommutatorFree.element
         # Two stages at one point would be one flow with two times.
-        if is_usual and len({*stages[:-1]}) == len(times) and can_loop(fields[0], y0):
-            first = fields[0]
+        is_distinct = len({*stages[:-1]}) == len(times)
+        here = points[()]
+        if is_usual and is_distinct and (can_loop(fields[0], y0) or has_room(fields[0], here)):
 
-            def entered(c, here: PyTree) -> PyTree:
+            def entered(c, here: PyTree, earlier: PyTree) -> PyTree:
                 # What has entered as a field of another class does so at every stage.
-                return enter(field(c, leave(first, here)), here, [first])[0]
+                return enter(field(c, leave(earlier, here)), here, [earlier])[0]
 
             with contextlib.suppress(FieldVaries):
-                made, fields[:] = run(flows, len(times), first, points[()], entered)
+                made, fields[:] = run(flows, len(times), fields[0], here, entered)
                 points |= zip(_products(stages), made, strict=True)
                 is_looped = True
         if not is_looped:

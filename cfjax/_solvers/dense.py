@@ -1,6 +1,7 @@
 """Output within a step, on the manifold."""
 
 from collections.abc import Callable
+from functools import lru_cache
 from typing import Any
 
 import diffrax
@@ -9,7 +10,7 @@ import jax
 import jax.numpy as jnp
 import jax.tree_util as jtu
 import numpy as np
-from jaxtyping import Array, PyTree
+from jaxtyping import Array, Float, PyTree, Real
 
 from .._field import combine, flow, leave
 from .._methods.tableau import ContinuousExtension
@@ -76,26 +77,45 @@ class Path(eqx.Module):
 
     def point(self, theta: Any) -> PyTree:
         """The solution at a part `theta` of the step."""
+        powers = _by_power(self.continuous_extension)
+        weights = _polynomials(powers, jnp.asarray(theta))
+        point, fields = self.parts(self.arrays)
+        # Of small states too: an event's root finder differentiates it, and a loop of flows on
+        # short vectors is as fast in batches.
+        if self.move is flow and len(weights) > 1 and can_loop(fields[0], point):
+            # There may be no field at the end of the step, where it has no weight.
+            return along(weights[:, : len(fields)], fields, point)
 
         def end(arrays: tuple[Array | np.ndarray, ...]) -> PyTree:
             point, fields = self.parts(arrays)
-            rows = [_polynomials(powers, theta) for powers in self.continuous_extension]
-            if self.move is flow and len(rows) > 1 and can_loop(fields[0], point):
-                return along(rows, fields, point)
-            for weights in rows:
-                used = [(w, f) for w, f in zip(weights, fields, strict=False) if w is not None]
-                point = self.move(combine(*zip(*used, strict=True)), point)
+            for j in range(len(weights)):
+                used = np.flatnonzero(powers[:, j].any(axis=0))
+                row = [(weights[j, k], fields[k]) for k in used]
+                point = self.move(combine(*zip(*row, strict=True)), point)
             return leave(fields[0], point)
 
         return by_components(end, self.arrays)
 
 
-def _polynomials(powers: Any, theta: Any) -> list[Any]:
-    """The weight of each stage, `sum_i powers[i] theta^(i+1)`; None if it is zero throughout."""
-    weights = []
-    for coefficients in zip(*powers, strict=True):
-        total = 0.0
-        for a in reversed(coefficients):
-            total = (total + float(a)) * theta
-        weights.append(total if any(coefficients) else None)
-    return weights
+@lru_cache
+def _by_power(extension: ContinuousExtension) -> Float[np.ndarray, "powers flows stages"]:
+    """Its coefficients; flows may have different numbers of powers."""
+    size = max(map(len, extension)), len(extension), len(extension[0][0])
+    found = np.zeros(size)
+    for j, powers in enumerate(extension):
+        found[: len(powers), j] = np.array(powers, float)
+    return found
+
+
+def _polynomials(
+    powers: Float[np.ndarray, "powers flows stages"], theta: Real[Array, ""]
+) -> Real[Array, "flows stages"]:
+    """The weight of each stage in each flow, `sum_i powers[i] theta^(i+1)`.
+
+    One array: number by number they would be most of the program of output within a step.
+    """
+    *rest, total = powers.astype(theta.dtype)
+    total = total * theta
+    for coefficients in reversed(rest):
+        total = (total + coefficients) * theta
+    return total

@@ -13,6 +13,7 @@ from jax import lax
 from .._field import combine, enter, flow
 from .._field import value as value_of
 from .._methods.continuous_extension import continuous_extension
+from .._methods.proved import proved
 from .._methods.tableau import Product, Row, Tableau
 from .base import Move
 from .commutator_free import AbstractCommutatorFree, minus, trimmed
@@ -179,7 +180,7 @@ class CK54(AbstractLowStorage):
         3134564353537 / 4481467310338,
         2277821191437 / 14882151754819,
     )
-    tableau: ClassVar[Tableau] = _tableau(a, b)
+    tableau: ClassVar[Tableau] = proved(_tableau(a, b), 4)
 
 
 class Luscher3(AbstractLowStorage, diffrax.AbstractAdaptiveSolver):
@@ -233,7 +234,7 @@ class YRK135(AbstractLowStorage):
         0.07729613386515187,
         0.054301254676908335,
     )
-    tableau: ClassVar[Tableau] = _tableau(a, b)
+    tableau: ClassVar[Tableau] = proved(_tableau(a, b), 5)
 
 
 class CFEES25(AbstractLowStorage, diffrax.AbstractAdaptiveSolver):

@@ -111,7 +111,7 @@ def _num_shared(a: Product, b: Product) -> int:
 def _moved(rows: Product, fields: Sequence[PyTree], point: PyTree) -> PyTree:
     floats = [list(map(float, row)) for row in rows]
     if len(floats) > 1 and can_loop(fields[0], point):
-        return along(floats, fields, point)
+        return along(jnp.asarray(floats), fields, point)
     for row in floats:
         used = [(a, f) for a, f in zip(row, fields, strict=True) if a != 0]
         point = flow(combine(*zip(*used, strict=True)), point)

@@ -26,20 +26,20 @@ from .._field import (
     without_bracket,
 )
 from .._field import value as value_of
-from .._methods.continuous_extension import runge_kutta_extension
+from .._methods.continuous_extension import RungeKuttaExtension, runge_kutta_extension
 from .._methods.order_conditions import runge_kutta_order
 from .._methods.tableau import ContinuousExtension, Row
 from .._xla import are_long, is_rewritten, once_together
 from .base import AbstractLieSolver, Move
 from .commutator_free import minus
 from .dense import Path
-from .stages import FieldVaries, can_loop, elements
+from .stages import FieldVaries, can_loop, elements, elements_in_room, has_room
 
 # Fewer stages are mostly short enough to be rewritten for XLA; to look costs a trace of one more.
 _MANY = 8
 
-# `f(c, point)` is `h f(t + c h, point)` for a point of the step, in the coordinates of the step.
-_FieldAt = Callable[[Any, PyTree], PyTree]
+# The rows of the stages after the first, and the weights.
+_RungeKutta = tuple[tuple[tuple[float, ...], ...], tuple[float, ...]]
 
 
 class AbstractMuntheKaas(AbstractLieSolver):
@@ -72,26 +72,27 @@ class AbstractMuntheKaas(AbstractLieSolver):
         return made
 
     @abc.abstractmethod
-    def elements(self, field: Callable[[Any, PyTree], PyTree]) -> list[PyTree]:
+    def elements(self, field: "_Fields") -> list[PyTree]:
         """What v is the combination of that has the weights `b`.
 
         `field(c, u)` is `h f(t + c h, exp(u) y0)`, and `u = None` means zero.
         """
 
     def estimating(
-        self, elements: list[PyTree], v: PyTree, end: PyTree, start: PyTree, field: _FieldAt
+        self, elements: list[PyTree], v: PyTree, end: PyTree, field: "_Fields"
     ) -> list[PyTree]:
-        """These and what else the estimate takes; v leads from the start to the end."""
+        """These and what else the estimate takes; v leads to the end."""
         return elements
 
     def move(self, field, y0):
-        v, elements, start, field_at = self.logarithm(field, y0)
+        v, elements, fields = self.logarithm(field, y0)
+        start = fields.start
         end = flow(v, start)
         left, error = leave(v, end), None
         # All that follows is for error control and output within the step. It is dead code, left
         # out by the compiler, where nobody asks for them.
         if self.estimate is not None and self.b_error is not None:
-            elements = self.estimating(elements, v, end, start, field_at)
+            elements = self.estimating(elements, v, end, fields)
             off = _combine_nonzero(self.b_error, elements)
             if self.estimate == "algebra":
                 error = tangent(off, value_of(left))
@@ -101,32 +102,50 @@ class AbstractMuntheKaas(AbstractLieSolver):
         elements = once_together(elements, alone=True)
         return Move(left, Path.of(self.continuous_extension, value_of(start), elements), error)
 
-    def logarithm(self, field: Callable[[Any, PyTree], PyTree], y0: PyTree) -> Any:
-        """The element v with the end of the step `exp(v) y0`, what it is a combination of, y0, and
-        the field at other points of the step.
-
-        They are in the step's coordinates.
+    def logarithm(
+        self, field: Callable[[Any, PyTree], PyTree], y0: PyTree
+    ) -> tuple[PyTree, list[PyTree], "_Fields"]:
+        """The element v with the end of the step `exp(v) y0`, what it is a combination of, and the
+        fields of the step. They are in the step's coordinates.
         """
-        fields: list[PyTree] = []
-        start = y0
+        fields = _Fields(field, y0)
+        elements = self.elements(fields)
+        return _combine_nonzero(self.b, elements), elements, fields
 
-        def field_at(c: float | Real[Array, ""], here: PyTree) -> PyTree:
-            nonlocal start
-            value = field(c, leave(fields[0], here) if fields else here)
-            value, here = enter(value, here, fields)
-            for part in jtu.tree_leaves(value, is_leaf=is_field):
-                if is_field(part) and not isinstance(part, AbstractAlgebraElement):
-                    raise TypeError(without_bracket(part))
-            if not fields:
-                start = here
-            fields.append(value)
-            return value
 
-        def field_along(c: float | Real[Array, ""], u: PyTree) -> PyTree:
-            return field_at(c, start if u is None else flow(u, start))
+class _Fields:
+    """The field at points of a step, in the coordinates of the step.
 
-        elements = self.elements(field_along)
-        return _combine_nonzero(self.b, elements), elements, start, field_at
+    It is called with a time c and what leads there from the start, or None for the start.
+    """
+
+    def __init__(
+        self, field: Callable[[Any, PyTree], PyTree], start: PyTree, earlier: Sequence[PyTree] = ()
+    ):
+        self.field = field
+        self.start = start
+        self.earlier = list(earlier)
+
+    def __call__(self, c: float | Real[Array, ""], u: PyTree) -> PyTree:
+        is_first = not self.earlier
+        here = self.start if u is None else flow(u, self.start)
+        value, here = self._entered(c, here, self.earlier)
+        if is_first:
+            self.start = here
+        self.earlier.append(value)
+        return value
+
+    def at(self, c: float | Real[Array, ""], here: PyTree, earlier: Sequence[PyTree]) -> PyTree:
+        """The same at the point `here`, after the fields `earlier`."""
+        return self._entered(c, here, earlier)[0]
+
+    def _entered(self, c: Any, here: PyTree, earlier: Sequence[PyTree]) -> tuple[PyTree, ...]:
+        value = self.field(c, leave(earlier[0], here) if earlier else here)
+        value, here = enter(value, here, earlier)
+        for part in jtu.tree_leaves(value, is_leaf=is_field):
+            if is_field(part) and not isinstance(part, AbstractAlgebraElement):
+                raise TypeError(without_bracket(part))
+        return value, here
 
 
 def _sixths(*numerators: int | Fraction) -> Row:
@@ -242,14 +261,21 @@ class RKMK(AbstractMuntheKaas, diffrax.AbstractAdaptiveSolver):
         self.estimate = estimate
 
     def order(self, terms) -> int:
-        return _classical_order(self.a[1 : len(self.b)], self.b)
+        return _order(*self._end)
 
     def error_order(self, terms) -> int | None:
-        if self.b_error is None:
-            return None
+        return None if self.b_error is None else _order(*self._embedded) + 1
+
+    # What the order of the end and that of the embedded method follow from.
+    @property
+    def _end(self) -> _RungeKutta:
+        return self.a[1 : len(self.b)], self.b
+
+    @property
+    def _embedded(self) -> _RungeKutta:
         n = len(self.a)
-        pairs = zip(_padded(self.b, n), _padded(self.b_error, n), strict=True)
-        return _classical_order(self.a[1:], tuple(x - y for x, y in pairs)) + 1
+        pairs = zip(_padded(self.b, n), _padded(self.b_error or (), n), strict=True)
+        return self.a[1:], tuple(x - y for x, y in pairs)
 
     @property
     def first_same_as_last(self) -> bool:
@@ -257,38 +283,34 @@ class RKMK(AbstractMuntheKaas, diffrax.AbstractAdaptiveSolver):
 
     @property
     def continuous_extension(self) -> ContinuousExtension:
-        return runge_kutta_extension(self.a[: len(self.b)], self.b).weights
+        return self._extension.weights
 
     def elements(self, field):
         n = len(self.b)
         return self._stages([field(0.0, None)], self.a[1:n], self.c[1:n], field)
 
-    def estimating(self, elements, v, end, start, field):
+    def estimating(self, elements, v, end, field):
         n, elements = len(self.b), list(elements)
         for c, row in zip(self.c[n:], self.a[n:], strict=True):
             u, here = v, end
             if row != self.b:
                 u = _combine_nonzero(row, elements)
-                here = flow(u, start)
-            elements.append(dexpinv(u, field(c, here), self._degree))
+                here = flow(u, field.start)
+            elements.append(dexpinv(u, field.at(c, here, elements), self._degree))
         return elements
 
     def extended(self, path, field):
         n = len(self.b)
-        _, rows, times = runge_kutta_extension(self.a[:n], self.b)
+        _, rows, times = self._extension
         if not rows:
             return path
         start, elements = path.parts(path.arrays)
-        entered = list(elements)
-
-        def along(c: Any, u: PyTree) -> PyTree:
-            here = flow(u, start)
-            value, _ = enter(field(c, leave(entered[0], here)), here, entered)
-            entered.append(value)
-            return value
-
-        elements = self._stages(elements[:n], rows, times, along)
+        elements = self._stages(elements[:n], rows, times, _Fields(field, start, elements))
         return Path.of(path.continuous_extension, start, elements)
+
+    @property
+    def _extension(self) -> RungeKuttaExtension:
+        return runge_kutta_extension(self.a[: len(self.b)], self.b, self.order(None))
 
     @property
     def _degree(self) -> int:
@@ -299,7 +321,7 @@ class RKMK(AbstractMuntheKaas, diffrax.AbstractAdaptiveSolver):
         known: list[PyTree],
         rows: Sequence[Row],
         times: Sequence[float],
-        field: Callable[[Any, PyTree], PyTree],
+        field: _Fields,
     ) -> list[PyTree]:
         """These, and a stage for each row and time."""
 
@@ -312,6 +334,17 @@ class RKMK(AbstractMuntheKaas, diffrax.AbstractAdaptiveSolver):
         if len(rows) > 1 and all(map(any, rows)) and can_loop(known[0], known[0], is_long):
             with contextlib.suppress(FieldVaries):
                 return elements(known, rows, times, element)
+        if len(rows) > 1 and all(map(any, rows)) and has_room(known[-1], field.start):
+            made = functools.partial(dexpinv, degree=self._degree)
+            # A bracket takes time as the third power of the room: so there is less for the first.
+            half = len(rows) // 2 if len(rows) > _MANY else 0
+            with contextlib.suppress(FieldVaries):
+                found = known
+                for few in (slice(half), slice(half, None)):
+                    found = elements_in_room(
+                        found, rows[few], times[few], field.start, field.at, made
+                    )
+                return found
         stages = list(known)
         for c, row in zip(times, rows, strict=True):
             # Rows may be shorter than what is known.
@@ -350,7 +383,17 @@ class RKMK8(RKMK):
         super().__init__(diffrax.Dopri8.tableau, estimate=estimate)
 
 
-_classical_order = functools.lru_cache(runge_kutta_order)
+@functools.lru_cache
+def _order(a: tuple[tuple[float, ...], ...], b: tuple[float, ...]) -> int:
+    known = _proved()
+    return known[a, b] if (a, b) in known else runge_kutta_order(a, b)
+
+
+@functools.cache
+def _proved() -> dict[_RungeKutta, int]:
+    """Orders that tests prove, as it takes longer than to trace a small step."""
+    long = RKMK(diffrax.Dopri8.tableau)
+    return {long._end: 8, long._embedded: 7}
 
 
 def _without_zeros(row: Sequence[float]) -> tuple[float, ...]:

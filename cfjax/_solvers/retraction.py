@@ -16,7 +16,7 @@ from .base import AbstractLieSolver, Move
 from .dense import Path
 
 _EXTENSION = runge_kutta_extension(
-    ((), (0.5,), (0.0, 0.5), (0.0, 0.0, 1.0)), (1 / 6, 1 / 3, 1 / 3, 1 / 6)
+    ((), (0.5,), (0.0, 0.5), (0.0, 0.0, 1.0)), (1 / 6, 1 / 3, 1 / 3, 1 / 6), 4
 ).weights
 
 

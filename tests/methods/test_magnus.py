@@ -1,5 +1,6 @@
 """Coefficients of commutator-free Magnus methods: every word, the nodes, symmetry."""
 
+import inspect
 from math import factorial, prod
 
 import numpy as np
@@ -10,7 +11,7 @@ from cfjax._methods.magnus import MagnusTableau
 
 TABLEAUS = {
     name: value.tableau
-    for name, value in vars(cfjax).items()
+    for name, value in inspect.getmembers(cfjax)
     if isinstance(getattr(value, "tableau", None), MagnusTableau)
 }
 # Rounded coefficients in products of floats: sums of some hundred terms, less than one in all.

@@ -18,6 +18,7 @@ from cfjax._methods.order_conditions import (
     trees,
     words,
 )
+from cfjax._methods.proved import PROVED, order_of
 from cfjax._methods.tableau import (
     CF2,
     CF3,
@@ -301,6 +302,22 @@ def test_a_small_mistake_in_a_long_tableau_is_seen():
     for place in random.Random(0).sample(list(nonzero_places(CG5)), 5):
         assert order(changed(CG5, place, 1e-10)) < 5, place
     assert order(changed(YRK135, (13, 12, 12), 1e-10)) < 5
+
+
+def test_stored_orders_are_those_that_the_conditions_prove():
+    # The import of a low-storage method stores its order.
+    assert cfjax.YRK135.tableau in PROVED and cfjax.CK54.tableau in PROVED
+    assert {tableau: order(tableau) for tableau in PROVED} == PROVED
+    assert all(order_of(tableau) == q for tableau, q in PROVED.items())
+    # Of others it is proved.
+    assert order_of(changed(CG5, (4, 0, 2), 1e-10)) < 5
+
+
+@pytest.mark.parametrize(("solver", "q", "embedded"), [(diffrax.Dopri8, 8, 7)])
+def test_stored_classical_orders(solver, q, embedded):
+    made = cfjax.RKMK(solver.tableau)
+    assert (made.order(None), made.error_order(None)) == (q, embedded + 1)
+    assert (runge_kutta_order(*made._end), runge_kutta_order(*made._embedded)) == (q, embedded)
 
 
 def test_order_is_at_most_the_number_of_stages():

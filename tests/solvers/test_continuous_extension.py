@@ -132,7 +132,7 @@ def test_the_order_conditions_of_the_continuous_extension(solver, order):
 def test_the_order_conditions_in_the_algebra(solver, order):
     """Those of continuous Runge-Kutta methods, tree by tree, at every stage by recursion."""
     a = solver.a[: len(solver.b)]
-    (powers,), more, times = runge_kutta_extension(a, solver.b)
+    (powers,), more, times = runge_kutta_extension(a, solver.b, solver.order(None))
     rows = (*a, *more)
     np.testing.assert_allclose([sum(row) for row in more], times, rtol=0, atol=1e-14)
 
@@ -164,6 +164,21 @@ def test_a_method_that_needs_the_field_at_the_end_of_the_step_evaluates_it():
         for name, (solver, _) in FLOWS.items()
         if any(map(solver.tableau.uses_last, continuous_extension(solver.tableau)))
     } == {"CF54", "CG5"}
+
+
+def test_output_within_a_step_is_a_short_program():
+    """What compiles it grows with the operations; an event's root finder differentiates them."""
+    solver, (field, y0, args) = cfjax.CF54(), BODY
+    term = cfjax.LieTerm(field)
+    info: Any = problems.first_step(solver, term, jnp.asarray(0.0), jnp.asarray(0.1), y0, args)[2]
+
+    def within(t):
+        return solver.interpolation_cls(t0=jnp.asarray(0.0), t1=jnp.asarray(0.1), **info).evaluate(
+            t
+        )
+
+    # 8 flows of 8 stages, whose weights have 5 powers of the time: 832 number by number, else 197.
+    assert problems.num_operations(jax.make_jaxpr(within)(0.05).jaxpr) < 250
 
 
 def dense(solver, n, field, y0, args, t1=1.0, **kwargs):

@@ -30,6 +30,7 @@ SOLVERS = {
     "CG3": cfjax.CG3(),
     "RKMK(Tsit5)": cfjax.RKMK(diffrax.Tsit5.tableau),
     "RKMK(Bosh3)": cfjax.RKMK(diffrax.Bosh3.tableau),
+    "RKMK(Dopri8)": cfjax.RKMK(diffrax.Dopri8.tableau),
 }
 
 
@@ -67,6 +68,54 @@ def test_a_step(name, problem):
     fun = lambda y0, args: moved(SOLVERS[name], field, y0, args)  # noqa: E731
     # Entries of size 1, some ten flows with a few roundings each.
     assert_same(*both(fun, y0, args), 100)
+
+
+def columns(t, y, args):
+    return cfjax.LowRankSkew(args @ y * jnp.sin(t) + args[:, :2])
+
+
+COLUMNS = problems.arrays(
+    (
+        np.linalg.qr(np.cos(np.arange(12.0)).reshape(6, 2))[0],
+        np.sin(np.arange(36.0) ** 1.5).reshape(6, 6) / 2,
+    )
+)
+
+
+@pytest.mark.representatives(3)
+@pytest.mark.parametrize("name", SOLVERS)
+def test_a_step_in_coordinates_that_grow(name):
+    """In a loop there is room for all of them from the start."""
+    fun = lambda y0, args: moved(SOLVERS[name], columns, y0, args)  # noqa: E731
+    # Ten flows, each a sum of ten products of vectors of up to 18 entries of size 1.
+    assert_same(*both(fun, *COLUMNS), 1000)
+
+
+def test_a_gradient_in_coordinates_that_grow_in_a_batch():
+    loss = lambda y0, args: jnp.sum(jnp.sin(moved(SOLVERS["CF4"], columns, y0, args)[0]))  # noqa: E731
+    fun = jax.vmap(jax.grad(loss, (0, 1)), (0, None))
+    # As above, and back through every stage.
+    y0, args = COLUMNS
+    assert_same(*both(fun, jnp.stack([y0, -y0[::-1]]), args), 10_000)
+
+
+def test_coordinates_that_grow_have_one_program_for_all_stages():
+    """It compiles in the time that a program is long."""
+
+    def evaluations():
+        calls = []
+
+        def field(t, y, args):
+            calls.append(1)
+            return columns(t, y, args)
+
+        jax.make_jaxpr(lambda y0, args: moved(cfjax.CF54(), field, y0, args)[0])(*COLUMNS)
+        return len(calls)
+
+    # Once to check the start, at the start, in the loop and at the end; and at seven stages.
+    assert evaluations() == 4
+    with written_out():
+        assert evaluations() == 9
 
 
 @pytest.mark.representatives(1)
