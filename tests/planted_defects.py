@@ -672,6 +672,41 @@ DEFECTS = [
         "joined arrays that all have the entries of the first",
         "xla/test_columns.py",
     ),
+    Defect(
+        "_xla/understood.py",
+        '"reshape": dict(dimensions=_none,',
+        '"reshape": dict(dimensions=_any,',
+        "a rule that takes a parameter for granted",
+        "xla/test_understood.py",
+    ),
+    Defect(
+        "_xla/components.py",
+        'params | {"fill_value": -1, "mode": mode}',
+        'params | {"mode": mode}',
+        "what fills out of bounds is taken for an entry",
+        "xla/test_understood.py",
+    ),
+    Defect(
+        "_xla/smooth.py",
+        "raise _NotSmooth",
+        "pass",
+        "products with reciprocals before a floor",
+        "xla/test_understood.py",
+    ),
+    Defect(
+        "_xla/components.py",
+        "return extreme, total / functools.reduce(operator.add, shares)",
+        "return extreme, total",
+        "a derivative of a maximum that counts each of its ties",
+        "xla/test_understood.py",
+    ),
+    Defect(
+        "_xla/program.py",
+        "raise _Declined",
+        "pass",
+        "updates in place within a program that is taken apart",
+        "xla/test_understood.py",
+    ),
 ]
 
 
