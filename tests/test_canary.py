@@ -28,6 +28,7 @@ import cfjax
 import cfjax._xla
 from cfjax._integrate import fingerprint
 from cfjax._measure import flops
+from cfjax._xla import understood
 
 PACKAGE = Path(cfjax.__file__).parent
 HOSTS = "jax", "jaxlib", "equinox", "diffrax"
@@ -272,6 +273,23 @@ def test_a_primitive_has_one_of_its_names(names):
     check_example(names, *EITHER[names])
 
 
+@pytest.mark.parametrize("name", [*EXAMPLES, *EITHER])
+def test_the_rules_know_all_parameters(name):
+    """An operation with one more is not taken apart any more, and its programs are slow."""
+    fun, args, _ = EITHER[name] if isinstance(name, tuple) else EXAMPLES[name]
+    for found, eqn in equations(jax.make_jaxpr(fun)(*args)).items():
+        if found in RULES:
+            assert understood.is_understood(eqn), (
+                f"{found} has the parameters {eqn.params}, which cfjax/_xla/understood.py does not "
+                "know all."
+            )
+
+
+RULES = {*understood.ELEMENTWISE, *understood.REDUCTIONS, *understood._PARAMETERS}
+# What is at the top of a module of names of parameters.
+PARAMETERS = {"_GATHER", "_HANDED_ON", "_PARAMETERS_OF_A_PRODUCT", "_SCATTER"}
+
+
 def tables():
     """Every set or table at the top of a module that is of names of primitives."""
     modules = [
@@ -284,7 +302,7 @@ def tables():
     for module in modules:
         for name, value in vars(module).items():
             is_table = isinstance(value, dict | frozenset | set) and value
-            is_table = is_table and set(value) != {"loop", "step"}
+            is_table = is_table and set(value) != {"loop", "step"} and name not in PARAMETERS
             if is_table and not name.startswith("__") and all(isinstance(x, str) for x in value):
                 yield f"{module.__name__}.{name}", value
 

@@ -678,6 +678,8 @@ _RULES: dict[str, Callable[[_Call], Columns | None]] = {
     "scatter": _scattered,
     "scatter-add": _scattered,
     "scatter-mul": _scattered,
+    "scatter_add": _scattered,
+    "scatter_mul": _scattered,
     "slice": _sliced,
     "squeeze": _reshaped,
     "stack": _stacked,

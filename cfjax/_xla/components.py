@@ -25,6 +25,8 @@ MAX_PRODUCT = 216
 SCATTERS: dict[str, Callable[[Any, Any], Any]] = {
     "scatter-add": operator.add,
     "scatter-mul": operator.mul,
+    "scatter_add": operator.add,
+    "scatter_mul": operator.mul,
 }
 
 

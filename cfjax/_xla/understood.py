@@ -88,6 +88,8 @@ _PARAMETERS: dict[str, dict[str, Callable[[Any], bool]]] = {
     # Here it repeats what the name says.
     "scatter-add": _SCATTER | dict(update_jaxpr=_any),
     "scatter-mul": _SCATTER | dict(update_jaxpr=_any),
+    "scatter_add": _SCATTER | dict(update_jaxpr=_any),
+    "scatter_mul": _SCATTER | dict(update_jaxpr=_any),
     "slice": dict(limit_indices=_any, start_indices=_any, strides=_any),
     "split": dict(axis=_any, sizes=_any),
     "squeeze": dict(dimensions=_any),
