@@ -65,9 +65,10 @@ class _NotSmooth(Exception):
 
 
 def by_fixed(eqn: JaxprEqn, fixed: Sequence[bool]) -> bool:
-    """Whether this is a real division by what is fixed, of what is not."""
+    """Whether this is a real division by what is fixed, of what is not; in no half precision."""
     aval: Any = eqn.outvars[0].aval
-    is_real = jnp.issubdtype(aval.dtype, jnp.floating)
+    dtype = aval.dtype
+    is_real = jnp.issubdtype(dtype, jnp.floating) and dtype.itemsize >= 4
     return eqn.primitive.name == "div" and list(fixed) == [False, True] and is_real
 
 
