@@ -71,19 +71,26 @@ def packed(ys):
 
 FUNCTIONS = {**{name: of(name) for name in SOLVES}, "gradient": gradient, "packed": packed}
 
-# Programs that are rewritten on one device.
+# Programs that are rewritten on one device, and those that are quick.
 REWRITTEN = "CF4", "gradient"
+QUICK = "CF4", "packed"
 
 
-def differences(kind):
+def programs(some):
+    """Names, functions, and whether these may be rewritten."""
+    cases = [
+        *((name, fun, False) for name, fun in FUNCTIONS.items()),
+        *((f"{name}, rewritten", FUNCTIONS[name], True) for name in REWRITTEN),
+    ]
+    return [case for case in cases if some == "all" or case[0].split(",")[0] in QUICK]
+
+
+def differences(kind, some):
     """By name, how far the values on a mesh are from those on one device, or an error."""
     mesh = jax.make_mesh((4,), ("i",))
     starts = jax.device_put(STARTS, NamedSharding(mesh, P("i")))
     found = {}
-    for name, fun, is_on in [
-        *((name, fun, False) for name, fun in FUNCTIONS.items()),
-        *((f"{name}, rewritten", FUNCTIONS[name], True) for name in REWRITTEN),
-    ]:
+    for name, fun, is_on in programs(some):
         with cfjax.rewriting(is_on):
             expected = jax.jit(fun)(STARTS)
             spread = fun
@@ -100,19 +107,20 @@ def differences(kind):
     return found
 
 
+@pytest.mark.parametrize("some", ["quick", pytest.param("all", marks=pytest.mark.slow)])
 @pytest.mark.parametrize("kind", ["explicit", "shard_map"])
-def test_a_batch_on_a_mesh_is_that_on_one_device(kind):
+def test_a_batch_on_a_mesh_is_that_on_one_device(kind, some):
     """In a process of its own, whose CPU is four devices."""
     flags = os.environ.get("XLA_FLAGS", "") + " --xla_force_host_platform_device_count=4"
     done = subprocess.run(
-        [sys.executable, __file__, kind],
+        [sys.executable, __file__, kind, some],
         env={**os.environ, "XLA_FLAGS": flags, "JAX_PLATFORMS": "cpu"},
         capture_output=True,
         text=True,
     )
     assert done.returncode == 0, done.stderr
     found = json.loads(done.stdout)
-    assert len(found) == len(FUNCTIONS) + len(REWRITTEN)
+    assert list(found) == [name for name, *_ in programs(some)]
     # The same operations, which may be fused otherwise: some hundred roundings of numbers below 10.
     wrong = {name: x for name, x in found.items() if isinstance(x, str) or x > 1e-13}
     assert not wrong
@@ -121,4 +129,4 @@ def test_a_batch_on_a_mesh_is_that_on_one_device(kind):
 if __name__ == "__main__":
     jax.config.update("jax_enable_x64", True)
     jax.config.update("jax_disable_most_optimizations", True)
-    print(json.dumps(differences(sys.argv[1])))
+    print(json.dumps(differences(*sys.argv[1:])))

@@ -126,7 +126,7 @@ def test_solves_of_lattices(name):
     term = cfjax.LieTerm(lambda t, s, k: cfjax.Rotation(LATTICES[name](s, k)))
 
     def solve(s):
-        return cfjax.integrate(term, cfjax.CF4(), 0.0, 0.1, s, k, num_steps=2).ys[-1]
+        return cfjax.integrate(term, cfjax.CF2(), 0.0, 0.1, s, k, num_steps=2).ys[-1]
 
     s = jnp.asarray(SPINS)
     ours, ours_grad = solve(s), grad(solve, s)
@@ -162,7 +162,7 @@ def test_lattices_with_sides_of_length_1(name):
 
     def solve(y0):
         term = cfjax.LieTerm(field)
-        return cfjax.integrate(term, cfjax.CF3(), 0.0, 0.1, y0, num_steps=2, save_every=1).ys
+        return cfjax.integrate(term, cfjax.CF2(), 0.0, 0.1, y0, num_steps=2, save_every=1).ys
 
     ours, ours_grad = solve(y0), grad(solve, y0)
     with cfjax.rewriting(False):
