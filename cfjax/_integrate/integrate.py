@@ -18,6 +18,9 @@ from .._numerics.squaring import max_over_batch
 from .._solvers.base import AbstractLieSolver, State, is_finite, result_of
 from .._xla import repeat
 
+# Steps whose derivative is not rewritten.
+_FEW = 10
+
 
 def integrate(
     term: PyTree[diffrax.AbstractTerm],
@@ -145,16 +148,19 @@ def equal_steps(
         y0, solver_state = solver_state.started(y0)
     carry = (n, y0, solver_state, diffrax.RESULTS.successful)
 
+    # Of a few steps the derivative takes longer to compile than it will ever save.
+    order = 0 if isinstance(num_steps, int) and num_steps < _FEW else 1
+
     def advance(carry, number):
         # XLA would take apart a loop of one turn, and compute the step anew for each of its uses.
         if isinstance(number, int) and number == 1:
             return step(carry)
         if checkpoint_every is None:
-            return repeat(step, carry, number)[0]
+            return repeat(step, carry, number, order=order)[0]
         length, rest = checkpoint_every, number % checkpoint_every
-        block = jax.checkpoint(lambda carry, _: (repeat(step, carry, length)[0], None))
+        block = jax.checkpoint(lambda carry, _: (repeat(step, carry, length, order=order)[0], None))
         carry, _ = lax.scan(block, carry, length=number // length)
-        return repeat(step, carry, rest)[0]
+        return repeat(step, carry, rest, order=order)[0]
 
     def steps_and_save(carry, _):
         carry = advance(carry, num_steps if save_every is None else save_every)
@@ -162,7 +168,7 @@ def equal_steps(
 
     num_saves: Any = 1 if save_every is None else num_steps // save_every
     if save_every == 1 and num_saves > 1:
-        carry, ys = repeat(step, carry, num_saves, keep=lambda carry: carry[1])
+        carry, ys = repeat(step, carry, num_saves, lambda carry: carry[1], order)
     else:
         carry, ys = lax.scan(steps_and_save, carry, length=num_saves)
     ts = time(

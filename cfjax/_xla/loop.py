@@ -1,5 +1,6 @@
 """Many equal steps in one loop, which XLA turns into one function; so it does its derivative."""
 
+import contextlib
 from collections.abc import Callable, Sequence
 from typing import Any, NamedTuple
 
@@ -24,12 +25,14 @@ def repeat(
     carry: PyTree,
     num_steps: int | Int[Array, ""],
     keep: Callable[[PyTree], PyTree] | None = None,
+    order: int = 1,
 ) -> tuple[PyTree, PyTree]:
     """Replaces `carry` by `step(carry)`, `num_steps` times; and `keep(carry)` after each step.
 
     `step` may close over traced values. Reverse mode keeps one carry a step, and computes the step
     again. It needs a Python int; an array makes one program for every number of steps, without
-    `keep`. What `keep` returns are parts of the carry; each is stacked along a new first axis.
+    `keep`. What `keep` returns are parts of the carry; each is stacked along a new first axis. Of
+    derivatives those up to `order` are taken apart, as the step is; they take long to compile.
 
     On CPU a loop of small steps is fast if XLA has few operations left after fusion, and it fuses
     towards each result all that leads to it. So where the step is taken apart there is one result:
@@ -40,7 +43,7 @@ def repeat(
     """
     program = trace(step, carry, "loop")
     if program is None:
-        with within_equal_steps():
+        with within_equal_steps() if order else contextlib.nullcontext():
             return _loop(jax.checkpoint(step), carry, num_steps, keep)
     leaves, structure = jtu.tree_flatten(carry)
     leaves = list(map(jnp.asarray, leaves))
@@ -53,7 +56,7 @@ def repeat(
     leaves, kept = _repeat(
         leaves,
         program.parameters,
-        step=_Step(of_leaves(program.run), of_leaves(program.plain), program.rows),
+        step=_Step(of_leaves(program.run), of_leaves(program.plain), program.rows, order),
         num_steps=num_steps,
         is_kept=keep is not None,
     )
@@ -78,11 +81,14 @@ def _loop(
 
 
 class _Step(NamedTuple):
-    """A step of leaves and parameters that are split, and the same before it was taken apart."""
+    """A step of leaves and parameters that are split, and the same before it was taken apart; and
+    up to which derivative it is.
+    """
 
     run: Callable[[list[Any], list[Any]], list[Any]]
     plain: Callable[[list[Any], list[Any]], list[Any]]
     rows: bool
+    order: int
 
 
 @eqx.filter_custom_jvp
@@ -190,6 +196,7 @@ def _scan(
             place="loop",
             is_batch=rows,
             plain=stepped(step.plain),
+            order=step.order,
         )
 
     keep = (lambda carry: carry) if is_kept else None

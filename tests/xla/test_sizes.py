@@ -1,0 +1,87 @@
+"""The size of compiled programs, which is the same on every machine, and goes with their time."""
+
+import diffrax
+import jax
+import jax.numpy as jnp
+import pytest
+
+import cfjax
+
+pytestmark = pytest.mark.usefixtures("rewritten")
+
+INERTIA = jnp.array([3.0, 2.0, 1.0])
+CRAFT = {"q": jnp.array([1.0, 0.0, 0.0, 0.0]), "m": jnp.array([0.05, 1.0, 0.0])}
+BODY = jnp.array([0.9, 0.4, 0.1])
+
+
+def craft(t, y, inertia):
+    omega = y["m"] / inertia
+    return {
+        "q": cfjax.QuaternionRotation(omega, frame="body", order="wxyz"),
+        "m": cfjax.Rotation(-omega),
+    }
+
+
+def body(t, y, inertia):
+    return cfjax.Rotation(-y / inertia)
+
+
+def total(ys):
+    return sum(jnp.sum(y**3) for y in jax.tree.leaves(ys))
+
+
+def equal(field, solver, num_steps, **options):
+    term = cfjax.LieTerm(field)
+    return lambda y, inertia: total(
+        cfjax.integrate(term, solver, 0.0, 1.0, y, inertia, num_steps=num_steps, **options).ys
+    )
+
+
+def controlled(field, solver):
+    controller = diffrax.PIDController(rtol=1e-7, atol=1e-7)
+    options = dict(stepsize_controller=controller, saveat=diffrax.SaveAt(ts=jnp.linspace(0, 1, 5)))
+    term = cfjax.LieTerm(field)
+    return lambda y, inertia: total(
+        diffrax.diffeqsolve(term, solver, 0.0, 1.0, 0.1, y, inertia, **options).ys
+    )
+
+
+def size(fun, y):
+    """Lines of optimised HLO."""
+    return jax.jit(fun).lower(y, INERTIA).compile().as_text().count("\n")
+
+
+SOLVERS = {
+    "CF4": cfjax.CF4(),
+    "CF43": cfjax.CF43(),
+    "CF54": cfjax.CF54(),
+    "RKMK5": cfjax.RKMK5(),
+    "RKMK8": cfjax.RKMK8(),
+    "CG3": cfjax.CG3(),
+    "Williamson3": cfjax.Williamson3(),
+}
+
+
+@pytest.mark.representatives(1)
+@pytest.mark.parametrize("name", SOLVERS)
+def test_a_step_that_is_kept_is_as_one_in_the_loop(name):
+    """The gradient of all that a fit compares with data, at every step or every fifth."""
+    sizes = [
+        size(jax.grad(equal(body, SOLVERS[name], 20, save_every=n), argnums=(0, 1)), BODY)
+        for n in (1, 5)
+    ]
+    assert sizes[0] <= 1.5 * sizes[1]
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("name", ["CF4", "CF54", "RKMK8"])
+def test_derivatives_are_at_most_twice_as_large_as_not_rewritten(name):
+    """Of controlled steps with output, and second ones of a few equal steps."""
+    fun = equal(craft, SOLVERS[name], 4)
+    for program in (
+        jax.grad(controlled(craft, SOLVERS[name])),
+        lambda y, a: jax.jvp(lambda y: jax.grad(fun)(y, a), (y,), (y,))[1],
+    ):
+        ours = size(program, CRAFT)
+        with cfjax.rewriting(False):
+            assert ours <= 2 * size(program, CRAFT)
