@@ -505,7 +505,7 @@ DEFECTS = [
     ),
     Defect(
         "_integrate/integrate.py",
-        "        return repeat(step, carry, rest)",
+        "        return repeat(step, carry, rest, order=order)[0]",
         "        return carry",
         "dropped steps behind the last checkpoint",
         "integrate/test_integrate.py -k checkpoint",

@@ -132,7 +132,8 @@ def test_as_the_function_itself(fun, leftover):
     apart = jax.jit(lambda y: by_components(fun, y))(Y)
     # Sums in another order. The products have at most 9 terms of size 10.
     np.testing.assert_allclose(apart, fun(jnp.asarray(Y)), rtol=1e-13, atol=1e-13)
-    assert set(leftover) <= {"iota"}
+    # The largest of all stays whole, as all ties have a share in its derivative.
+    assert set(leftover) <= {"iota", "reduce_max"}
 
 
 @pytest.mark.representatives(4)
