@@ -9,6 +9,7 @@ from jax import lax
 from jaxtyping import Array, Float
 
 from .._field import AbstractFrozenField
+from .._xla import smooth
 from .elementwise import elementwise
 from .low_rank import SpanSkew, check_like
 from .rotation import Rotation
@@ -77,6 +78,7 @@ class SphereRotation(AbstractFrozenField):
         return _SpanRotation.entered(g[:, None], point if earlier else point[:, None], earlier)
 
 
+@smooth
 def _corrected(y: Float[Array, "*batch n"]) -> Float[Array, "*batch n"]:
     """`y (3 - y @ y) / 2`, the first step of Newton's method for length 1."""
     defect = 1 - jnp.sum(y * y, axis=-1, keepdims=True)

@@ -13,7 +13,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Float
 
-from .._xla import is_rewritten, pack
+from .._xla import is_rewritten, pack, smooth
 from .quaternion import Order, check_choice, from_parts, parts
 
 
@@ -128,6 +128,7 @@ def _cross(a: Sequence[Array], b: Sequence[Array]) -> list[Array]:
     return [a[k - 2] * b[k - 1] - a[k - 1] * b[k - 2] for k in range(3)]
 
 
+@smooth
 def _quaternion(q: Array | np.ndarray, order: Order) -> tuple[tuple[Array, ...], Array]:
     """The parts of q, and `2 / |q|^2`."""
     check_choice("order", order)

@@ -26,7 +26,7 @@ from .._methods import tableau as _tableau
 from .._methods.continuous_extension import continuous_extension
 from .._methods.proved import order_of
 from .._methods.tableau import Product, Row, Tableau
-from .._xla import cut, once_together
+from .._xla import cut, once_together, smooth
 from .base import AbstractLieSolver, Move
 from .dense import Path
 from .stages import FieldVaries, Flow, can_loop, has_room, run
@@ -191,6 +191,8 @@ def minus(a: PyTree, b: PyTree) -> PyTree:
     )
 
 
+# It chooses by a comparison, of which no more than rounding decides either.
+@smooth
 def _seen(
     error: Inexact[Array, "..."], apart: Inexact[Array, "..."], way: Inexact[Array, "..."]
 ) -> Inexact[Array, "..."]:

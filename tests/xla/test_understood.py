@@ -109,6 +109,23 @@ def test_a_quotient_is_a_product_where_all_is_smooth():
     assert divisions(lambda y, a: cfjax.Rotation(jnp.round(y / a)).flow(y), y[:3], a[:3]) == 3
 
 
+@pytest.mark.parametrize("estimate", ["group", "algebra", None])
+def test_a_step_with_its_estimate_is_smooth(estimate):
+    """It compares norms of errors, and yet has as many divisions as without those of the field."""
+    y, solver = jnp.asarray(SIX[:3]), cfjax.CF4(estimate=estimate)
+
+    def count(field):
+        term = cfjax.LieTerm(lambda t, y, a: cfjax.Rotation(field(y, a)))
+
+        def step(y, a, state):
+            return solver.step(term, 0.0, 0.1, y, a, state, made_jump=False)[:2]
+
+        program = jax.make_jaxpr(step)(y, y, solver.init(term, 0.0, 0.1, y, y))
+        return len(re.findall(r" div \w+ [a-z]", str(program)))
+
+    assert count(lambda y, a: y / a) == count(lambda y, a: y * a)
+
+
 LATTICES = {
     "shifted by a number of the program": lambda s, k: s.at[1:].set(
         lax.dynamic_slice_in_dim(s, k - 5, 99, 0)
