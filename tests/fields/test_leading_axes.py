@@ -250,7 +250,7 @@ def test_the_motions_of_an_empty_batch(name):
     assert by_weight == 0
 
 
-@pytest.mark.representatives(3)
+@pytest.mark.representatives(1)
 @pytest.mark.parametrize("name", EMPTY)
 def test_solves_of_an_empty_batch(name):
     field, y0 = empty(name)
@@ -297,7 +297,7 @@ def test_an_empty_batch_by_other_methods(name, solver):
     assert_empty_like(ys, y0[None])
 
 
-@pytest.mark.representatives(3)
+@pytest.mark.representatives(1)
 @pytest.mark.parametrize("name", [name for name in EMPTY if not name.startswith("elementwise")])
 def test_an_empty_batch_of_solves(name):
     """By `jax.vmap`, each solve with its checks of the start and of the end."""

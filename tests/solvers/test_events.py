@@ -245,7 +245,7 @@ def test_a_steady_state_of_a_sum_of_terms():
 # Other events
 
 
-@pytest.mark.representatives(3)
+@pytest.mark.representatives(2)
 @cases
 def test_events_of_every_kind_at_once(name):
     """Numbers with directions, a bool, and a root: the first that happens ends the solve."""

@@ -510,6 +510,7 @@ def test_a_named_method_is_that_of_its_tableau(name):
     assert count_step(solver.without_estimate(), jnp.ones((4, 4))) == cost
 
 
+@pytest.mark.representatives(1)
 @pytest.mark.parametrize("name", NAMED)
 def test_a_named_method_turns_a_symmetric_body_with_its_order(name):
     """Its momentum m turns about the third axis at the rate r = m3 (1 / I3 - 1 / I1).

@@ -136,6 +136,7 @@ LATTICES = {
 }
 
 
+@pytest.mark.representatives(2)
 @pytest.mark.parametrize("name", LATTICES)
 def test_solves_of_lattices(name):
     """XLA updates arrays in place, and reads what it has overwritten if these have two shapes."""
@@ -172,6 +173,7 @@ SHAPES = {
 }
 
 
+@pytest.mark.representatives(1)
 @pytest.mark.parametrize("name", SHAPES)
 def test_lattices_with_sides_of_length_1(name):
     field, y0 = SHAPES[name]
