@@ -199,6 +199,9 @@ def _scan(
             order=step.order,
         )
 
+    if not step.order:
+        # An operation computes its step again in reverse; the step as it was would keep all of it.
+        body = jax.checkpoint(body)
     keep = (lambda carry: carry) if is_kept else None
     carried, kept = _loop(body, (vectors(numbers, known), rest), num_steps, keep)
     return whole(carried), jax.vmap(whole)(kept) if is_kept else None
