@@ -51,7 +51,7 @@ from .scope import (
     where,
     within,
 )
-from .smooth import by_fixed, has_reciprocals
+from .smooth import by_fixed, has_reciprocals, scaled_reciprocal
 from .understood import REDUCTIONS, is_in_place, is_readable
 
 # A state is taken apart if all of it is numbers and short vectors, so many entries together, and if
@@ -313,7 +313,7 @@ def _evaluate(
         if not is_one:
             loose.add(variable)
     # Each reciprocal once.
-    reciprocals: dict[int, tuple[Any, Any]] = {}
+    divisors: dict[int, tuple[Any, Any, Any]] = {}
     for eqn in jaxpr.eqns:
         values = [read(v) for v in eqn.invars]
         fixed = [is_fixed(v) for v in eqn.invars]
@@ -324,20 +324,17 @@ def _evaluate(
             outs, outs_fixed = _evaluate(
                 inner.jaxpr, (*inner.consts, *values), (*constants, *fixed), form
             )
+        elif form.has_reciprocals and by_fixed(eqn, fixed):
+            x, divisor = values
+            if id(divisor) not in divisors:
+                # With the divisor, so that it is not forgotten and its identity used again.
+                divisors[id(divisor)] = *scaled_reciprocal(divisor), divisor
+            scale, reciprocal, _ = divisors[id(divisor)]
+            eqn = eqn.replace(primitive=lax.mul_p, params=_PARAMETERS_OF_A_PRODUCT)
+            outs = _results(jaxpr, eqn, [x, scale], fixed, form)
+            outs = _results(jaxpr, eqn, [*outs, reciprocal], fixed, form)
         else:
-            if form.has_reciprocals and by_fixed(eqn, fixed):
-                key = id(values[1])
-                if key not in reciprocals:
-                    one = jtu.tree_map(lambda x: lax.integer_pow(x, -1), values[1])
-                    # With the divisor, so that it is not forgotten and its identity used again.
-                    reciprocals[key] = one, values[1]
-                eqn = eqn.replace(primitive=lax.mul_p, params=_PARAMETERS_OF_A_PRODUCT)
-                values[1] = reciprocals[key][0]
-            outs = _apart(jaxpr, eqn, values, fixed, form)
-            if outs is None and is_in_place(eqn):
-                raise _Declined
-            if outs is None:
-                outs = map(split, evaluate(jaxpr, eqn, list(map(_whole, values))))
+            outs = _results(jaxpr, eqn, values, fixed, form)
         env.update(zip(eqn.outvars, outs, strict=True))
         loose.update(v for v, is_one in zip(eqn.outvars, outs_fixed, strict=True) if not is_one)
     return [read(v) for v in jaxpr.outvars], [is_fixed(v) for v in jaxpr.outvars]
@@ -345,6 +342,18 @@ def _evaluate(
 
 # As a version of JAX has them.
 _PARAMETERS_OF_A_PRODUCT = jax.make_jaxpr(lax.mul)(1.0, 1.0).jaxpr.eqns[0].params
+
+
+def _results(
+    jaxpr: Jaxpr, eqn: JaxprEqn, values: list[Any], fixed: Sequence[bool], form: _Form
+) -> list[Any]:
+    """The results of one operation: taken apart, if there is a rule for it."""
+    outs = _apart(jaxpr, eqn, values, fixed, form)
+    if outs is None and is_in_place(eqn):
+        raise _Declined
+    if outs is None:
+        outs = map(split, evaluate(jaxpr, eqn, list(map(_whole, values))))
+    return list(outs)
 
 
 def _apart(

@@ -12,7 +12,10 @@ from typing import Any
 
 import jax
 import jax.numpy as jnp
+import jax.tree_util as jtu
+from jax import lax
 from jax.extend.core import Jaxpr, JaxprEqn, Literal
+from jaxtyping import Array, PyTree
 
 from .understood import is_understood
 
@@ -65,11 +68,31 @@ class _NotSmooth(Exception):
 
 
 def by_fixed(eqn: JaxprEqn, fixed: Sequence[bool]) -> bool:
-    """Whether this is a real division by what is fixed, of what is not; in no half precision."""
+    """Whether this is a real division by what is fixed, of what is not; in no half precision.
+
+    A division by a literal is XLA's affair, which has the products itself.
+    """
+    if eqn.primitive.name != "div" or isinstance(eqn.invars[1], Literal):
+        return False
     aval: Any = eqn.outvars[0].aval
     dtype = aval.dtype
     is_real = jnp.issubdtype(dtype, jnp.floating) and dtype.itemsize >= 4
-    return eqn.primitive.name == "div" and list(fixed) == [False, True] and is_real
+    return list(fixed) == [False, True] and is_real
+
+
+def scaled_reciprocal(divisor: PyTree) -> tuple[PyTree, PyTree]:
+    """s and 1 / (s a), for each number a: x / a is (x s) / (s a).
+
+    1 / a is no normal number where a is one of the largest, and XLA takes it for zero. s is a power
+    of two, small there and otherwise one. x s is zero only where x / a is.
+    """
+
+    def scale(a: Array) -> Array:
+        half = jnp.finfo(a.dtype).maxexp // 2
+        return lax.select(lax.abs(a) < 2.0**half, lax.full_like(a, 1), lax.full_like(a, 2.0**-half))
+
+    scales = jtu.tree_map(scale, divisor)
+    return scales, jtu.tree_map(lambda s, a: lax.integer_pow(s * a, -1), scales, divisor)
 
 
 def _follow(jaxpr: Jaxpr, is_fixed: dict[Any, bool], inexact: set[Any], is_smooth: bool) -> None:

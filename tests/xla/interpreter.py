@@ -84,7 +84,13 @@ def _apply(jaxpr: Jaxpr, eqn: Any, values: list[Any]) -> Sequence[Any]:
     return out if eqn.primitive.multiple_results else [out]
 
 
+# LAPACK may not return from these if a number is infinite.
+_FINITE = frozenset("eig eigh hessenberg schur svd tridiagonal".split())
+
+
 def _by_jax(jaxpr: Jaxpr, eqn: Any, values: list[Any]) -> Sequence[Any]:
+    if eqn.primitive.name in _FINITE and not all(np.isfinite(x).all() for x in values):
+        raise ValueError(f"{eqn.primitive.name} of numbers that are not finite")
     known = {v: x for v, x in zip(eqn.invars, values, strict=True) if not isinstance(v, Literal)}
     alone = jaxpr.replace(
         constvars=[],

@@ -109,6 +109,34 @@ def test_a_quotient_is_a_product_where_all_is_smooth():
     assert divisions(lambda y, a: cfjax.Rotation(jnp.round(y / a)).flow(y), y[:3], a[:3]) == 3
 
 
+@pytest.mark.parametrize("dtype", [np.float32, np.float64])
+def test_a_quotient_by_any_number_is_that_of_jax(dtype):
+    """The reciprocals of the largest are no normal numbers."""
+    ends = np.finfo(dtype)
+    a = np.array([ends.max, -ends.max / 1.5, ends.max / 3, ends.max**0.45, 3, ends.tiny, 0], dtype)
+    a = np.concatenate([a, [np.inf, np.nan]], dtype=dtype)
+    assert not np.any(np.abs(1 / a[:3]) > ends.tiny)  # or this would test nothing
+    x = np.array([ends.max, a[1], -a[2], 1, 3, 0, 0], dtype)
+    xs, divisors = map(np.ravel, np.meshgrid(x, a))
+
+    def results(change):
+        def quotient(x, a):
+            return change(lambda y: y / a)(jnp.full(3, x))[0]
+
+        return jax.jit(jax.vmap(jax.value_and_grad(quotient, (0, 1))))(xs, divisors)
+
+    ours, (dx, da) = results(lambda fun: lambda y: by_components(fun, y))
+    plain, (dx_plain, da_plain) = results(lambda fun: fun)
+    # XLA takes numbers below the smallest normal one for zero.
+    tolerance = dict(rtol=4 * ends.eps, atol=2 * ends.tiny)
+    np.testing.assert_allclose(ours, plain, **tolerance)
+    np.testing.assert_allclose(dx, dx_plain, **tolerance)
+    # JAX divides by the square of a, which is a normal number for these.
+    some = (np.abs(divisors) > ends.tiny**0.5) & (np.abs(divisors) < ends.max**0.5)
+    assert some.sum() == 2 * len(x)
+    np.testing.assert_allclose(da[some], da_plain[some], **tolerance)
+
+
 @pytest.mark.parametrize("estimate", ["group", "algebra", None])
 def test_a_step_with_its_estimate_is_smooth(estimate):
     """It compares norms of errors, and yet has as many divisions as without those of the field."""
