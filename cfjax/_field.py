@@ -3,6 +3,7 @@
 import abc
 import functools
 import inspect
+import warnings
 from collections.abc import Sequence
 from fractions import Fraction
 from math import factorial
@@ -14,8 +15,6 @@ import jax.numpy as jnp
 import jax.tree_util as jtu
 import numpy as np
 from jaxtyping import Array, Inexact, PyTree, Real
-
-from ._xla import once_in_rows
 
 Weight = float | Real[Array, ""]
 
@@ -38,8 +37,8 @@ class AbstractFrozenField(eqx.Module):
     `acts_on_subtree = True`: then its point, and what `flow` and `tangent` return, is the pytree
     that stands in its place in the state.
 
-    A class may also work in coordinates of its own within a step, where that is what makes it
-    cheap. Then it overrides `enter` and `leave` too.
+    A class may also work in coordinates of its own within a step, a chart, where that is what makes
+    it cheap. Then it overrides `to_chart` and `from_chart` too.
     """
 
     # Whether the point that the field acts on is a pytree instead of one array.
@@ -56,6 +55,14 @@ class AbstractFrozenField(eqx.Module):
                     "instances: write `acts_on_subtree = True`, without an annotation or with "
                     f"`typing.ClassVar[bool]`, got the annotation {annotation!r}."
                 )
+        for old, new in (("enter", "to_chart"), ("leave", "from_chart")):
+            if old in vars(cls):
+                warnings.warn(
+                    f"{cls.__name__}.{old} is deprecated: the method is called {new} now.",
+                    DeprecationWarning,
+                    stacklevel=2,
+                )
+                setattr(cls, new, vars(cls)[old])
 
     @abc.abstractmethod
     def flow(self, point: Any) -> Any:
@@ -83,9 +90,9 @@ class AbstractFrozenField(eqx.Module):
     def increment(self, point: Any) -> Any:
         """`flow(point) - point`, with a rounding as small as the increment; None if not offered.
 
-        A class that offers it gets compensated summation over the steps where it acts on matrices
-        (`_solvers/base.py`). Not for a field whose flow keeps signs or relative accuracy: the sum
-        of point and increment keeps absolute accuracy only.
+        A class that offers it gets compensated summation over the steps
+        (`_solvers/compensation.py`). Not for a field whose flow keeps signs or relative accuracy:
+        the sum of point and increment keeps absolute accuracy only.
         """
         return None
 
@@ -113,35 +120,35 @@ class AbstractFrozenField(eqx.Module):
         del point
         return None
 
-    def enter(self, point: Any, earlier: Sequence[Any]) -> tuple["AbstractFrozenField", Any]:
-        """This field and the point where it is frozen, in the coordinates of the step.
+    def to_chart(self, point: Any, earlier: Sequence[Any]) -> tuple["AbstractFrozenField", Any]:
+        """This field and the point where it is frozen, in the chart of the step.
 
-        A solver calls it after every evaluation. `earlier` holds the fields that have entered in
-        this step; where there is none, `point` is the state itself. All flows of the step start
+        A solver calls it after every evaluation. `earlier` holds the fields of this step that are
+        in the chart; where there is none, `point` is the state itself. All flows of the step start
         from the point returned then, so drift can be corrected there. By default nothing changes.
         """
         del earlier
         return self, point
 
     def room(self, point: Any, num_fields: int) -> Any:
-        """Coordinates of the step with room for so many fields, of which this is the first.
+        """A chart of the step with room for so many fields, of which this is the first.
 
         For a loop over the stages, whose arrays must not grow: `cfjax._fields.low_rank.Room` is
-        one. None, the default, if it has none. `point` is the one where this field has entered.
+        one. None, the default, if it has none. This field and `point` are in the chart of the step.
         """
         del point, num_fields
         return None
 
-    def leave(self, point: Any) -> Any:
-        """The state at a point of a step, for a field that has entered. By default the point."""
+    def from_chart(self, point: Any) -> Any:
+        """The state at a point of the chart, for a field in the chart. By default the point."""
         return point
 
 
 class AbstractAlgebraElement(AbstractFrozenField):
     """A frozen field from a set that is closed under the bracket: an element of a Lie algebra.
 
-    Munthe-Kaas methods accept only what is one in the coordinates of a step: these, and fields
-    whose `enter` returns one, such as `cfjax.LowRankSkew`, which has a bracket only together with
+    Munthe-Kaas methods accept only what is one in the chart of a step: these, and fields whose
+    `to_chart` returns one, such as `cfjax.LowRankSkew`, which has a bracket only together with
     the point where it is frozen.
 
     The bracket is normalised so that `y = exp(u) p` has
@@ -185,15 +192,10 @@ def flow(field: PyTree, point: PyTree) -> PyTree:
     """
 
     def flow_leaf(f, p):
-        if isinstance(p, Incremented) and is_field(f):
-            moved = f.increment(p.value)
-            if moved is not None:
-                return Incremented(p.start, once_in_rows(p.increment + moved))
-        p = value(p)
         if not is_field(f):
             return p + f
-        moved = once_in_rows(f.flow(p))
-        # A point in a step's own coordinates may come back in more of them.
+        moved = f.flow(p)
+        # A point in the chart of a step may come back with more coordinates.
         is_state = f.acts_on_subtree or jtu.all_leaves([p])
         if is_state and struct(moved) != struct(p):
             raise ValueError(
@@ -203,28 +205,6 @@ def flow(field: PyTree, point: PyTree) -> PyTree:
         return moved
 
     return jtu.tree_map(flow_leaf, field, point, is_leaf=is_field)
-
-
-class Incremented(eqx.Module):
-    """A point as a start and the increment from it, whose rounding is as small as it is."""
-
-    start: Inexact[Array, "..."]
-    increment: Inexact[Array, "..."]
-
-    @property
-    def value(self) -> Inexact[Array, "..."]:
-        return self.start + self.increment
-
-
-def is_incremented(x: Any) -> bool:
-    return isinstance(x, Incremented)
-
-
-def value(point: PyTree) -> PyTree:
-    """The point with every `Incremented` in it summed up."""
-    return jtu.tree_map(
-        lambda p: p.value if is_incremented(p) else p, point, is_leaf=is_incremented
-    )
 
 
 def tangent(field: PyTree, point: PyTree) -> PyTree:
@@ -321,22 +301,22 @@ def _bernoulli(n: int) -> Fraction:
     return -row[0] if n == 1 else row[0]
 
 
-def enter(field: PyTree, point: PyTree, earlier: Sequence[PyTree]) -> tuple[PyTree, ...]:
-    """`field` and the point where it is frozen, in the coordinates of a step, part by part."""
+def to_chart(field: PyTree, point: PyTree, earlier: Sequence[PyTree]) -> tuple[PyTree, ...]:
+    """`field` and the point where it is frozen, in the chart of a step, part by part."""
     parts, treedef = jtu.tree_flatten(field, is_leaf=is_field)
     columns = [treedef.flatten_up_to(tree) for tree in (point, *earlier)]
-    entered = [
-        f.enter(p, before) if is_field(f) else (f, p)
+    charted = [
+        f.to_chart(p, before) if is_field(f) else (f, p)
         for f, p, *before in zip(parts, *columns, strict=True)
     ]
     # A state may have no parts.
-    return tuple(treedef.unflatten([pair[k] for pair in entered]) for k in range(2))
+    return tuple(treedef.unflatten([pair[k] for pair in charted]) for k in range(2))
 
 
-def leave(field: PyTree, point: PyTree) -> PyTree:
-    """The state at a point of a step, for a field that has entered."""
+def from_chart(field: PyTree, point: PyTree) -> PyTree:
+    """The state at a point of the chart, for a field in the chart."""
     return jtu.tree_map(
-        lambda f, p: f.leave(p) if is_field(f) else p, field, point, is_leaf=is_field
+        lambda f, p: f.from_chart(p) if is_field(f) else p, field, point, is_leaf=is_field
     )
 
 

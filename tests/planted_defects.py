@@ -102,7 +102,7 @@ DEFECTS = [
     ),
     Defect(
         "_solvers/magnus.py",
-        "enter(frozen, y, ())[0]",
+        "to_chart(frozen, y, ())[0]",
         "frozen",
         "a Magnus method that takes fields frozen at the state",
         "solvers/test_magnus.py -k frozen",
@@ -117,15 +117,17 @@ DEFECTS = [
     # Solvers.
     Defect(
         "_solvers/commutator_free.py",
-        "points[rows] = flow(self.element(rows, fields, kept), point(rows[:-1]))",
-        "points[rows] = flow(self.element(rows[:1], fields, kept), point(rows[1:]))",
+        "direction = self.direction(rows, self.chart, self.kept)\n"
+        "            self.points[rows] = self.chart.flow(direction, self(rows[:-1]))",
+        "direction = self.direction(rows[:1], self.chart, self.kept)\n"
+        "            self.points[rows] = self.chart.flow(direction, self(rows[1:]))",
         "flows of a product in the wrong order",
         "solvers/test_one_step.py",
     ),
     Defect(
         "_solvers/commutator_free.py",
-        "            evaluate(1.0, stages[-1])",
-        "            evaluate(1.0, stages[-2])",
+        "            chart.frozen(1.0, end)",
+        "            chart.frozen(1.0, reach(stages[-1]))",
         "the field at the last stage in place of that at the end",
         "solvers/test_one_step.py",
     ),
@@ -173,15 +175,15 @@ DEFECTS = [
     ),
     Defect(
         "_solvers/base.py",
-        "State(new_lost, last, solver_state.zero)",
-        "State(new_lost, first, solver_state.zero)",
+        "State(compensation, last, solver_state.zero)",
+        "State(compensation, first, solver_state.zero)",
         "a stale field after a step",
         "solvers/test_one_step.py",
     ),
     Defect(
-        "_solvers/base.py",
-        "a, b = end.start, end.increment + lax.stop_gradient(self.lost)",
-        "a, b = end.start, end.increment",
+        "_solvers/compensation.py",
+        "b = end + lax.stop_gradient(c)",
+        "b = end",
         "a dropped compensation of rounding",
         "integrate/test_integrate.py -k compensation",
     ),
@@ -632,8 +634,8 @@ DEFECTS = [
     ),
     Defect(
         "_solvers/commutator_free.py",
-        "cut(point(stages[-1]))",
-        "point(stages[-1])",
+        "reach.points[beta] = cut(end)",
+        "reach.points[beta] = end",
         "a long step that is not cut",
         "xla/test_held.py -k long_step",
     ),

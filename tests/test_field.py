@@ -303,3 +303,42 @@ def test_brackets_of_two_classes_are_refused():
     for a, b in itertools.permutations(fields, 2):
         with pytest.raises(TypeError, match=rf"bracket .*\bgot .*{type(b).__name__}\."):
             cfjax.bracket(a, b)
+
+
+def test_the_old_names_of_a_chart_work_and_are_deprecated():
+    with pytest.warns(DeprecationWarning, match="to_chart") as caught:
+
+        class Shifted(AbstractFrozenField):
+            """A rate in coordinates that are one more than the state."""
+
+            rate: Any
+
+            def flow(self, point):
+                return point * jnp.exp(self.rate)
+
+            def tangent(self, point):
+                return point * self.rate
+
+            def enter(self, point, earlier):
+                return _Inside(self.rate), point if earlier else point + 1
+
+    assert [str(w.message).split(":")[0] for w in caught] == ["Shifted.enter is deprecated"]
+    with pytest.warns(DeprecationWarning, match="from_chart"):
+
+        class _Inside(AbstractFrozenField):
+            rate: Any
+
+            def flow(self, point):
+                return 1 + (point - 1) * jnp.exp(self.rate)
+
+            def tangent(self, point):
+                return point * self.rate
+
+            def leave(self, point):
+                return point - 1
+
+    term = cfjax.LieTerm(lambda t, y, args: Shifted(-t * jnp.ones(2)))
+    y0 = jnp.array([1.0, 2.0])
+    end = cfjax.integrate(term, cfjax.CF2(), 0.0, 1.0, y0, num_steps=4).ys[-1]
+    # The midpoint rule is exact for a rate that is linear in t.
+    np.testing.assert_allclose(end, y0 * np.exp(-0.5), rtol=16 * EPS)

@@ -29,9 +29,9 @@ def check_field(fields: Sequence[AbstractFrozenField], point: PyTree) -> None:
     - the flow of the zero field is the identity, that of 0.4 of a field after 0.6 of it is that of
       the whole, and `tangent` is its derivative at time zero;
     - `combine` is linear: the tangent of a sum is the sum of the tangents;
-    - `increment`, if offered, is `flow(point) - point`; `enter` and `leave` lead back to the
-      point and to the same flow; and where `defect` says how far a point is off the manifold, the
-      flow stays on it;
+    - `increment`, if offered, is `flow(point) - point`; `to_chart` and `from_chart` lead back
+      to the point and to the same flow; and where `defect` says how far a point is off the
+      manifold, the flow stays on it;
     - for algebra elements, `[a, b]` has the sign and the size that `cfjax.AbstractAlgebraElement`
       says: its tangent is `DX_a X_b - DX_b X_a`, with the tangents of a and b as functions of the
       point. This is compared for `[a, b]`, for `[b, a]` and for the bracket of `[a, b]` with the
@@ -61,7 +61,7 @@ def check_field(fields: Sequence[AbstractFrozenField], point: PyTree) -> None:
 
     entered, start = [], point
     for field in fields:
-        field, start = field.enter(start, entered)
+        field, start = field.to_chart(start, entered)
         entered.append(field)
     unit = float(np.sqrt(max(jnp.finfo(leaf.dtype).eps for leaf in jtu.tree_leaves(point))))
 
@@ -95,12 +95,12 @@ def _check_arguments(fields: Any, point: PyTree) -> None:
 
 @eqx.filter_jit
 def _of_start(given: Any, field: Any, start: Any, point: PyTree) -> _Facts:
-    here, end = field.leave(start), given.flow(point)
-    entered = field.leave(field.flow(start))
+    here, end = field.from_chart(start), given.flow(point)
+    entered = field.from_chart(field.flow(start))
     size = _size((point, end))
     facts: _Facts = [
-        ("enter and leave must lead back to the point", here, point, size),
-        ("flow must be the same before and after enter", end, entered, size),
+        ("to_chart and from_chart must lead back to the point", here, point, size),
+        ("flow must be the same before and after to_chart", end, entered, size),
     ]
     defect = given.defect(end)
     if defect is not None:
@@ -113,20 +113,20 @@ def _of_flow(given: Any, field: Any, first: Any, start: Any, point: PyTree) -> _
     def moved(t: Any, start: Any) -> Any:
         return type(field).combine((t,), (field,)).flow(start)
 
-    here = first.leave(start)
+    here = first.from_chart(start)
     # In the precision of the point, which is that of the field.
     times = jnp.asarray([0.0, 0.6, 1.0], jnp.finfo(jtu.tree_leaves(here)[0].dtype).dtype)
     # In a loop, so that the flow is compiled once.
     ends = lax.map(lambda t: moved(t, start), times)
     at_zero, before, end = (jtu.tree_map(itemgetter(k), ends) for k in range(3))
-    end = first.leave(end)
-    velocity = jax.jvp(lambda t: first.leave(moved(t, start)), (0 * times[0],), (times[2],))[1]
+    end = first.from_chart(end)
+    velocity = jax.jvp(lambda t: first.from_chart(moved(t, start)), (0 * times[0],), (times[2],))[1]
     tangent = given.tangent(here)
     increment = given.increment(point)
     facts: _Facts = [
         (
             "flow of the zero field must be the identity",
-            first.leave(at_zero),
+            first.from_chart(at_zero),
             here,
             _size(here),
         ),
@@ -138,7 +138,7 @@ def _of_flow(given: Any, field: Any, first: Any, start: Any, point: PyTree) -> _
         ),
         (
             "flow of 0.4 of a field after 0.6 of it must be that of the whole field",
-            first.leave(moved(0.4, before)),
+            first.from_chart(moved(0.4, before)),
             end,
             _size((here, end)),
         ),
@@ -152,7 +152,7 @@ def _of_flow(given: Any, field: Any, first: Any, start: Any, point: PyTree) -> _
 
 @eqx.filter_jit
 def _of_sum(fields: Sequence[Any], entered: Sequence[Any], start: Any) -> _Facts:
-    here = entered[0].leave(start)
+    here = entered[0].from_chart(start)
     weights = [0.7 * (-0.6) ** k for k in range(len(fields))]
     parts = [field.tangent(here) for field in fields]
     # Translations are added without the class's help.
@@ -171,7 +171,7 @@ def _of_sum(fields: Sequence[Any], entered: Sequence[Any], start: Any) -> _Facts
 
 @eqx.filter_jit
 def _of_bracket(entered: Sequence[Any], start: Any) -> _Facts:
-    here = entered[0].leave(start)
+    here = entered[0].from_chart(start)
     a, b, c = entered[0], entered[1], entered[-1]
     ab = a.bracket(b)
     facts: _Facts = []

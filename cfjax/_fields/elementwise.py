@@ -180,14 +180,14 @@ class Elementwise(AbstractFrozenField):
         found = self._each(off)(point)
         return None if text is None else (jnp.max(found, initial=0), text)
 
-    def enter(self, point: Any, earlier: Sequence[Any]) -> tuple[AbstractFrozenField, Any]:
+    def to_chart(self, point: Any, earlier: Sequence[Any]) -> tuple[AbstractFrozenField, Any]:
         inside = [field.field for field in earlier]
-        enter = self._each(lambda field, point, *earlier: field.enter(point, earlier))
-        field, point = enter(self.field, point, *inside)
+        each = self._each(lambda field, point, *earlier: field.to_chart(point, earlier))
+        field, point = each(self.field, point, *inside)
         return elementwise(field, self.num_axes), point
 
-    def leave(self, point: Any) -> Any:
-        return self._each(lambda field, point: field.leave(point))(self.field, point)
+    def from_chart(self, point: Any) -> Any:
+        return self._each(lambda field, point: field.from_chart(point))(self.field, point)
 
     def _each(self, fun: Callable[..., PyTree]) -> Callable[..., PyTree]:
         return each(fun, self.num_axes)

@@ -59,8 +59,8 @@ class LowRankSkew(AbstractSkew):
 
     def flow(self, point: Float[Array, "*batch n p"]) -> Float[Array, "*batch n p"]:
         """The point that `point`, taken as the one where the field is frozen, reaches."""
-        field, start = self.enter(point, ())
-        return field.leave(field.flow(start))
+        field, start = self.to_chart(point, ())
+        return field.from_chart(field.flow(start))
 
     def tangent(self, point: Float[Array, "*batch n p"]) -> Float[Array, "*batch n p"]:
         _check_point(self, "g", point)
@@ -68,11 +68,11 @@ class LowRankSkew(AbstractSkew):
             return elementwise(self, self.g.ndim - 2).tangent(point)
         return matmul(self.g, matmul(point.T, point)) - matmul(point, matmul(self.g.T, point))
 
-    def enter(self, point: Any, earlier: Sequence[Any]) -> tuple[Any, Any]:
+    def to_chart(self, point: Any, earlier: Sequence[Any]) -> tuple[Any, Any]:
         if not earlier:
             _check_point(self, "g", point)
         if self.g.ndim > 2:
-            return elementwise(self, self.g.ndim - 2).enter(point, earlier)
+            return elementwise(self, self.g.ndim - 2).to_chart(point, earlier)
         return SpanSkew.entered(self.g, point, earlier)
 
 
@@ -170,9 +170,9 @@ class BorderedSkew(AbstractSkewElement):
             return pair[0].dexpinv(pair[1], degree)
         return super().dexpinv(other, degree)
 
-    def enter(self, point: Any, earlier: Sequence[Any]) -> tuple[AbstractFrozenField, Any]:
+    def to_chart(self, point: Any, earlier: Sequence[Any]) -> tuple[AbstractFrozenField, Any]:
         if self.gamma.ndim > 2:
-            return elementwise(self, self.gamma.ndim - 2).enter(point, earlier)
+            return elementwise(self, self.gamma.ndim - 2).to_chart(point, earlier)
         if not earlier:
             _check_point(self, "gamma", point)
             point = point + matmul(point, _correction(_square(point)))
@@ -288,7 +288,7 @@ class SpanSkew(AbstractSkewElement):
         k = half - half.T
         return type(self)(k, matmul(k, x.span.gram), x.span)
 
-    def leave(self, point: Any) -> Any:
+    def from_chart(self, point: Any) -> Any:
         if isinstance(point, SpanPoint):
             p = point.z.shape[1]
             return matmul(_columns(point.blocks[: len(point.z) // p]), point.z)

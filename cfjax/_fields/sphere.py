@@ -51,8 +51,8 @@ class SphereRotation(AbstractFrozenField):
 
     def flow(self, point: Float[Array, "*batch n"]) -> Float[Array, "*batch n"]:
         """The point that `point`, taken as the one where the field is frozen, reaches."""
-        field, start = self.enter(point, ())
-        return field.leave(field.flow(start))
+        field, start = self.to_chart(point, ())
+        return field.from_chart(field.flow(start))
 
     def tangent(self, point: Float[Array, "*batch n"]) -> Float[Array, "*batch n"]:
         check_like(self, "g", 1, point)
@@ -63,15 +63,15 @@ class SphereRotation(AbstractFrozenField):
         length = jnp.sqrt(jnp.sum(point * point, axis=-1))
         return jnp.max(jnp.abs(length - 1), initial=0), "length 1"
 
-    def enter(self, point: Any, earlier: Sequence[Any]) -> tuple[AbstractFrozenField, Any]:
+    def to_chart(self, point: Any, earlier: Sequence[Any]) -> tuple[AbstractFrozenField, Any]:
         if not earlier:
             check_like(self, "g", 1, point)
         if self.g.shape[-1] == 3:
             point = point if earlier else _corrected(point)
             return Rotation(jnp.cross(point, self.g)), point
         if self.g.ndim > 1:
-            return elementwise(self, self.g.ndim - 1).enter(point, earlier)
-        y = earlier[0].leave(point) if earlier else point
+            return elementwise(self, self.g.ndim - 1).to_chart(point, earlier)
+        y = earlier[0].from_chart(point) if earlier else point
         # What is along y moves nothing, but large coordinates would round. Nothing depends on the
         # factor, so it needs no derivative.
         g = self.g - lax.stop_gradient(jnp.sum(y * self.g)) * y
@@ -93,5 +93,5 @@ class _SpanRotation(SpanSkew):
     def tangent(self, point: Float[Array, " n"]) -> Float[Array, " n"]:
         return super().tangent(point[:, None])[:, 0]
 
-    def leave(self, point: Any) -> Float[Array, " n"]:
-        return super().leave(point)[:, 0]
+    def from_chart(self, point: Any) -> Float[Array, " n"]:
+        return super().from_chart(point)[:, 0]

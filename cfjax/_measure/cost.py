@@ -12,7 +12,7 @@ import numpy as np
 from jaxtyping import Array, Float, PyTree
 
 from .._field import AbstractAlgebraElement, bracket, combine, flow, is_field, tangent
-from .._solvers.stages import written_out
+from .._solvers.base import AbstractLieSolver
 from .flops import count_flops
 
 
@@ -67,8 +67,16 @@ def _is_implicit(solver: diffrax.AbstractSolver) -> bool:
     return isinstance(solver, diffrax.AbstractImplicitSolver)
 
 
+def _unrolled(solver: diffrax.AbstractSolver) -> diffrax.AbstractSolver:
+    if isinstance(solver, diffrax.AbstractWrappedSolver):
+        return eqx.tree_at(lambda s: s.solver, solver, _unrolled(solver.solver))
+    return solver.unrolled() if isinstance(solver, AbstractLieSolver) else solver
+
+
 def flops_of_steps(problem: Problem, is_adaptive: bool = False) -> tuple[float, float]:
     """Of the first step with what comes before it, and of any other."""
+    # A loop whose passes differ cannot be counted.
+    problem = problem._replace(solver=_unrolled(problem.solver))
     arrays, static = eqx.partition(problem, eqx.is_array)
 
     def init(arrays):
@@ -94,10 +102,8 @@ def flops_of_steps(problem: Problem, is_adaptive: bool = False) -> tuple[float, 
         return y, y_error if is_adaptive else None, eqx.filter(state, eqx.is_array)
 
     try:
-        # A loop whose passes differ cannot be counted.
-        with written_out():
-            later = float(count_flops(step, arrays, problem.t0 + problem.dt0, state))
-            return count_flops(start, arrays) + later, later
+        later = float(count_flops(step, arrays, problem.t0 + problem.dt0, state))
+        return count_flops(start, arrays) + later, later
     except NotImplementedError:
         return np.nan, np.nan
 

@@ -90,7 +90,7 @@ def rank_of_step(method: str, problem: str) -> int | None:
         return combine((0.5,), (PROBLEMS[problem](0.0, y, args),))
 
     if isinstance(solver, AbstractMuntheKaas):
-        v = jax.eval_shape(lambda y: solver.logarithm(field, y)[0], y0)
+        v = jax.eval_shape(lambda y: solver.logarithm(field, y), y0)
         return len(v.k)
     if isinstance(solver, CF4):
         # The span of all columns, or the form of the field.

@@ -1,6 +1,7 @@
 """What all Lie group methods are to diffrax: one-step maps made of flows."""
 
 import abc
+import copy
 from collections.abc import Callable
 from typing import Any, ClassVar
 
@@ -12,13 +13,15 @@ import jax.tree_util as jtu
 import numpy as np
 from jax import lax
 from jax.core import Tracer
-from jaxtyping import Array, Bool, Inexact, PyTree, Real
+from jaxtyping import Array, Bool, PyTree, Real
 
-from .._field import Incremented, flow, is_field, is_incremented, value
+from .._field import is_field
 from .._numerics.checks import needing
 from .._numerics.squaring import max_over_batch
 from .._term import product, velocity
 from .._xla import by_components, is_rewritten, once_in_rows, once_together
+from .chart import Chart
+from .compensation import added, at, no_compensation, with_sums
 from .dense import Interpolation, Path
 
 
@@ -41,10 +44,7 @@ class AbstractLieSolver(diffrax.AbstractSolver):
     It takes the geometry from what the term's vector field returns: `cfjax.LieTerm` for frozen
     fields, any other diffrax term for a linear space.
 
-    Rounding the state after every flow makes lengths, orthogonality and the like drift as a random
-    walk. Where the field offers increments, these are summed first, and over the steps with
-    compensation: the state of the solver is what the last sum lost. (Hairer, Lubich & Wanner,
-    Geometric Numerical Integration, Section VIII.5.) It costs small vectors a tenth of the time.
+    Where the field offers increments, the sum over the steps is compensated (`compensation.py`).
     """
 
     term_structure: ClassVar = diffrax.AbstractTerm
@@ -62,13 +62,14 @@ class AbstractLieSolver(diffrax.AbstractSolver):
         return False
 
     @abc.abstractmethod
-    def move(self, field: Callable[[Any, PyTree], PyTree], y0: PyTree) -> "Move":
-        """A step from `y0`; `field(c, y)` is `h f(t + c h, y)`, a frozen field."""
+    def move(self, chart: Chart) -> "Move":
+        """A step from `chart.start`, with the fields that `chart.frozen` evaluates."""
 
     def extended(self, path: Path, field: Callable[[Any, PyTree], PyTree]) -> Path:
-        """The way of a step with what only output within it takes; `field` as in `move`.
+        """The way of a step with what only output within it takes.
 
-        Apart from `move`, which is compiled whether anybody asks for that or not.
+        `field(c, y)` is `h f(t + c h, y)`. Apart from `move`, which is compiled whether anybody
+        asks for that or not.
         """
         return path
 
@@ -79,23 +80,29 @@ class AbstractLieSolver(diffrax.AbstractSolver):
         acts on.
         """
 
-        def first_flow(y0):
+        def at_start(y0):
             field = product(terms, terms.vf(t0, y0, args), terms.contr(t0, t1))
-            return field, flow(field, jtu.tree_map(_at_rest, y0))
+            return field, no_compensation(field, y0)
 
-        field, end = eqx.filter_eval_shape(first_flow, y0)
-
-        def no_loss(end, y):
-            # Where the field offers no increment, its flow ends in a plain point.
-            return _Sum(jnp.zeros_like(y)) if is_incremented(end) else None
-
-        lost = jtu.tree_map(no_loss, end, y0, is_leaf=is_incremented)
+        field, compensation = eqx.filter_eval_shape(at_start, y0)
+        compensation = jtu.tree_map(lambda c: jnp.zeros(c.shape, c.dtype), compensation)
         first = terms.vf(t0, y0, args) if self.first_same_as_last else None
-        return State.checked(lost, first, _admitted(jnp.asarray(t0), t1, field, y0))
+        return State.checked(compensation, first, _admitted(jnp.asarray(t0), t1, field, y0))
 
     def without_estimate(self) -> "AbstractLieSolver":
         """The same method for steps that nobody controls: it keeps nothing for an estimate."""
-        return self
+        return self._with(estimate=None) if hasattr(self, "estimate") else self
+
+    def unrolled(self) -> "AbstractLieSolver":
+        """The same method with its stages one by one in the program, where each can be counted."""
+        return self._with(unroll=True) if hasattr(self, "unroll") else self
+
+    def _with(self, **fields: Any) -> "AbstractLieSolver":
+        changed = copy.copy(self)
+        for name, value in fields.items():
+            # As dataclasses do. Not every solver is made from its fields.
+            object.__setattr__(changed, name, value)
+        return changed
 
     def step(self, terms, t0, t1, y0, args, solver_state, made_jump):
         # Not in a loop that is taken apart, which JAX does not know of, nor where times are known.
@@ -104,7 +111,7 @@ class AbstractLieSolver(diffrax.AbstractSolver):
         return step(self, terms, t0, t1, y0, args, solver_state, made_jump)
 
     def _step(self, terms, t0, t1, y0, args, solver_state, made_jump):
-        lost, first, zero = solver_state.parts()
+        compensation, first, zero = solver_state.parts()
         if zero is not None:
             t0 = t0 + zero
         if first is not None and made_jump is not False:
@@ -117,7 +124,7 @@ class AbstractLieSolver(diffrax.AbstractSolver):
             else:
                 c = jnp.asarray(c, jnp.result_type(t0))
                 t = jnp.where(c == 1, t1, t0 + c * (t1 - t0))
-            return once_in_rows(terms.vf(t, value(y), args))
+            return once_in_rows(terms.vf(t, y, args))
 
         def move(y0):
             control = terms.contr(t0, t1)
@@ -130,36 +137,25 @@ class AbstractLieSolver(diffrax.AbstractSolver):
                     values.append(first)
                 return product(terms, values[-1], control)
 
-            start = jtu.tree_map(
-                lambda lost, y: y if lost is None else _at_rest(y), lost, y0, is_leaf=_is_leaf
-            )
-            made = self.move(field, start)
+            made = self.move(Chart(field, y0, compensation))
             end, error = made.end, made.error
             if not made.is_shared:
-                end, error = _shared(lost, end, error, is_followed=first is not None)
+                end, error = _shared(compensation, end, error, is_followed=first is not None)
             if first is None:
                 last = None
             elif is_rewritten() and self.is_of_state:
                 # From the end alone: it is one evaluation more, where XLA would else compute the
                 # step for each of its entries.
-                last = evaluate(1.0, end)
+                last = evaluate(1.0, at(y0, end, compensation))
             else:
                 last = values[-1]
             return (end, last), (error, made.path)
 
         (end, last), (error, path) = by_components(move, y0)
         path = self.extended(path, lambda c, y: product(terms, evaluate(c, y), terms.contr(t0, t1)))
-        sums = jtu.tree_map(
-            lambda lost, p: (p, None) if lost is None else lost.up_to(p),
-            lost,
-            end,
-            is_leaf=_is_leaf,
-        )
-        y1, new_lost = (
-            jtu.tree_map(lambda _, pair: pair[k], lost, sums, is_leaf=_is_leaf)  # noqa: B023
-            for k in range(2)
-        )
-        return y1, error, dict(path=path), State(new_lost, last, solver_state.zero), result_of(y1)
+        y1, compensation = added(y0, end, compensation)
+        state = State(compensation, last, solver_state.zero)
+        return y1, error, dict(path=path), state, result_of(y1)
 
     def func(self, terms, t0, y0, args) -> Any:
         """The velocity at `y0`, shaped like it. A control that is not time has diffrax's own."""
@@ -176,6 +172,13 @@ class Move(eqx.Module):
     path: Path
     error: PyTree = None
     is_shared: bool = eqx.field(static=True, default=False)
+
+
+def check_choice(name: str, value: Any, *choices: Any) -> None:
+    """Raises `ValueError` unless the value is one of the choices."""
+    if not any(value is x or (isinstance(x, str) and value == x) for x in choices):
+        texts = list(map(repr, choices))
+        raise ValueError(f"{name} must be {', '.join(texts[:-1])} or {texts[-1]}, got {value!r}.")
 
 
 def is_finite(y: PyTree) -> Bool[Array, ""]:
@@ -199,36 +202,36 @@ def _select(made_jump: Any, anew: Callable[[], PyTree], kept: PyTree) -> PyTree:
 class State(eqx.Module):
     """What a solver keeps from step to step.
 
-    - `lost`: what compensated sums have lost: a `_Sum` for the parts of the state that are one.
+    - `compensation`: what rounding has cut off the parts of the state that are compensated sums.
     - `first`: the field at the start of the next step, where the last evaluation was there.
     - `zero`: what every step adds to its time, if there is nothing else to carry the checks of the
       start. diffrax drops what no step uses.
     """
 
-    lost: PyTree
+    compensation: PyTree
     first: PyTree
     zero: Real[Array, ""] | None
 
     @classmethod
-    def checked(cls, lost: PyTree, first: PyTree, zero: Real[Array, ""]) -> "State":
+    def checked(cls, compensation: PyTree, first: PyTree, zero: Real[Array, ""]) -> "State":
         """With `zero` within one of the other arrays: a loop of small steps feels every one."""
-        arrays, structure = jtu.tree_flatten((lost, first))
+        arrays, structure = jtu.tree_flatten((compensation, first))
         if not arrays:
-            return cls(lost, first, zero)
+            return cls(compensation, first, zero)
         arrays[0] = needing(zero, arrays[0])
-        lost, first = jtu.tree_unflatten(structure, arrays)
-        return cls(lost, first, None)
+        compensation, first = jtu.tree_unflatten(structure, arrays)
+        return cls(compensation, first, None)
 
     def parts(self) -> tuple[PyTree, PyTree, Real[Array, ""] | None]:
         zero = None if self.zero is None else lax.stop_gradient(self.zero)
-        return self.lost, self.first, zero
+        return self.compensation, self.first, zero
 
     def started(self, y0: PyTree) -> tuple[PyTree, "State"]:
         """The start, with the checks in it, and a state for steps that do not know of them."""
         zero = self.zero
         if zero is not None:
             y0 = needing(zero, y0)
-        return y0, State(self.lost, self.first, None)
+        return y0, State(self.compensation, self.first, None)
 
 
 # By how much a start is off, in the message. The error itself may be in a compiled program.
@@ -262,44 +265,19 @@ def _admitted(t0: Array, t1: Any, field: PyTree, y0: PyTree) -> Real[Array, ""]:
     return zero
 
 
-class _Sum(eqx.Module):
-    """Says that a part of the state is a start and increments, and keeps what its sum lost."""
-
-    lost: Array
-
-    def up_to(self, end: Incremented) -> tuple[Array, "_Sum"]:
-        """The end with what the step before lost, and what this sum loses (Dekker's FastTwoSum)."""
-        a, b = end.start, end.increment + lax.stop_gradient(self.lost)
-        total = a + b
-        return total, _Sum(lax.stop_gradient(b - (total - a)))
-
-
-def _shared(lost: PyTree, end: PyTree, error: PyTree, is_followed: bool) -> tuple[PyTree, PyTree]:
+def _shared(
+    compensation: PyTree, end: PyTree, error: PyTree, is_followed: bool
+) -> tuple[PyTree, PyTree]:
     """The end of a step and its error, which XLA would else compute for each use of an entry.
 
     A compensated sum uses each increment several times, and so does what follows from the end.
     """
-    leaves, structure = jtu.tree_flatten(lost, is_leaf=_is_leaf)
-    ends = structure.flatten_up_to(end)
     is_used = is_followed or error is not None
-    moving = [
-        p.increment if isinstance(x, _Sum) else (p if is_used else None)
-        for x, p in zip(leaves, ends, strict=True)
-    ]
+    moving = with_sums(lambda c, z: z if is_used or c is not None else None, compensation, end)
     moving, error = once_together((moving, error), alone=is_used)
-    ends = [
-        Incremented(p.start, new) if isinstance(x, _Sum) else (p if new is None else new)
-        for x, p, new in zip(leaves, ends, moving, strict=True)
-    ]
-    return structure.unflatten(ends), error
-
-
-def _is_leaf(x: Any) -> bool:
-    return x is None or isinstance(x, _Sum)
-
-
-def _at_rest(y: Inexact[Array, "..."]) -> Incremented:
-    return Incremented(y, jnp.zeros_like(y))
+    return with_sums(
+        lambda c, z, new: new if is_used or c is not None else z, compensation, end, moving
+    ), error
 
 
 # diffrax traces a step three times, which takes longer than all else that it traces. Inline, the

@@ -1,8 +1,6 @@
 """Commutator-free methods: one step for every tableau."""
 
-import contextlib
-import dataclasses
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from typing import ClassVar, Literal
 
 import diffrax
@@ -12,24 +10,17 @@ import jax.tree_util as jtu
 from jax import lax
 from jaxtyping import Array, Inexact, PyTree
 
-from .._field import (
-    combine,
-    enter,
-    flow,
-    is_incremented,
-    leave,
-    tangent,
-    value,
-)
+from .._field import combine, tangent
 from .._methods import pairs as _pairs
 from .._methods import tableau as _tableau
 from .._methods.continuous_extension import continuous_extension
 from .._methods.proved import order_of
 from .._methods.tableau import Product, Row, Tableau
 from .._xla import cut, once_together, smooth
-from .base import AbstractLieSolver, Move
+from .base import AbstractLieSolver, Move, check_choice
+from .chart import Chart
 from .dense import Path
-from .stages import FieldVaries, Flow, can_loop, has_room, run
+from .stages import Flow, can_roll_stages, rolled
 
 
 class AbstractCommutatorFree(AbstractLieSolver):
@@ -46,7 +37,11 @@ class AbstractCommutatorFree(AbstractLieSolver):
 
     A class whose tableau has an embedded method is a `diffrax.AbstractAdaptiveSolver`.
 
-    **Raises** `ValueError` for another `estimate`.
+    `unroll` says how the stages of a step are compiled, as `scan_kind` does in diffrax: one by one
+    (True), or as one loop where the fields allow it (False), which is a shorter program. None, the
+    default, takes what measures best.
+
+    **Raises** `ValueError` for another `estimate` or `unroll`.
     """
 
     tableau: eqx.AbstractVar[Tableau]
@@ -54,12 +49,12 @@ class AbstractCommutatorFree(AbstractLieSolver):
         static=True, default="group", kw_only=True
     )
 
-    def __check_init__(self):
-        if self.estimate not in ("group", "algebra", None):
-            raise ValueError(f"estimate must be 'group', 'algebra' or None, got {self.estimate!r}.")
+    # Whether the stages stand one by one in the program instead of in a loop. None: what is faster.
+    unroll: bool | None = eqx.field(static=True, default=None, kw_only=True)
 
-    def without_estimate(self) -> "AbstractCommutatorFree":
-        return dataclasses.replace(self, estimate=None)
+    def __check_init__(self):
+        check_choice("estimate", self.estimate, "group", "algebra", None)
+        check_choice("unroll", self.unroll, True, False, None)
 
     @property
     def first_same_as_last(self) -> bool:
@@ -75,76 +70,73 @@ class AbstractCommutatorFree(AbstractLieSolver):
         embedded = self.tableau.embedded_method
         return None if embedded is None else order_of(embedded) + 1
 
-    def element(self, rows: Product, fields: Sequence[PyTree], kept: dict[int, PyTree]) -> PyTree:
+    def direction(self, rows: Product, chart: Chart, kept: dict[int, PyTree]) -> PyTree:
         """The field of the last of some rows; `kept` is for what is used again in the step."""
-        return _combined(rows[-1], fields)
+        return _combined(rows[-1], chart.fields)
 
-    def move(self, field, y0):
+    def move(self, chart):
         tableau = self.tableau
-        fields: list[PyTree] = []
-        evaluated: list[PyTree] = []
-        # Rows that begin alike share their flows (the paper's "reusing flow calculations").
-        points: dict[Product, PyTree] = {(): y0}
-        kept: dict[int, PyTree] = {}
-
-        def point(rows: Product) -> PyTree:
-            if rows not in points:
-                points[rows] = flow(self.element(rows, fields, kept), point(rows[:-1]))
-            return points[rows]
-
-        def evaluate(c: float, rows: Product) -> None:
-            here = point(rows)
-            evaluated.append(field(c, leave(fields[0], here) if fields else here))
-            entered, points[rows] = enter(evaluated[-1], here, fields)
-            fields.append(entered)
-
-        stages = [trimmed(rows) for rows in (*tableau.alpha, tableau.beta)]
-        times = list(map(float, tableau.c))
-        evaluate(times[0], stages[0])
-        flows = _flows(stages, times)
-        is_looped = False
-        is_usual = type(self).element is AbstractCommutatorFree.element
+        stages = [trimmed(rows) for rows in tableau.alpha]
+        beta, times = trimmed(tableau.beta), list(map(float, tableau.c))
+        reach = _Reach(chart, self.direction)
+        if not chart.fields:
+            chart.frozen(times[0], chart.start)
+        flows = _flows([*stages, beta], times)
+        is_usual = type(self).direction is AbstractCommutatorFree.direction
         # Two stages at one point would be one flow with two times.
-        is_distinct = len({*stages[:-1]}) == len(times)
-        here = points[()]
-        if is_usual and is_distinct and (can_loop(fields[0], y0) or has_room(fields[0], here)):
-
-            def entered(c, here: PyTree, earlier: PyTree) -> PyTree:
-                # What has entered as a field of another class does so at every stage.
-                return enter(field(c, leave(earlier, here)), here, [earlier])[0]
-
-            with contextlib.suppress(FieldVaries):
-                made, fields[:] = run(flows, len(times), fields[0], here, entered)
-                points |= zip(_products(stages), made, strict=True)
-                is_looped = True
-        if not is_looped:
-            for c, rows in zip(times[1:], stages[1:-1], strict=True):
-                evaluate(c, rows)
+        is_distinct = len({*stages}) == len(times)
+        if is_usual and is_distinct and can_roll_stages(self.unroll, chart, len(times)):
+            ends = rolled(chart, flows, len(times))
+            reach.points |= zip(_products([*stages, beta])[1:], ends, strict=True)
+        else:
+            for c, rows in zip(times[1:], stages[1:], strict=True):
+                chart.frozen(c, reach(rows))
+        end = reach(beta)
         if self.first_same_as_last:
             # The end, the last field and the error are made of it.
-            points[stages[-1]] = cut(point(stages[-1]))
-        end = leave(fields[0], point(stages[-1]))
+            end = reach.points[beta] = cut(end)
         # All that follows is for error control and output within the step. It is dead code, left
         # out by the compiler, where nobody asks for them.
         embedded = None if self.estimate is None else tableau.embedded
         within = continuous_extension(tableau)
         if any(map(tableau.uses_last, (embedded or (), *within))):
-            evaluate(1.0, stages[-1])
-        error, is_shared = None, False
-        if embedded is not None:
-            if self.estimate == "algebra":
-                difference = _combined(_difference(embedded, tableau.beta), fields)
-                error = tangent(difference, value(end))
-            else:
-                error = minus(end, leave(fields[0], point(trimmed(embedded))))
-            if tableau.uses_last(embedded):
-                start, last_stage = (leave(fields[0], point(x)) for x in ((), stages[-2]))
-                apart = minus(end, last_stage)
-                # A ratio is where a function of XLA's ends, and all of it is needed before.
-                is_shared = True
-                end, error, apart = once_together((end, error, apart), alone=True)
-                error = jtu.tree_map(_seen, error, apart, minus(end, start))
-        return Move(end, Path.of(within, value(points[()]), fields), error, is_shared)
+            chart.frozen(1.0, end)
+        path = Path.of(within, chart.without_sums(chart.start), chart.fields)
+        end_from_start = chart.from_start(end)
+        if embedded is None:
+            return Move(end_from_start, path)
+        if self.estimate == "algebra":
+            difference = _combined(_difference(embedded, tableau.beta), chart.fields)
+            error = tangent(difference, chart.state(end))
+        else:
+            error = chart.difference(end, reach(trimmed(embedded)))
+        if not tableau.uses_last(embedded):
+            return Move(end_from_start, path, error)
+        apart = chart.difference(end, reach(stages[-1]))
+        # A ratio is where a function of XLA's ends, and all of it is needed before.
+        end_from_start, error, apart = once_together((end_from_start, error, apart), alone=True)
+        way = jtu.tree_map(jnp.subtract, end_from_start, chart.from_start(chart.start))
+        return Move(end_from_start, path, jtu.tree_map(_seen, error, apart, way), is_shared=True)
+
+
+class _Reach:
+    """Where products of flows lead. Rows that begin alike share their flows.
+
+    (The paper's "reusing flow calculations".)
+    """
+
+    def __init__(self, chart: Chart, direction: Callable[..., PyTree]):
+        self.chart, self.direction = chart, direction
+        self.points: dict[Product, PyTree] = {}
+        self.kept: dict[int, PyTree] = {}
+
+    def __call__(self, rows: Product) -> PyTree:
+        if not rows:
+            return self.chart.start
+        if rows not in self.points:
+            direction = self.direction(rows, self.chart, self.kept)
+            self.points[rows] = self.chart.flow(direction, self(rows[:-1]))
+        return self.points[rows]
 
 
 def _products(stages: Sequence[Product]) -> list[Product]:
@@ -179,16 +171,6 @@ def _difference(a: Product, b: Product) -> Row:
     """The sum of all rows of a less that of b, which may have fewer entries."""
     rest = [[-entry for entry in row] + [0] * (len(a[0]) - len(row)) for row in b]
     return tuple(sum(column) for column in zip(*a, *rest, strict=True))
-
-
-def minus(a: PyTree, b: PyTree) -> PyTree:
-    """The difference of two points of a step that may be increments from the same start."""
-    return jtu.tree_map(
-        lambda p, q: p.increment - q.increment if is_incremented(p) else p - q,
-        a,
-        b,
-        is_leaf=is_incremented,
-    )
 
 
 # It chooses by a comparison, of which no more than rounding decides either.

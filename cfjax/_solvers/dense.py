@@ -12,10 +12,11 @@ import jax.tree_util as jtu
 import numpy as np
 from jaxtyping import Array, Float, PyTree, Real
 
-from .._field import combine, flow, leave
+from .._field import combine, from_chart
 from .._methods.tableau import ContinuousExtension
 from .._xla import by_components
-from .stages import along, can_loop
+from .chart import carried
+from .stages import can_roll, rolled_flows
 
 
 class Interpolation(diffrax.AbstractLocalInterpolation):
@@ -63,7 +64,7 @@ class Path(eqx.Module):
         continuous_extension: ContinuousExtension,
         start: PyTree,
         fields: list[PyTree],
-        move: Callable[[PyTree, PyTree], PyTree] = flow,
+        move: Callable[[PyTree, PyTree], PyTree] = carried,
     ) -> "Path":
         leaves, structure = jtu.tree_flatten((start, fields))
         arrays = {id(leaf): leaf for leaf in leaves}
@@ -82,9 +83,9 @@ class Path(eqx.Module):
         point, fields = self.parts(self.arrays)
         # Of small states too: an event's root finder differentiates it, and a loop of flows on
         # short vectors is as fast in batches.
-        if self.move is flow and len(weights) > 1 and can_loop(fields[0], point):
+        if self.move is carried and len(weights) > 1 and can_roll(None, fields[0], point):
             # There may be no field at the end of the step, where it has no weight.
-            return along(weights[:, : len(fields)], fields, point)
+            return rolled_flows(weights[:, : len(fields)], fields, point, carried)
 
         def end(arrays: tuple[Array | np.ndarray, ...]) -> PyTree:
             point, fields = self.parts(arrays)
@@ -92,7 +93,7 @@ class Path(eqx.Module):
                 used = np.flatnonzero(powers[:, j].any(axis=0))
                 row = [(weights[j, k], fields[k]) for k in used]
                 point = self.move(combine(*zip(*row, strict=True)), point)
-            return leave(fields[0], point)
+            return from_chart(fields[0], point)
 
         return by_components(end, self.arrays)
 

@@ -9,16 +9,16 @@ import diffrax
 import jax.numpy as jnp
 import jax.tree_util as jtu
 from jax import lax
+from jaxtyping import PyTree
 
-from .._field import combine, enter, flow
-from .._field import value as value_of
+from .._field import combine
 from .._methods.continuous_extension import continuous_extension
 from .._methods.proved import proved
 from .._methods.tableau import Product, Row, Tableau
 from .base import Move
-from .commutator_free import AbstractCommutatorFree, minus, trimmed
+from .commutator_free import AbstractCommutatorFree, trimmed
 from .dense import Path
-from .stages import is_plain
+from .stages import is_uniform
 
 # Unrolled stages cost compile time quadratically. And XLA keeps the fields of several of them, to
 # add them up at once: as many as fit in a cache may be.
@@ -37,50 +37,50 @@ class AbstractLowStorage(AbstractCommutatorFree):
     a: ClassVar[Row]
     b: ClassVar[Row]
 
-    def element(self, rows, fields, kept):
+    def direction(self, rows, chart, kept):
         i = len(rows) - 1
         if trimmed(self.tableau.beta)[: i + 1] != rows:
             # A flow of the embedded method's own.
-            return super().element(rows, fields, kept)
+            return super().direction(rows, chart, kept)
         if i not in kept:
             both = (float(self.a[i]), 1.0)
-            kept[i] = combine(both, (kept[i - 1], fields[i])) if i else fields[0]
+            kept[i] = combine(both, (kept[i - 1], chart.fields[i])) if i else chart.fields[0]
         return combine((float(self.b[i]),), (kept[i],))
 
-    def move(self, field, y0):
+    def move(self, chart):
         embedded = None if self.estimate is None else self.tableau.embedded
         penultimate = embedded is not None and trimmed(embedded) == trimmed(self.tableau.beta[:-1])
         other = embedded is not None and not (penultimate and self.estimate == "group")
-        size = sum(jnp.size(leaf) for leaf in jtu.tree_leaves(value_of(y0)))
-        if other or (len(self.b) <= _MAX_UNROLLED and size <= _LARGE):
-            return super().move(field, y0)
-        value = field(0.0, y0)
-        first, point = enter(value, y0, ())
-        is_same = [
-            jtu.tree_structure(x) == jtu.tree_structure(y) for x, y in ((point, y0), (first, value))
-        ]
-        # Else the arrays of a step's own coordinates grow from stage to stage.
-        if not is_same[0] or not (is_same[1] or is_plain(first)):
-            # The first stage is known.
-            known = [value]
-            return super().move(lambda c, y: known.pop() if known else field(c, y), y0)
+        if other or self._is_unrolled(chart.start):
+            return super().move(chart)
+        first = chart.frozen(0.0, chart.start)
+        if not is_uniform(chart):
+            return super().move(chart)
 
         def stage(carry, coefficients):
             a, b, c = coefficients
             total, point, _ = carry
-            here, _ = enter(field(c, point), point, (total,))
+            here = chart.frozen_after([total], c, point)
             total = combine((a, 1.0), (total, here))
-            return (total, flow(combine((b,), (total,)), point), point), here
+            return (total, chart.flow(combine((b,), (total,)), point), point), here
 
-        after = flow(combine((float(self.b[0]),), (first,)), point)
+        start = chart.start
+        after = chart.flow(combine((float(self.b[0]),), (first,)), start)
         coefficients = tuple(
             jnp.asarray([float(x) for x in row[1:]]) for row in (self.a, self.b, self.tableau.c)
         )
-        (_, end, before), later = lax.scan(stage, (first, after, point), coefficients)
+        (_, end, before), later = lax.scan(stage, (first, after, start), coefficients)
         # Not kept where nobody asks for output within the step.
-        fields = [jtu.tree_map(itemgetter(i), later) for i in range(len(self.b) - 1)]
-        path = Path.of(continuous_extension(self.tableau), value_of(point), [first, *fields])
-        return Move(end, path, minus(end, before) if penultimate else None)
+        fields = [first, *(jtu.tree_map(itemgetter(i), later) for i in range(len(self.b) - 1))]
+        path = Path.of(continuous_extension(self.tableau), chart.without_sums(start), fields)
+        error = chart.difference(end, before) if penultimate else None
+        return Move(chart.from_start(end), path, error)
+
+    def _is_unrolled(self, point: PyTree) -> bool:
+        if self.unroll is not None:
+            return self.unroll
+        size = sum(jnp.size(leaf) for leaf in jtu.tree_leaves(point))
+        return len(self.b) <= _MAX_UNROLLED and size <= _LARGE
 
 
 def _tableau(a: Row, b: Row, embedded: Callable[[Product], Any] | None = None) -> Tableau:

@@ -1,7 +1,6 @@
 """Commutator-free Magnus methods: high order for fields that depend on time alone."""
 
-import dataclasses
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 from typing import Any, ClassVar, Literal
 
 import diffrax
@@ -11,15 +10,15 @@ import jax.numpy as jnp
 import jax.tree_util as jtu
 from jaxtyping import PyTree
 
-from .._field import combine, enter, flow, is_field, leave, value
+from .._field import combine, is_field, to_chart
 from .._methods import magnus as _magnus
 from .._methods.magnus import MagnusTableau
 from .._methods.tableau import Product
 from .._term import product
-from .base import AbstractLieSolver, Move, State
-from .commutator_free import minus
+from .base import AbstractLieSolver, Move, State, check_choice
+from .chart import Chart
 from .dense import Path
-from .stages import along, can_loop
+from .stages import can_roll, rolled_flows
 
 
 class AbstractMagnus(AbstractLieSolver):
@@ -31,23 +30,25 @@ class AbstractMagnus(AbstractLieSolver):
     estimate is `y1 - embedded`. Under a controller of constant steps nobody needs it:
     `estimate=None` switches it off. (`cfjax.integrate` does.)
 
+    `unroll` says whether the flows stand one by one in the program (True) or in a loop (False);
+    None, the default, takes what measures best.
+
     Where the nodes have both ends of the step, its last evaluation is the first one of the next.
 
     **Raises** `TypeError` when the program is traced if the field depends on the state, be it that
     it is frozen there as `cfjax.LowRankSkew` is, or gives the state to a function of the host that
-    `jax.vmap` does not take; `ValueError` for another `estimate`.
+    `jax.vmap` does not take; `ValueError` for another `estimate` or `unroll`.
     """
 
     is_of_state: ClassVar[bool] = False
     tableau: eqx.AbstractVar[MagnusTableau]
     estimate: Literal["group"] | None = eqx.field(static=True, default="group", kw_only=True)
+    # Whether the stages stand one by one in the program instead of in a loop. None: what is faster.
+    unroll: bool | None = eqx.field(static=True, default=None, kw_only=True)
 
     def __check_init__(self):
-        if self.estimate not in ("group", None):
-            raise ValueError(f"estimate must be 'group' or None, got {self.estimate!r}.")
-
-    def without_estimate(self) -> "AbstractMagnus":
-        return dataclasses.replace(self, estimate=None)
+        check_choice("estimate", self.estimate, "group", None)
+        check_choice("unroll", self.unroll, True, False, None)
 
     @property
     def first_same_as_last(self) -> bool:
@@ -81,41 +82,35 @@ class AbstractMagnus(AbstractLieSolver):
             raise TypeError(_depends_on_state(name, *found[0]))
         return super().init(terms, t0, t1, y0, args)
 
-    def move(self, field, y0):
+    def move(self, chart):
         tableau = self.tableau
-        fields: list[PyTree] = []
-        start = y0
         for c in tableau.nodes:
-            # Any state will do.
-            entered, here = enter(field(c, y0), start, fields)
-            start = start if fields else here
-            fields.append(entered)
-
+            # Any point will do.
+            chart.frozen(c, chart.start)
         embedded = None if self.estimate is None else tableau.embedded
         num_shared = 0 if embedded is None else _num_shared(tableau.rows, embedded)
-        middle = _moved(tableau.rows[:num_shared], fields, start)
-        end = leave(fields[0], _moved(tableau.rows[num_shared:], fields, middle))
+        middle = self._flows(tableau.rows[:num_shared], chart, chart.start)
+        end = self._flows(tableau.rows[num_shared:], chart, middle)
         error = None
         if embedded is not None:
-            other = _moved(embedded[num_shared:], fields, middle)
-            error = minus(end, leave(fields[0], other))
-        path = Path.of(tableau.continuous_extension, value(start), fields)
-        return Move(end, path, error)
+            error = chart.difference(end, self._flows(embedded[num_shared:], chart, middle))
+        start = chart.without_sums(chart.start)
+        path = Path.of(tableau.continuous_extension, start, chart.fields)
+        return Move(chart.from_start(end), path, error)
+
+    def _flows(self, rows: Product, chart: Chart, point: PyTree) -> PyTree:
+        weights = [list(map(float, row)) for row in rows]
+        if len(weights) > 1 and can_roll(self.unroll, chart.fields[0], point):
+            return rolled_flows(jnp.asarray(weights), chart.fields, point, chart.flow)
+        for row in weights:
+            used = [(a, f) for a, f in zip(row, chart.fields, strict=True) if a != 0]
+            point = chart.flow(combine(*zip(*used, strict=True)), point)
+        return point
 
 
 def _num_shared(a: Product, b: Product) -> int:
     """With how many rows both begin."""
     return next(n for n, (x, y) in enumerate(zip(a, b, strict=False)) if x != y)
-
-
-def _moved(rows: Product, fields: Sequence[PyTree], point: PyTree) -> PyTree:
-    floats = [list(map(float, row)) for row in rows]
-    if len(floats) > 1 and can_loop(fields[0], point):
-        return along(jnp.asarray(floats), fields, point)
-    for row in floats:
-        used = [(a, f) for a, f in zip(row, fields, strict=True) if a != 0]
-        point = flow(combine(*zip(*used, strict=True)), point)
-    return point
 
 
 def _varying(field: Callable[[PyTree], PyTree], y0: PyTree) -> list[tuple[str, Any]]:
@@ -130,8 +125,8 @@ def _varying(field: Callable[[PyTree], PyTree], y0: PyTree) -> list[tuple[str, A
     def look(y: PyTree) -> PyTree:
         frozen = field(y)
         parts, treedef = jtu.tree_flatten_with_path(frozen, is_leaf=is_field)
-        entered = treedef.flatten_up_to(enter(frozen, y, ())[0])
-        for (path, part), coordinates in zip(parts, entered, strict=True):
+        charted = treedef.flatten_up_to(to_chart(frozen, y, ())[0])
+        for (path, part), coordinates in zip(parts, charted, strict=True):
 
             def rule(size, is_mapped, leaves, path=path, part=part):
                 found.append((jtu.keystr(path), part))

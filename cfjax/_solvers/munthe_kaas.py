@@ -1,8 +1,6 @@
 """Munthe-Kaas methods: one flow for each stage, paid for with commutators."""
 
 import abc
-import contextlib
-import copy
 import functools
 from collections.abc import Callable, Sequence
 from fractions import Fraction
@@ -11,29 +9,31 @@ from typing import Any, ClassVar, Literal
 import diffrax
 import equinox as eqx
 import jax.tree_util as jtu
-from jaxtyping import Array, PyTree, Real
+from jaxtyping import PyTree
 
 from .._field import (
     AbstractAlgebraElement,
     bracket,
     combine,
     dexpinv,
-    enter,
-    flow,
     is_field,
-    leave,
     tangent,
     without_bracket,
 )
-from .._field import value as value_of
 from .._methods.continuous_extension import RungeKuttaExtension, runge_kutta_extension
 from .._methods.order_conditions import runge_kutta_order
 from .._methods.tableau import ContinuousExtension, Row
 from .._xla import are_long, is_rewritten, once_together
-from .base import AbstractLieSolver, Move
-from .commutator_free import minus
+from .base import AbstractLieSolver, Move, check_choice
+from .chart import Chart
 from .dense import Path
-from .stages import FieldVaries, can_loop, elements, elements_in_room, has_room
+from .stages import (
+    can_roll,
+    can_roll_in_room,
+    is_uniform,
+    rolled_elements,
+    rolled_elements_in_room,
+)
 
 # Fewer stages are mostly short enough to be rewritten for XLA; to look costs a trace of one more.
 _MANY = 8
@@ -49,7 +49,11 @@ class AbstractMuntheKaas(AbstractLieSolver):
     end of the step of the difference of the two, which costs no flow, or with `estimate="group"`
     that of the end points, for 1 flow more. `estimate=None` switches it off.
 
-    **Raises** `ValueError` for another `estimate`.
+    `unroll` says how the stages of a step are compiled, as `scan_kind` does in diffrax: one by one
+    (True), or as one loop where the fields allow it (False), which is a shorter program. None, the
+    default, takes what measures best.
+
+    **Raises** `ValueError` for another `estimate` or `unroll`.
     """
 
     b: eqx.AbstractVar[Row]
@@ -61,91 +65,59 @@ class AbstractMuntheKaas(AbstractLieSolver):
         static=True, default="algebra", kw_only=True
     )
 
-    def __check_init__(self):
-        if self.estimate not in ("group", "algebra", None):
-            raise ValueError(f"estimate must be 'group', 'algebra' or None, got {self.estimate!r}.")
+    # Whether the stages stand one by one in the program instead of in a loop. None: what is faster.
+    unroll: bool | None = eqx.field(static=True, default=None, kw_only=True)
 
-    def without_estimate(self) -> "AbstractMuntheKaas":
-        made = copy.copy(self)
-        # As dataclasses do; `RKMK` is not made from its fields.
-        object.__setattr__(made, "estimate", None)
-        return made
+    def __check_init__(self):
+        check_choice("estimate", self.estimate, "group", "algebra", None)
+        check_choice("unroll", self.unroll, True, False, None)
 
     @abc.abstractmethod
-    def elements(self, field: "_Fields") -> list[PyTree]:
-        """What v is the combination of that has the weights `b`.
-
-        `field(c, u)` is `h f(t + c h, exp(u) y0)`, and `u = None` means zero.
-        """
+    def elements(self, chart: Chart) -> list[PyTree]:
+        """What v is the combination of that has the weights `b`."""
 
     def estimating(
-        self, elements: list[PyTree], v: PyTree, end: PyTree, field: "_Fields"
+        self, elements: list[PyTree], v: PyTree, end: PyTree, chart: Chart
     ) -> list[PyTree]:
         """These and what else the estimate takes; v leads to the end."""
         return elements
 
-    def move(self, field, y0):
-        v, elements, fields = self.logarithm(field, y0)
-        start = fields.start
-        end = flow(v, start)
-        left, error = leave(v, end), None
+    def logarithm(self, field: Callable[[Any, PyTree], PyTree], y0: PyTree) -> PyTree:
+        """The element v, where `field(c, y)` is `h f(t + c h, y)`."""
+        return _combine_nonzero(self.b, self.elements(Chart(field, y0)))
+
+    def move(self, chart):
+        elements = self.elements(chart)
+        v = _combine_nonzero(self.b, elements)
+        end = chart.flow(v, chart.start)
+        error = None
         # All that follows is for error control and output within the step. It is dead code, left
         # out by the compiler, where nobody asks for them.
         if self.estimate is not None and self.b_error is not None:
-            elements = self.estimating(elements, v, end, fields)
+            elements = self.estimating(elements, v, end, chart)
             off = _combine_nonzero(self.b_error, elements)
             if self.estimate == "algebra":
-                error = tangent(off, value_of(left))
+                error = tangent(off, chart.state(end))
             else:
-                error = minus(left, leave(v, flow(combine((1.0, -1.0), (v, off)), start)))
+                embedded = chart.flow(combine((1.0, -1.0), (v, off)), chart.start)
+                error = chart.difference(end, embedded)
         # All are results then, and XLA would compute those before anew for each.
         elements = once_together(elements, alone=True)
-        return Move(left, Path.of(self.continuous_extension, value_of(start), elements), error)
-
-    def logarithm(
-        self, field: Callable[[Any, PyTree], PyTree], y0: PyTree
-    ) -> tuple[PyTree, list[PyTree], "_Fields"]:
-        """The element v with the end of the step `exp(v) y0`, what it is a combination of, and the
-        fields of the step. They are in the step's coordinates.
-        """
-        fields = _Fields(field, y0)
-        elements = self.elements(fields)
-        return _combine_nonzero(self.b, elements), elements, fields
+        path = Path.of(self.continuous_extension, chart.without_sums(chart.start), elements)
+        return Move(chart.from_start(end), path, error)
 
 
-class _Fields:
-    """The field at points of a step, in the coordinates of the step.
+def _frozen(chart: Chart, c: float, u: PyTree) -> PyTree:
+    """The field at the point where u leads from the start of the step; None is zero.
 
-    It is called with a time c and what leads there from the start, or None for the start.
+    **Raises** `TypeError` for a field without a bracket.
     """
-
-    def __init__(
-        self, field: Callable[[Any, PyTree], PyTree], start: PyTree, earlier: Sequence[PyTree] = ()
-    ):
-        self.field = field
-        self.start = start
-        self.earlier = list(earlier)
-
-    def __call__(self, c: float | Real[Array, ""], u: PyTree) -> PyTree:
-        is_first = not self.earlier
-        here = self.start if u is None else flow(u, self.start)
-        value, here = self._entered(c, here, self.earlier)
-        if is_first:
-            self.start = here
-        self.earlier.append(value)
-        return value
-
-    def at(self, c: float | Real[Array, ""], here: PyTree, earlier: Sequence[PyTree]) -> PyTree:
-        """The same at the point `here`, after the fields `earlier`."""
-        return self._entered(c, here, earlier)[0]
-
-    def _entered(self, c: Any, here: PyTree, earlier: Sequence[PyTree]) -> tuple[PyTree, ...]:
-        value = self.field(c, leave(earlier[0], here) if earlier else here)
-        value, here = enter(value, here, earlier)
-        for part in jtu.tree_leaves(value, is_leaf=is_field):
-            if is_field(part) and not isinstance(part, AbstractAlgebraElement):
-                raise TypeError(without_bracket(part))
-        return value, here
+    point = chart.start if u is None else chart.flow(u, chart.start)
+    field = chart.frozen(c, point)
+    for part in jtu.tree_leaves(field, is_leaf=is_field):
+        if is_field(part) and not isinstance(part, AbstractAlgebraElement):
+            raise TypeError(without_bracket(part))
+    return field
 
 
 def _sixths(*numerators: int | Fraction) -> Row:
@@ -170,10 +142,10 @@ class RKMK3(AbstractMuntheKaas, diffrax.AbstractAdaptiveSolver):
     def order(self, terms) -> int:
         return 3
 
-    def elements(self, field):
-        k1 = field(0.0, None)
-        k2 = field(0.5, combine((1 / 2,), (k1,)))
-        k3 = field(1.0, combine((-1.0, 2.0), (k1, k2)))
+    def elements(self, chart):
+        k1 = _frozen(chart, 0.0, None)
+        k2 = _frozen(chart, 0.5, combine((1 / 2,), (k1,)))
+        k3 = _frozen(chart, 1.0, combine((-1.0, 2.0), (k1, k2)))
         return [k1, k2, k3, bracket(k1, k2)]
 
 
@@ -200,11 +172,11 @@ class RKMK4(AbstractMuntheKaas):
     def order(self, terms) -> int:
         return 4
 
-    def elements(self, field):
-        k1 = field(0.0, None)
-        k2 = field(0.5, combine((1 / 2,), (k1,)))
-        k3 = field(0.5, combine((1 / 2, -1 / 8), (k2, bracket(k1, k2))))
-        k4 = field(1.0, k3)
+    def elements(self, chart):
+        k1 = _frozen(chart, 0.0, None)
+        k2 = _frozen(chart, 0.5, combine((1 / 2,), (k1,)))
+        k3 = _frozen(chart, 0.5, combine((1 / 2, -1 / 8), (k2, bracket(k1, k2))))
+        k4 = _frozen(chart, 1.0, k3)
         return [k1, k2, k3, k4, bracket(k1, k4)]
 
 
@@ -221,10 +193,10 @@ class RKMK(AbstractMuntheKaas, diffrax.AbstractAdaptiveSolver):
     stages alone, with 4 evaluations more for that of `diffrax.Dopri8`.
 
     **Arguments:** `tableau`, a `diffrax.ButcherTableau`, for example `diffrax.Dopri5.tableau`;
-    `estimate`, `"algebra"`, `"group"` or None, as in the other methods.
+    `estimate`, `"algebra"`, `"group"` or None, and `unroll`, as in the other methods.
 
     **Raises** `TypeError` if the tableau is something else, `ValueError` if the method is implicit,
-    or for another `estimate`.
+    or for another `estimate` or `unroll`.
 
     Source: Munthe-Kaas, High order Runge-Kutta methods on manifolds, Appl. Numer. Math. 29 (1999),
     doi:10.1016/S0168-9274(98)00030-0.
@@ -244,6 +216,7 @@ class RKMK(AbstractMuntheKaas, diffrax.AbstractAdaptiveSolver):
         tableau: diffrax.ButcherTableau,
         *,
         estimate: Literal["algebra", "group"] | None = "algebra",
+        unroll: bool | None = None,
     ):
         if not isinstance(tableau, diffrax.ButcherTableau):
             own = getattr(tableau, "tableau", None)
@@ -259,6 +232,7 @@ class RKMK(AbstractMuntheKaas, diffrax.AbstractAdaptiveSolver):
         self.a = ((), *(tuple(row.tolist()) for row in tableau.a_lower[: n - 1]))
         self.c = (0.0, *tableau.c.tolist()[: n - 1])
         self.estimate = estimate
+        self.unroll = unroll
 
     def order(self, terms) -> int:
         return _order(*self._end)
@@ -285,18 +259,18 @@ class RKMK(AbstractMuntheKaas, diffrax.AbstractAdaptiveSolver):
     def continuous_extension(self) -> ContinuousExtension:
         return self._extension.weights
 
-    def elements(self, field):
+    def elements(self, chart):
         n = len(self.b)
-        return self._stages([field(0.0, None)], self.a[1:n], self.c[1:n], field)
+        return self._stages([_frozen(chart, 0.0, None)], self.a[1:n], self.c[1:n], chart)
 
-    def estimating(self, elements, v, end, field):
+    def estimating(self, elements, v, end, chart):
         n, elements = len(self.b), list(elements)
         for c, row in zip(self.c[n:], self.a[n:], strict=True):
             u, here = v, end
             if row != self.b:
                 u = _combine_nonzero(row, elements)
-                here = flow(u, field.start)
-            elements.append(dexpinv(u, field.at(c, here, elements), self._degree))
+                here = chart.flow(u, chart.start)
+            elements.append(dexpinv(u, chart.frozen_after(elements, c, here), self._degree))
         return elements
 
     def extended(self, path, field):
@@ -305,7 +279,8 @@ class RKMK(AbstractMuntheKaas, diffrax.AbstractAdaptiveSolver):
         if not rows:
             return path
         start, elements = path.parts(path.arrays)
-        elements = self._stages(elements[:n], rows, times, _Fields(field, start, elements))
+        chart = Chart.at_path(field, start, elements)
+        elements = self._stages(elements[:n], rows, times, chart)
         return Path.of(path.continuous_extension, start, elements)
 
     @property
@@ -317,39 +292,33 @@ class RKMK(AbstractMuntheKaas, diffrax.AbstractAdaptiveSolver):
         return self.order(None) - 2
 
     def _stages(
-        self,
-        known: list[PyTree],
-        rows: Sequence[Row],
-        times: Sequence[float],
-        field: _Fields,
+        self, known: list[PyTree], rows: Sequence[Row], times: Sequence[float], chart: Chart
     ) -> list[PyTree]:
         """These, and a stage for each row and time."""
 
         def element(c: Any, u: PyTree) -> PyTree:
-            return dexpinv(u, field(c, u), self._degree)
+            field = chart.frozen_after(known, c, chart.flow(u, chart.start))
+            return dexpinv(u, field, self._degree)
 
-        # Before all of them are traced, only to find that they are too long together.
-        one = functools.partial(element, times[0])
-        is_long = len(rows) > _MANY and is_rewritten() and are_long(one, known[0], len(rows))
-        if len(rows) > 1 and all(map(any, rows)) and can_loop(known[0], known[0], is_long):
-            with contextlib.suppress(FieldVaries):
-                return elements(known, rows, times, element)
-        if len(rows) > 1 and all(map(any, rows)) and has_room(known[-1], field.start):
-            made = functools.partial(dexpinv, degree=self._degree)
-            # A bracket takes time as the third power of the room: so there is less for the first.
-            half = len(rows) // 2 if len(rows) > _MANY else 0
-            with contextlib.suppress(FieldVaries):
-                found = known
+        if len(rows) > 1 and all(map(any, rows)):
+            # Before all of them are traced, only to find that they are too long together.
+            one = functools.partial(element, times[0])
+            is_long = len(rows) > _MANY and is_rewritten() and are_long(one, known[0], len(rows))
+            if can_roll(self.unroll, known[0], known[0], is_long) and is_uniform(chart):
+                return rolled_elements(known, rows, times, element)
+            if can_roll_in_room(self.unroll, chart, known, len(known) + len(rows)):
+                made = functools.partial(dexpinv, degree=self._degree)
+                # A bracket takes time as the third power of the room: less for the first ones.
+                half = len(rows) // 2 if len(rows) > _MANY else 0
                 for few in (slice(half), slice(half, None)):
-                    found = elements_in_room(
-                        found, rows[few], times[few], field.start, field.at, made
-                    )
-                return found
+                    known = rolled_elements_in_room(known, rows[few], times[few], chart, made)
+                return known
         stages = list(known)
         for c, row in zip(times, rows, strict=True):
             # Rows may be shorter than what is known.
             u = _combine_nonzero(row, stages) if any(row) else None
-            stages.append(field(c, None) if u is None else element(c, u))
+            field = _frozen(chart, c, u)
+            stages.append(field if u is None else dexpinv(u, field, self._degree))
         return stages
 
 
@@ -364,8 +333,13 @@ class RKMK5(RKMK):
     assumption, Comput. Math. Appl. 62 (2011), doi:10.1016/j.camwa.2011.06.002.
     """
 
-    def __init__(self, *, estimate: Literal["algebra", "group"] | None = "algebra"):
-        super().__init__(diffrax.Tsit5.tableau, estimate=estimate)
+    def __init__(
+        self,
+        *,
+        estimate: Literal["algebra", "group"] | None = "algebra",
+        unroll: bool | None = None,
+    ):
+        super().__init__(diffrax.Tsit5.tableau, estimate=estimate, unroll=unroll)
 
 
 class RKMK8(RKMK):
@@ -379,8 +353,13 @@ class RKMK8(RKMK):
     (1981), doi:10.1016/0771-050X(81)90010-3.
     """
 
-    def __init__(self, *, estimate: Literal["algebra", "group"] | None = "algebra"):
-        super().__init__(diffrax.Dopri8.tableau, estimate=estimate)
+    def __init__(
+        self,
+        *,
+        estimate: Literal["algebra", "group"] | None = "algebra",
+        unroll: bool | None = None,
+    ):
+        super().__init__(diffrax.Dopri8.tableau, estimate=estimate, unroll=unroll)
 
 
 @functools.lru_cache

@@ -41,7 +41,9 @@ class CayleyRK4(AbstractLieSolver):
     def order(self, terms) -> int:
         return 4
 
-    def move(self, field, y0):
+    def move(self, chart):
+        # It has coordinates of its own, and takes states.
+        field, y0 = chart.field, chart.start
         first = field(0.0, y0)
         num_axes = jtu.tree_map(_num_axes, first, is_leaf=is_field)
 

@@ -1,6 +1,5 @@
-"""The stages of a step as one loop, so that a program has the field and its flow once."""
+"""The stages of a step rolled into one loop, so that a program has the field and its flow once."""
 
-import contextlib
 from collections.abc import Callable, Sequence
 from typing import Any, NamedTuple
 
@@ -10,25 +9,18 @@ import jax.tree_util as jtu
 from jax import lax
 from jaxtyping import Array, PyTree, Real
 
-from .._field import AbstractFrozenField, Incremented, flow, is_field, is_incremented
+from .._field import AbstractFrozenField, describe, is_field
 from .._fields.elementwise import Elementwise
 from .._xla import is_rewritten, pack, table
+from .chart import Chart
 
 # A loop copies the fields of all stages in each of its turns. For a dense matrix of more entries
 # that moves a vector, this takes longer than the flow.
 _SMALL = 100
 
-# Of a point in coordinates of the step, with its columns. Where a loop is differentiated, it keeps
+# Of a point in the chart of a field, with its columns. Where a loop is differentiated, it keeps
 # those of all stages for each of its turns.
 _SMALL_STEP = 2048
-
-# JAX traces anew where it changes.
-_is_written_out = jax.make_user_context(False)
-
-
-def written_out() -> contextlib.AbstractContextManager:
-    """Within, no stages are traced as a loop: every flow is seen, and counted, on its own."""
-    return _is_written_out(True)
 
 
 class Flow(NamedTuple):
@@ -43,39 +35,67 @@ class Flow(NamedTuple):
     c: float
 
 
-class FieldVaries(Exception):
-    """The field has not one structure, shape and dtype at all stages."""
+def can_roll(unroll: bool | None, field: PyTree, point: PyTree, is_long: bool = False) -> bool:
+    """Whether flows of combinations of such fields may be one loop, and where `unroll` is None
+    whether that pays.
 
-
-def can_loop(field: PyTree, point: PyTree, is_long: bool = False) -> bool:
-    """Whether a loop over the stages pays: where there are flows, written for one point as for all.
-
-    A step that is rewritten for XLA is faster written out, if it is not too long for that. So are
-    fields that combine in a way of their own or work in coordinates of the step, whose arrays grow
-    from stage to stage, and fields of far more numbers than the point has.
+    Fields must combine in the usual way and have no chart of their own. A step that is rewritten
+    for XLA is faster unrolled, if it is not too long for that, and so are fields of far more
+    numbers than the point has.
     """
     parts = jtu.tree_leaves(field, is_leaf=is_field)
-    return (
-        (is_long or not is_rewritten())
-        and not _is_written_out.value
-        and any(map(is_field, parts))
-        and _size(field) <= max(_SMALL, 4 * _size(point))
-        and is_plain(field)
-    )
+    is_possible = any(map(is_field, parts)) and is_plain(field)
+    if unroll is not None:
+        return is_possible and not unroll
+    pays = is_long or not is_rewritten()
+    return is_possible and pays and _size(field) <= max(_SMALL, 4 * _size(point))
 
 
-def has_room(field: PyTree, point: PyTree) -> bool:
-    """Whether a loop pays in coordinates of the step: for one small field that has room for others.
+def can_roll_stages(unroll: bool | None, chart: Chart, num_stages: int) -> bool:
+    """The same of stages that are evaluated at points of the step, of which the first one is known.
+
+    A field with a chart of its own is rolled if it offers room for the coordinates of all stages.
+    """
+    first = chart.fields[0]
+    if is_plain(first):
+        return can_roll(unroll, first, chart.start) and is_uniform(chart)
+    return can_roll_in_room(unroll, chart, [first], num_stages)
+
+
+def can_roll_in_room(
+    unroll: bool | None, chart: Chart, known: Sequence[Any], num_stages: int
+) -> bool:
+    """Whether a field with a chart of its own has room for all stages, after those known.
 
     It compiles in a third of the time, and runs an eighth to a third longer.
     """
-    return (
-        not is_rewritten()
-        and not _is_written_out.value
-        and is_field(field)
-        and _size(point) <= _SMALL_STEP
-        and type(field).room is not AbstractFrozenField.room
-    )
+    first = known[-1]
+    if unroll or not is_field(first) or type(first).room is AbstractFrozenField.room:
+        return False
+    pays = unroll is False or (not is_rewritten() and _size(chart.start) <= _SMALL_STEP)
+    if not pays or any(x.span is not first.span for x in known):
+        return False
+    room = first.room(chart.start, num_stages)
+    return room is not None and _fits(room, chart, first)
+
+
+def _fits(room: Any, chart: Chart, first: Any) -> bool:
+    is_like = False
+
+    def look() -> None:
+        nonlocal is_like
+        k, z = room.coordinates(first, chart.start)
+        later = chart.frozen_after([room.field(k)], jnp.zeros(()), room.point(z))
+        is_like = type(later) is type(first) and _is_like(room.kept(0), room.entered(later))
+
+    jax.eval_shape(look)
+    return is_like
+
+
+def is_uniform(chart: Chart) -> bool:
+    """Whether the field has one structure, and its arrays one shape and dtype, at all stages."""
+    first, c = chart.fields[0], jnp.zeros(())
+    return _is_like(first, jax.eval_shape(lambda: chart.frozen_after([first], c, chart.start)))
 
 
 def _size(tree: PyTree) -> int:
@@ -83,7 +103,7 @@ def _size(tree: PyTree) -> int:
 
 
 def is_plain(field: PyTree) -> bool:
-    """Whether its parts combine in the usual way and have no coordinates of a step."""
+    """Whether its parts combine in the usual way and have no chart of their own."""
     parts = jtu.tree_leaves(field, is_leaf=is_field)
     return all(_is_plain(part) for part in parts if is_field(part))
 
@@ -93,21 +113,18 @@ def _is_plain(field: AbstractFrozenField) -> bool:
     usual: Any = AbstractFrozenField
     return (
         cls.combine.__func__ is usual.combine.__func__
-        and cls.enter is usual.enter
-        and cls.leave is usual.leave
+        and cls.to_chart is usual.to_chart
+        and cls.from_chart is usual.from_chart
     )
 
 
-def elements(
+def rolled_elements(
     known: Sequence[PyTree],
     rows: Sequence[Sequence[Any]],
     times: Sequence[float],
     element: Callable[[Real[Array, ""], PyTree], PyTree],
 ) -> list[PyTree]:
-    """After the known stages k, for each row and time c the stage `element(c, sum_j row[j] k[j])`.
-
-    **Raises** `FieldVaries` as `run`.
-    """
+    """The known stages k, and for each row and time c `element(c, sum_j row[j] k[j])`."""
     first, n = known[0], len(known) + len(rows)
     weights = _padded(rows, n)
     made = table(
@@ -129,50 +146,45 @@ def elements(
     return [*known, *(_at(stages, k) for k in range(len(known), n))]
 
 
-def elements_in_room(
+def rolled_elements_in_room(
     known: Sequence[Any],
     rows: Sequence[Sequence[Any]],
     times: Sequence[float],
-    start: Any,
-    field: Callable[[Real[Array, ""], Any, Any], Any],
+    chart: Chart,
     element: Callable[[Any, Any], Any],
 ) -> list[Any]:
-    """As `elements`, for a field whose coordinates of a step grow from stage to stage.
+    """The same for a field with a chart of its own, which grows from stage to stage.
 
-    `field(c, here, earlier)` has entered at `here`, where the fields `earlier` have; the element is
-    made of the combination that leads there from `start`, and of it.
-
-    **Raises** `FieldVaries` where they cannot be in one array each.
+    The stage is `element(u, field)` of the combination u that leads to the point of the field.
     """
     if not rows:
         return list(known)
     first, n = known[-1], len(known) + len(rows)
-    if any(x.span is not first.span for x in known):
-        raise FieldVaries
-    room = first.room(start, n)
-    if room is None:
-        raise FieldVaries
+    room = first.room(chart.start, n)
 
     def body(carry: Any, x: Any) -> Any:
         room, stages = carry
         k, row, c = x
         u = _combination(row, stages)
         along = room.field(u)
-        here = flow(along, start)
-        entered = field(c, here, [along])
-        if type(entered) is not type(first):
-            raise FieldVaries
+        here = chart.flow(along, chart.start)
+        entered = chart.frozen_after([along], c, here)
         room, new = room.extended(_like(room.kept(k), room.entered(entered)), here.z, k)
         return (room, _put(stages, k, element(room.field(u), room.field(new)).k)), None
 
-    ks = [room.coordinates(x, start)[0] for x in known]
+    ks = [room.coordinates(x, chart.start)[0] for x in known]
     stages = jnp.zeros((n, *ks[0].shape), ks[0].dtype).at[: len(ks)].set(jnp.stack(ks))
     xs = jnp.arange(len(known), n), _padded(rows, n), jnp.asarray(times)
     (room, stages), _ = lax.scan(body, (room, stages), xs)
     return [room.field(stages[k]) for k in range(n)]
 
 
-def along(weights: Real[Array, "flows stages"], fields: Sequence[PyTree], point: PyTree) -> PyTree:
+def rolled_flows(
+    weights: Real[Array, "flows stages"],
+    fields: Sequence[PyTree],
+    point: PyTree,
+    flow: Callable[[PyTree, PyTree], PyTree],
+) -> PyTree:
     """Where flows of combinations of the first fields lead, that of the first row first."""
     # XLA computes what leads to each of the arrays that `jnp.stack` gets for itself.
     stages = jtu.tree_map(lambda *leaves: pack(leaves), *fields[: weights.shape[1]])
@@ -185,80 +197,55 @@ def along(weights: Real[Array, "flows stages"], fields: Sequence[PyTree], point:
     return lax.scan(body, start, weights)[0]
 
 
-def run(
-    flows: Sequence[Flow],
-    num_stages: int,
-    first: PyTree,
-    start: PyTree,
-    field: Callable[[Real[Array, ""], PyTree, PyTree], PyTree],
-) -> tuple[list[PyTree], list[PyTree]]:
-    """The points of a step, of which `start` is the first, and its fields, of which `first` is.
-
-    `field(c, here, earlier)` has entered, where the field `earlier` has.
-
-    **Raises** `FieldVaries` where they cannot be in one array each.
-    """
-    if not is_plain(first):
-        return _run_in_room(flows, num_stages, first, start, field)
-    moving, rest = _stripped(start)
+def rolled(chart: Chart, flows: Sequence[Flow], num_stages: int) -> list[PyTree]:
+    """The points that the flows lead to, after the first field of the step; and all its fields."""
+    if not is_plain(chart.fields[0]):
+        return _rolled_in_room(chart, flows, num_stages)
+    first, start = chart.fields[0], chart.start
 
     def body(carry: Any, x: Any) -> Any:
         points, fields = carry
         source, row, target, stage, c = x
         along = jtu.tree_map(lambda f: _combination(row, f[:num_stages]), fields)
-        point = flow(along, _dressed(_at(points, source), rest))
-
-        value = lax.cond(
+        point = chart.flow(along, _at(points, source))
+        field = lax.cond(
             stage < num_stages,
-            lambda: _like(first, field(c, point, first)),
+            lambda: _like(first, chart.frozen_after([first], c, point)),
             lambda: jtu.tree_map(jnp.zeros_like, first),
         )
-        return (_put(points, target, _stripped(point)[0]), _put(fields, stage, value)), None
+        return (_put(points, target, point), _put(fields, stage, field)), None
 
     # One more row for what is no stage.
-    carry = _stack(moving, len(flows) + 1), _stack(first, num_stages + 1)
+    carry = _stack(start, len(flows) + 1), _stack(first, num_stages + 1)
     (points, fields), _ = lax.scan(body, carry, _turns(flows, num_stages))
-    return (
-        [_dressed(_at(points, k), rest) for k in range(len(flows) + 1)],
-        [_at(fields, k) for k in range(num_stages)],
-    )
+    chart.fields[:] = [_at(fields, k) for k in range(num_stages)]
+    return [_at(points, k + 1) for k in range(len(flows))]
 
 
-def _run_in_room(
-    flows: Sequence[Flow],
-    num_stages: int,
-    first: AbstractFrozenField,
-    start: Any,
-    field: Callable[[Real[Array, ""], Any, Any], Any],
-) -> tuple[list[Any], list[Any]]:
-    """The same for a field whose coordinates of a step grow from stage to stage."""
-    room = first.room(start, num_stages)
-    if room is None:
-        raise FieldVaries
+def _rolled_in_room(chart: Chart, flows: Sequence[Flow], num_stages: int) -> list[Any]:
+    """The same for a field with a chart of its own, which grows from stage to stage."""
+    first: Any = chart.fields[0]
+    room = first.room(chart.start, num_stages)
 
     def body(carry: Any, x: Any) -> Any:
         room, points, fields = carry
         source, row, target, stage, c = x
         along = room.field(_combination(row, fields[:num_stages]))
-        here = flow(along, room.point(_at(points, source)))
+        here = chart.flow(along, room.point(_at(points, source)))
 
         def evaluated() -> Any:
-            entered = field(c, here, along)
-            if type(entered) is not type(first):
-                raise FieldVaries
-            return _like(room.kept(stage), room.entered(entered))
+            return _like(room.kept(stage), room.entered(chart.frozen_after([along], c, here)))
 
         new = lax.cond(stage < num_stages, evaluated, lambda: room.kept(stage))
         room, entered = room.extended(new, here.z, stage)
         return (room, _put(points, target, here.z), _put(fields, stage, entered)), None
 
-    k, z = room.coordinates(first, start)
+    k, z = room.coordinates(first, chart.start)
     carry = room, _stack(z, len(flows) + 1), _stack(k, num_stages + 1)
     (room, points, fields), _ = lax.scan(body, carry, _turns(flows, num_stages))
-    return (
-        [room.point(points[k]) for k in range(len(flows) + 1)],
-        [room.field(fields[k]) for k in range(num_stages)],
-    )
+    chart.start = room.point(points[0])
+    chart.fields[:] = [room.field(fields[k]) for k in range(num_stages)]
+    return [room.point(points[k + 1]) for k in range(len(flows))]
 
 
 def _turns(flows: Sequence[Flow], num_stages: int) -> tuple[Array, ...]:
@@ -275,10 +262,18 @@ def _padded(rows: Sequence[Sequence[Any]], n: int) -> Array:
     return jnp.asarray([[*map(float, row), *[0.0] * (n - len(row))] for row in rows])
 
 
+def _is_like(a: PyTree, b: PyTree) -> bool:
+    return jtu.tree_structure(a) == jtu.tree_structure(b) and _types(a) == _types(b)
+
+
 def _like(first: PyTree, value: PyTree) -> PyTree:
-    if jtu.tree_structure(value) != jtu.tree_structure(first) or _types(value) != _types(first):
-        # It may be an error, and is one in words where the stages are written out.
-        raise FieldVaries
+    # What was seen of the field before may not hold for every time.
+    if not _is_like(first, value):
+        raise TypeError(
+            "The field must return frozen fields of one structure, shape and dtype at all stages "
+            f"of a step, got {describe(first)} and {describe(value)}. With unroll=True the solver "
+            "takes others too."
+        )
     # Only a weak type may be left over.
     return jtu.tree_map(lambda v, f: jnp.asarray(v, f.dtype), value, first)
 
@@ -305,21 +300,3 @@ def _put(tree: PyTree, k: Any, values: PyTree) -> PyTree:
 
 def _types(tree: PyTree) -> list[tuple[tuple[int, ...], Any]]:
     return [(jnp.shape(x), jnp.result_type(x)) for x in jtu.tree_leaves(tree)]
-
-
-def _stripped(point: PyTree) -> tuple[PyTree, PyTree]:
-    """What differs between the points of a step, and what does not: starts of increments."""
-    leaves = lambda f: jtu.tree_map(f, point, is_leaf=is_incremented)  # noqa: E731
-    return (
-        leaves(lambda p: p.increment if is_incremented(p) else p),
-        leaves(lambda p: p.start if is_incremented(p) else None),
-    )
-
-
-def _dressed(moving: PyTree, rest: PyTree) -> PyTree:
-    return jtu.tree_map(
-        lambda start, p: p if start is None else Incremented(start, p),
-        rest,
-        moving,
-        is_leaf=lambda x: x is None,
-    )

@@ -159,9 +159,9 @@ MISTAKES = {
         dict(combine=classmethod(structured)),
         "flow of the zero field must be the identity",
     ),
-    "enter": (
-        dict(enter=lambda self, point, earlier: (self, point + 0.01)),
-        "enter and leave must lead back to the point",
+    "to_chart": (
+        dict(to_chart=lambda self, point, earlier: (self, point + 0.01)),
+        "to_chart and from_chart must lead back to the point",
     ),
     "defect": (
         dict(defect=classmethod(lambda cls, p: (abs(p @ p - POINT @ POINT), "the start's length"))),

@@ -368,7 +368,7 @@ def test_a_stiefel_step_keeps_one_span_for_its_stages():
     start = y
     entered = []
     for t in (0.0, 0.4, 1.1):
-        field, start = cfjax.LowRankSkew(jnp.cos(t) * A6 @ y).enter(start, entered)
+        field, start = cfjax.LowRankSkew(jnp.cos(t) * A6 @ y).to_chart(start, entered)
         entered.append(field)
     assert len(entered[-1].field.span.blocks) == 4
     total = cfjax.combine((1.0, 1.0, 1.0), entered)

@@ -64,14 +64,14 @@ def test_a_sum_of_fields_frozen_at_different_points(n):
         entered: list[Any] = []
         points, start = [], y
         for g in gs:
-            field, here = SphereRotation(g).enter(y if not entered else start, entered)
-            points.append(field.leave(here))
+            field, here = SphereRotation(g).to_chart(y if not entered else start, entered)
+            points.append(field.from_chart(here))
             start = here if not entered else start
             entered.append(field)
             # On to where the next is frozen.
             start = field.flow(start)
         total = cfjax.combine(weights, entered)
-        return points, total.leave(total.flow(start)), total.leave(start)
+        return points, total.from_chart(total.flow(start)), total.from_chart(start)
 
     gs, y = normal(3, n), unit(n)
     for weights in ([0.7, -0.4, 1.3], [0.0, 0.0, 0.0], [20.0, 0.0, -20.0]):

@@ -1026,13 +1026,13 @@ def test_compensation_serves_every_part_whose_field_offers_an_increment():
         term = cfjax.LieTerm(field)
         state = solver.init(term, 0.0, 0.1, y0, None)
         step = eqx.filter_jit(solver.step)
-        assert state.lost["shift"] is None
+        assert state.compensation["shift"] is None
         for _ in range(2):
             y1, _, _, state, _ = step(term, 0.0, 0.1, y0, None, state, made_jump=False)
             for name in ("vector", "long", "rotated", "left", "right"):
-                assert state.lost[name].lost.dtype == y1[name].dtype == y0[name].dtype
+                assert state.compensation[name].dtype == y1[name].dtype == y0[name].dtype
                 # What a sum loses is at most half a unit in the last place.
-                lost = np.abs(state.lost[name].lost) / np.spacing(np.abs(np.asarray(y1[name])))
+                lost = np.abs(state.compensation[name]) / np.spacing(np.abs(np.asarray(y1[name])))
                 assert 0 < lost.max() <= 0.5
 
 

@@ -16,7 +16,6 @@ import scipy.linalg
 
 import cfjax
 from cfjax._methods.continuous_extension import continuous_extension
-from cfjax._solvers.stages import written_out
 
 METHODS: dict[str, cfjax.CommutatorFree] = {
     "LieEuler": cfjax.LieEuler(),
@@ -339,7 +338,7 @@ class Counting(cfjax.AbstractFrozenField):
 @pytest.mark.parametrize("estimate", [False, True])
 def test_a_step_costs_what_its_tableau_says(solver, shape, estimate):
     counts = {"flows": 0, "evaluations": 0}
-    solver = solver if estimate else solver.without_estimate()
+    solver = (solver if estimate else solver.without_estimate()).unrolled()
     tableau = solver.tableau
 
     def field(t, y, args):
@@ -354,7 +353,7 @@ def test_a_step_costs_what_its_tableau_says(solver, shape, estimate):
 
     # Steps of the vector are rewritten on single numbers, those of the matrix not.
     is_rewritten = shape == (3,)
-    with written_out(), cfjax.rewriting(is_rewritten):
+    with cfjax.rewriting(is_rewritten):
         jax.eval_shape(step, jnp.ones(shape))
     # The field at the end of the step comes on top, where the next step does not start with it.
     # Where it does, a rewritten step evaluates it once more, from the end alone.

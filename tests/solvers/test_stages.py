@@ -1,4 +1,4 @@
-"""Stages in a loop: the numbers and derivatives of stages that are written out."""
+"""Stages rolled into a loop: the numbers and derivatives of stages that are not."""
 
 import diffrax
 import equinox as eqx
@@ -9,7 +9,6 @@ import problems
 import pytest
 
 import cfjax
-from cfjax._solvers.stages import written_out
 
 A, B = problems.GENERATORS[:2]
 FIELDS = {
@@ -42,14 +41,16 @@ def moved(solver, field, y0, args):
     return y1, error, solver.interpolation_cls(t0=time[0], t1=time[1], **dense).evaluate(0.2)
 
 
-def both(fun, *args):
-    looped = jax.jit(lambda *a: fun(*a)).lower(*args)
-    with written_out():
-        plain = jax.jit(lambda *a: fun(*a)).lower(*args)
-    assert "while" in looped.as_text()
+def both(fun, name, *args):
+    """`fun(solver, *args)` with the stages rolled and not."""
+    solver = SOLVERS[name]
+    rolled, plain = (
+        jax.jit(lambda *a, s=s: fun(s, *a)).lower(*args) for s in (solver, solver.unrolled())
+    )
+    assert "while" in rolled.as_text()
     # Not the same program twice.
-    assert looped.as_text() != plain.as_text()
-    return tuple(program.compile(problems.QUICK)(*args) for program in (looped, plain))
+    assert rolled.as_text() != plain.as_text()
+    return tuple(program.compile(problems.QUICK)(*args) for program in (rolled, plain))
 
 
 def assert_same(found, expected, units):
@@ -65,9 +66,9 @@ def assert_same(found, expected, units):
 def test_a_step(name, problem):
     field, y0, args = FIELDS[problem]
     y0, args = problems.arrays((y0, args))
-    fun = lambda y0, args: moved(SOLVERS[name], field, y0, args)  # noqa: E731
+    fun = lambda solver, y0, args: moved(solver, field, y0, args)  # noqa: E731
     # Entries of size 1, some ten flows with a few roundings each.
-    assert_same(*both(fun, y0, args), 100)
+    assert_same(*both(fun, name, y0, args), 100)
 
 
 def columns(t, y, args):
@@ -86,36 +87,38 @@ COLUMNS = problems.arrays(
 @pytest.mark.parametrize("name", SOLVERS)
 def test_a_step_in_coordinates_that_grow(name):
     """In a loop there is room for all of them from the start."""
-    fun = lambda y0, args: moved(SOLVERS[name], columns, y0, args)  # noqa: E731
+    fun = lambda solver, y0, args: moved(solver, columns, y0, args)  # noqa: E731
     # Ten flows, each a sum of ten products of vectors of up to 18 entries of size 1.
-    assert_same(*both(fun, *COLUMNS), 1000)
+    assert_same(*both(fun, name, *COLUMNS), 1000)
 
 
 def test_a_gradient_in_coordinates_that_grow_in_a_batch():
-    loss = lambda y0, args: jnp.sum(jnp.sin(moved(SOLVERS["CF4"], columns, y0, args)[0]))  # noqa: E731
-    fun = jax.vmap(jax.grad(loss, (0, 1)), (0, None))
+    def fun(solver, y0, args):
+        loss = lambda y0, args: jnp.sum(jnp.sin(moved(solver, columns, y0, args)[0]))  # noqa: E731
+        return jax.vmap(jax.grad(loss, (0, 1)), (0, None))(y0, args)
+
     # As above, and back through every stage.
     y0, args = COLUMNS
-    assert_same(*both(fun, jnp.stack([y0, -y0[::-1]]), args), 10_000)
+    assert_same(*both(fun, "CF4", jnp.stack([y0, -y0[::-1]]), args), 10_000)
 
 
 def test_coordinates_that_grow_have_one_program_for_all_stages():
     """It compiles in the time that a program is long."""
 
-    def evaluations():
+    def evaluations(solver):
         calls = []
 
         def field(t, y, args):
             calls.append(1)
             return columns(t, y, args)
 
-        jax.make_jaxpr(lambda y0, args: moved(cfjax.CF54(), field, y0, args)[0])(*COLUMNS)
+        jax.make_jaxpr(lambda y0, args: moved(solver, field, y0, args)[0])(*COLUMNS)
         return len(calls)
 
-    # Once to check the start, at the start, in the loop and at the end; and at seven stages.
-    assert evaluations() == 4
-    with written_out():
-        assert evaluations() == 9
+    # Once to check the start, at the start, to see whether later ones are alike, in the loop and at
+    # the end; and at seven stages.
+    assert evaluations(cfjax.CF54()) == 5
+    assert evaluations(cfjax.CF54(unroll=True)) == 9
 
 
 @pytest.mark.representatives(1)
@@ -123,10 +126,13 @@ def test_coordinates_that_grow_have_one_program_for_all_stages():
 def test_a_gradient_in_a_batch(name):
     field = lambda t, y, args: cfjax.Rotation(args * y[:, 0] + t * y[:, 1])  # noqa: E731
     y0, args = jnp.eye(3), jnp.array([0.5, -0.4, 0.9])
-    loss = lambda y0, args: jnp.sum(jnp.sin(moved(SOLVERS[name], field, y0, args)[0]))  # noqa: E731
-    fun = jax.vmap(jax.grad(loss, (0, 1)), (0, None))
+
+    def fun(solver, y0, args):
+        loss = lambda y0, args: jnp.sum(jnp.sin(moved(solver, field, y0, args)[0]))  # noqa: E731
+        return jax.vmap(jax.grad(loss, (0, 1)), (0, None))(y0, args)
+
     # Sums of nine sines, each turned some ten times, and back through every stage.
-    assert_same(*both(fun, jnp.stack([y0, 2 * y0]), args), 2000)
+    assert_same(*both(fun, name, jnp.stack([y0, 2 * y0]), args), 2000)
 
 
 class Weighted(cfjax.AbstractFrozenField):
@@ -152,7 +158,7 @@ def test_fields_of_different_kinds_are_an_error_in_words():
         moved(cfjax.CF4(), field, jnp.eye(4), None)
 
 
-def test_a_field_that_varies_is_written_out():
+def test_a_field_that_varies_is_unrolled():
     """Here in its static part, which no array can hold for all stages."""
 
     def field(t, y, args):
@@ -167,3 +173,34 @@ def test_a_field_that_varies_is_written_out():
     middle = y0 * np.exp(0.15 * np.cos(0.1) * y0 / 2)
     expected = y0 * np.exp(0.3 * np.cos(half) * middle / 2)
     np.testing.assert_allclose(found, expected, rtol=1e-15)
+
+
+@pytest.mark.parametrize(
+    "solver",
+    [cfjax.CF4(unroll=False), cfjax.RKMK5(unroll=False), cfjax.Magnus4(unroll=False)],
+    ids=lambda solver: type(solver).__name__,
+)
+@pytest.mark.usefixtures("rewritten")
+def test_a_small_step_is_rolled_if_asked_for(solver):
+    """It is rewritten for XLA else, one flow after the other."""
+    args = (jnp.array([0.5, -0.4, 0.9]), jnp.array([0.3, 0.2, -0.1]))
+
+    def field(t, y, args):
+        return cfjax.Rotation(args[0] + t * args[1])
+
+    def end(solver, y0):
+        times = jnp.asarray(0.1), jnp.asarray(0.4)
+        return problems.first_step(solver, cfjax.LieTerm(field), *times, y0, args)[0]
+
+    y0 = jnp.array([0.6, 0.0, 0.8])
+    rolled = jax.make_jaxpr(lambda y0: end(solver, y0))(y0)
+    assert "scan[" in str(rolled)
+    assert "scan[" not in str(jax.make_jaxpr(lambda y0: end(solver.unrolled(), y0))(y0))
+    # Entries of size 1, some ten flows with a few roundings each.
+    assert_same(end(solver, y0), end(solver.unrolled(), y0), 100)
+
+
+@pytest.mark.parametrize("make", [cfjax.CF4, cfjax.RKMK5, cfjax.RKMK4, cfjax.Magnus4])
+def test_another_unroll_is_refused(no_shape_hook, make):
+    with pytest.raises(ValueError, match="unroll must be True, False or None, got 1"):
+        make(unroll=1)

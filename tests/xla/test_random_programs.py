@@ -33,15 +33,15 @@ def check(seeds, lattices):
     assert calls["cfjax_operation"] - before >= len(seeds) / 2
 
 
-# Every tenth operation or so at the end: some 0.15 s a program, of which NumPy evaluates most.
+# Every fifth operation or so at the end: some 0.15 s a program, of which NumPy evaluates most.
 @pytest.mark.parametrize("first", range(0, 600, 150))
 def test_small_states(first):
-    check(range(first, first + 150, 7), lattices=0)
+    check(range(first, first + 150, 5), lattices=0)
 
 
 @pytest.mark.parametrize("first", range(3, 600, 200))
 def test_leading_axes(first):
-    check(range(first, first + 200, 13), lattices=1)
+    check(range(first, first + 200, 8), lattices=1)
 
 
 @pytest.mark.slow
