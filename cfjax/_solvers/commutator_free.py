@@ -20,7 +20,7 @@ from .._xla import cut, once_together, smooth
 from .base import AbstractLieSolver, Move, check_choice
 from .chart import Chart
 from .dense import Path
-from .stages import Flow, can_roll_stages, rolled
+from .stages import can_roll_stages, rolled
 
 
 class AbstractCommutatorFree(AbstractLieSolver):
@@ -48,7 +48,6 @@ class AbstractCommutatorFree(AbstractLieSolver):
     estimate: Literal["group", "algebra"] | None = eqx.field(
         static=True, default="group", kw_only=True
     )
-
     # Whether the stages stand one by one in the program instead of in a loop. None: what is faster.
     unroll: bool | None = eqx.field(static=True, default=None, kw_only=True)
 
@@ -76,47 +75,49 @@ class AbstractCommutatorFree(AbstractLieSolver):
 
     def move(self, chart):
         tableau = self.tableau
-        stages = [trimmed(rows) for rows in tableau.alpha]
-        beta, times = trimmed(tableau.beta), list(map(float, tableau.c))
+        alpha, beta = [trimmed(rows) for rows in tableau.alpha], trimmed(tableau.beta)
         reach = _Reach(chart, self.direction)
         if not chart.fields:
-            chart.frozen(times[0], chart.start)
-        flows = _flows([*stages, beta], times)
-        is_usual = type(self).direction is AbstractCommutatorFree.direction
-        # Two stages at one point would be one flow with two times.
-        is_distinct = len({*stages}) == len(times)
-        if is_usual and is_distinct and can_roll_stages(self.unroll, chart, len(times)):
-            ends = rolled(chart, flows, len(times))
-            reach.points |= zip(_products([*stages, beta])[1:], ends, strict=True)
-        else:
-            for c, rows in zip(times[1:], stages[1:], strict=True):
-                chart.frozen(c, reach(rows))
+            chart.frozen(0.0, chart.start)
+        if self._can_roll(chart):
+            reach.points |= rolled(chart, [*alpha, beta], tableau.c)
+        for c, rows in list(zip(tableau.c, alpha, strict=True))[len(chart.fields) :]:
+            chart.frozen(float(c), reach(rows))
         end = reach(beta)
         if self.first_same_as_last:
             # The end, the last field and the error are made of it.
             end = reach.points[beta] = cut(end)
         # All that follows is for error control and output within the step. It is dead code, left
         # out by the compiler, where nobody asks for them.
-        embedded = None if self.estimate is None else tableau.embedded
         within = continuous_extension(tableau)
-        if any(map(tableau.uses_last, (embedded or (), *within))):
+        if any(map(tableau.uses_last, (self._embedded or (), *within))):
             chart.frozen(1.0, end)
         path = Path.of(within, chart.without_sums(chart.start), chart.fields)
-        end_from_start = chart.from_start(end)
-        if embedded is None:
-            return Move(end_from_start, path)
+        if self._embedded is None:
+            return Move(chart.from_start(end), path)
         if self.estimate == "algebra":
-            difference = _combined(_difference(embedded, tableau.beta), chart.fields)
+            difference = _combined(_difference(self._embedded, tableau.beta), chart.fields)
             error = tangent(difference, chart.state(end))
         else:
-            error = chart.difference(end, reach(trimmed(embedded)))
-        if not tableau.uses_last(embedded):
-            return Move(end_from_start, path, error)
-        apart = chart.difference(end, reach(stages[-1]))
+            error = chart.difference(end, reach(trimmed(self._embedded)))
+        if not tableau.uses_last(self._embedded):
+            return Move(chart.from_start(end), path, error)
+        apart = chart.difference(end, reach(alpha[-1]))
         # A ratio is where a function of XLA's ends, and all of it is needed before.
-        end_from_start, error, apart = once_together((end_from_start, error, apart), alone=True)
-        way = jtu.tree_map(jnp.subtract, end_from_start, chart.from_start(chart.start))
-        return Move(end_from_start, path, jtu.tree_map(_seen, error, apart, way), is_shared=True)
+        end, error, apart = once_together((chart.from_start(end), error, apart), alone=True)
+        way = jtu.tree_map(jnp.subtract, end, chart.from_start(chart.start))
+        return Move(end, path, jtu.tree_map(_seen, error, apart, way), is_shared=True)
+
+    @property
+    def _embedded(self) -> Product | None:
+        return None if self.estimate is None else self.tableau.embedded
+
+    def _can_roll(self, chart: Chart) -> bool:
+        is_usual = type(self).direction is AbstractCommutatorFree.direction
+        # Two stages at one point would be one flow with two times.
+        is_distinct = len(set(map(trimmed, self.tableau.alpha))) == len(self.tableau.c)
+        num_stages = len(self.tableau.c)
+        return is_usual and is_distinct and can_roll_stages(self.unroll, chart, num_stages)
 
 
 class _Reach:
@@ -137,24 +138,6 @@ class _Reach:
             direction = self.direction(rows, self.chart, self.kept)
             self.points[rows] = self.chart.flow(direction, self(rows[:-1]))
         return self.points[rows]
-
-
-def _products(stages: Sequence[Product]) -> list[Product]:
-    """The products of flows that lead to the points of a step, each after those that it begins."""
-    return list(dict.fromkeys(rows[:n] for rows in stages for n in range(len(rows) + 1)))
-
-
-def _flows(stages: Sequence[Product], times: Sequence[float]) -> list[Flow]:
-    """The flows of a step, each to a point of its own; the last of `stages` is its end."""
-    products = _products(stages)
-    found = {product: k for k, product in enumerate(products)}
-    evaluated = {rows: k for k, rows in enumerate(stages[:-1])}
-    flows = []
-    for product in products[1:]:
-        stage = evaluated.get(product)
-        c = times[stage] if stage is not None else 0.0
-        flows.append(Flow(found[product[:-1]], product[-1], found[product], stage, c))
-    return flows
 
 
 def _combined(row: Row, fields: Sequence[PyTree]) -> PyTree:

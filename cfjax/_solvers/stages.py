@@ -11,6 +11,7 @@ from jaxtyping import Array, PyTree, Real
 
 from .._field import AbstractFrozenField, describe, is_field
 from .._fields.elementwise import Elementwise
+from .._methods.tableau import Product, Row
 from .._xla import is_rewritten, pack, table
 from .chart import Chart
 
@@ -21,18 +22,6 @@ _SMALL = 100
 # Of a point in the chart of a field, with its columns. Where a loop is differentiated, it keeps
 # those of all stages for each of its turns.
 _SMALL_STEP = 2048
-
-
-class Flow(NamedTuple):
-    """One flow of a step: from which point, along which combination of the fields, to which point;
-    and the stage that is evaluated there, if any, with its time.
-    """
-
-    source: int
-    row: Sequence[Any]
-    target: int
-    stage: int | None
-    c: float
 
 
 def can_roll(unroll: bool | None, field: PyTree, point: PyTree, is_long: bool = False) -> bool:
@@ -197,10 +186,44 @@ def rolled_flows(
     return lax.scan(body, start, weights)[0]
 
 
-def rolled(chart: Chart, flows: Sequence[Flow], num_stages: int) -> list[PyTree]:
-    """The points that the flows lead to, after the first field of the step; and all its fields."""
-    if not is_plain(chart.fields[0]):
-        return _rolled_in_room(chart, flows, num_stages)
+class _Flow(NamedTuple):
+    """One flow of a step: from which point, along which combination of the fields, to which point;
+    and the stage that is evaluated there, if any, with its time.
+    """
+
+    source: int
+    row: Row
+    target: int
+    stage: int | None
+    c: float
+
+
+def _flows(products: Sequence[Product], stages: Sequence[Product], times: Row) -> list[_Flow]:
+    """The flows of a step, each to a point of its own; the last of `stages` is its end."""
+    found = {product: k for k, product in enumerate(products)}
+    evaluated = {rows: k for k, rows in enumerate(stages[:-1])}
+    flows = []
+    for product in products[1:]:
+        stage = evaluated.get(product)
+        c = float(times[stage]) if stage is not None else 0.0
+        flows.append(_Flow(found[product[:-1]], product[-1], found[product], stage, c))
+    return flows
+
+
+def rolled(chart: Chart, stages: Sequence[Product], times: Row) -> dict[Product, PyTree]:
+    """The points of a step, of which the first field is known; `chart` gets all its fields.
+
+    `stages` are the products of flows that lead to the stages, each to a point of its own, and to
+    the end; `times` are the times of the stages.
+    """
+    # Each after those that it begins with. The first has no flows.
+    products = list(dict.fromkeys(rows[:n] for rows in stages for n in range(len(rows) + 1)))
+    flows = _flows(products, stages, times)
+    run = _rolled if is_plain(chart.fields[0]) else _rolled_in_room
+    return dict(zip(products[1:], run(chart, flows, len(times)), strict=True))
+
+
+def _rolled(chart: Chart, flows: Sequence[_Flow], num_stages: int) -> list[PyTree]:
     first, start = chart.fields[0], chart.start
 
     def body(carry: Any, x: Any) -> Any:
@@ -222,7 +245,7 @@ def rolled(chart: Chart, flows: Sequence[Flow], num_stages: int) -> list[PyTree]
     return [_at(points, k + 1) for k in range(len(flows))]
 
 
-def _rolled_in_room(chart: Chart, flows: Sequence[Flow], num_stages: int) -> list[Any]:
+def _rolled_in_room(chart: Chart, flows: Sequence[_Flow], num_stages: int) -> list[Any]:
     """The same for a field with a chart of its own, which grows from stage to stage."""
     first: Any = chart.fields[0]
     room = first.room(chart.start, num_stages)
@@ -248,7 +271,7 @@ def _rolled_in_room(chart: Chart, flows: Sequence[Flow], num_stages: int) -> lis
     return [room.point(points[k + 1]) for k in range(len(flows))]
 
 
-def _turns(flows: Sequence[Flow], num_stages: int) -> tuple[Array, ...]:
+def _turns(flows: Sequence[_Flow], num_stages: int) -> tuple[Array, ...]:
     return (
         jnp.asarray([f.source for f in flows]),
         _padded([f.row for f in flows], num_stages),
