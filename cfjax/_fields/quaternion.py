@@ -10,7 +10,7 @@ from jaxtyping import Array, Float
 
 from .._field import AbstractAlgebraElement, describe
 from .._numerics.quaternion import Frame, Order, check_choice, increment, times, turn
-from .._numerics.rotate import cross, dexpinv
+from .._numerics.rotate import cross_product, dexpinv
 from .elementwise import check_point, each
 
 
@@ -67,7 +67,7 @@ class QuaternionRotation(AbstractAlgebraElement):
         return self._each(times, point)
 
     def bracket(self, other: Any) -> "QuaternionRotation":
-        return self._with(cross, other)
+        return self._with(cross_product, other)
 
     def dexpinv(self, other: Any, degree: int) -> "QuaternionRotation":
         """Exact, whatever the degree. Poles where `omega` makes full turns."""

@@ -7,7 +7,7 @@ import jax.numpy as jnp
 from jaxtyping import Array, Float
 
 from .._field import AbstractAlgebraElement
-from .._numerics.rotate import cross, dexpinv, increment, rotate
+from .._numerics.rotate import cross_product, dexpinv, increment, rotate
 from .elementwise import check_point, each
 
 
@@ -49,10 +49,10 @@ class Rotation(AbstractAlgebraElement):
 
     def tangent(self, point: Float[Array, "..."]) -> Float[Array, "..."]:
         self._check_point(point)
-        return each(cross, self._num_axes)(self.omega, point)
+        return each(cross_product, self._num_axes)(self.omega, point)
 
     def bracket(self, other: Any) -> "Rotation":
-        return self._with(cross, other)
+        return self._with(cross_product, other)
 
     def dexpinv(self, other: Any, degree: int) -> "Rotation":
         """Exact, whatever the degree. Poles where `omega` makes full turns."""

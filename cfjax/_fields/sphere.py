@@ -9,7 +9,7 @@ from jax import lax
 from jaxtyping import Array, Float
 
 from .._field import AbstractFrozenField
-from .._xla import smooth
+from .._numerics.vectors import smooth
 from .elementwise import elementwise
 from .low_rank import SpanSkew, check_like
 from .rotation import Rotation

@@ -6,15 +6,14 @@ meant as an attitude, and is an error. So is a matrix that is not orthogonal, wh
 rotation in particular.
 """
 
-from collections.abc import Sequence
-
 import equinox as eqx
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Float
 
-from .._xla import is_rewritten, pack, smooth
+from .._xla import is_rewritten
 from .quaternion import Order, check_choice, from_parts, parts
+from .vectors import cross, pack, smooth
 
 
 def quaternion_to_matrix(
@@ -73,8 +72,8 @@ def quaternion_rotate(
             f"The leading axes of q and x must agree or be 1, got q {q.shape} and x {x.shape}."
         )
     x0, x1, x2 = (x[..., k] for k in range(3))
-    twice = [factor * t for t in _cross(v, (x0, x1, x2))]
-    turned = zip((x0, x1, x2), twice, _cross(v, twice), strict=True)
+    twice = [factor * t for t in cross(v, (x0, x1, x2))]
+    turned = zip((x0, x1, x2), twice, cross(v, twice), strict=True)
     return pack([a + (w * b + c) for a, b, c in turned], axis=w.ndim, sums=True)
 
 
@@ -124,10 +123,6 @@ def quaternion_from_matrix(
     return from_parts((w * scale, x * scale, y * scale, z * scale), order)
 
 
-def _cross(a: Sequence[Array], b: Sequence[Array]) -> list[Array]:
-    return [a[k - 2] * b[k - 1] - a[k - 1] * b[k - 2] for k in range(3)]
-
-
 @smooth
 def _quaternion(q: Array | np.ndarray, order: Order) -> tuple[tuple[Array, ...], Array]:
     """The parts of q, and `2 / |q|^2`."""
@@ -163,7 +158,7 @@ def _checked_matrix(matrix: Array) -> Array:
         "u, _, vh = jnp.linalg.svd(matrix).",
     )
     (a, b, c), *others = ([matrix[..., j, k] for k in range(3)] for j in range(3))
-    x, y, z = _cross(*others)
+    x, y, z = cross(*others)
     return _error_unless(
         a * x + b * y + c * z > 0,
         matrix,

@@ -6,18 +6,15 @@ functions c_n of w^2.
 """
 
 import functools
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 from typing import Any
 
 import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
-from .._xla import pack
 from .stumpff import cotangent_excess, stumpff_1_2_apart
-
-# The two entries of a vector: numbers, or the rows or columns of a matrix.
-_Vector = Sequence[Any]
+from .vectors import Vector, entries, pack
 
 
 @functools.partial(jax.jit, static_argnames="frame")
@@ -35,7 +32,7 @@ def increment(
     """What `x` moves by in unit time, with a rounding as small as it is."""
     near, d1, d2 = stumpff_1_2_apart(w * w)
 
-    def way(w: Array, u: _Vector) -> _Vector:
+    def way(w: Array, u: Vector) -> Vector:
         # What c_1 and c_2 are at zero is apart for the reason that `rotate.increment` gives.
         return [
             near * (a + b / 2) + (d1 * a + d2 * b) for a, b in zip(u, _times_i(w, u), strict=True)
@@ -66,7 +63,7 @@ def dexpinv(
 
 
 def _moved(
-    way: Callable[[Array, _Vector], _Vector], w: Array, v: Array, x: Array, frame: str
+    way: Callable[[Array, Vector], Vector], w: Array, v: Array, x: Array, frame: str
 ) -> Array:
     """What `x` moves by, where `way` makes it of a velocity that turns with w."""
     vs = [v[0], v[1]]
@@ -75,12 +72,12 @@ def _moved(
         r0, r1 = x[:, 0], x[:, 1]
         v0, v1 = way(w, vs)
         return pack([*way(-w, _times_i(-w, [r0, r1])), r0 * v0 + r1 * v1], axis=1, sums=True)
-    entries = [x[k] for k in range(len(x))]
+    numbers = entries(x)
     if x.ndim == 2:
-        *rows, last = entries
+        *rows, last = numbers
         u = _plus(_times_i(w, rows), [last * a for a in vs])
         return pack([*way(w, u), jnp.zeros_like(last)], sums=True)
-    z, place = entries[:-2], entries[-2:]
+    z, place = numbers[:-2], numbers[-2:]
     if frame == "fixed":
         u = _plus(_times_i(w, place), vs)
     else:
@@ -89,10 +86,10 @@ def _moved(
     return pack([*turned, *way(w, u)], sums=True)
 
 
-def _times_i(w: Any, x: _Vector) -> _Vector:
+def _times_i(w: Any, x: Vector) -> Vector:
     """`i w x`."""
     return [-(w * x[1]), w * x[0]]
 
 
-def _plus(a: _Vector, b: _Vector) -> _Vector:
+def _plus(a: Vector, b: Vector) -> Vector:
     return [a[0] + b[0], a[1] + b[1]]

@@ -7,8 +7,8 @@ import jax
 from jax import lax
 from jaxtyping import Array, Float
 
-from .._xla import pack
 from .stumpff import stumpff_1_2_apart
+from .vectors import cross, dot, pack
 
 # In which frame a vector is given, and where the scalar part of a quaternion is stored.
 Frame = Literal["body", "fixed"]
@@ -76,7 +76,7 @@ def _change(
     `exp(u) = 1 + c_1 u - s c_2` with Stumpff functions of s. As in `rotate.py` what these are at
     zero is kept apart.
     """
-    s = a[0] * a[0] + a[1] * a[1] + a[2] * a[2]
+    s = dot(a, a)
     near, d1, d2 = stumpff_1_2_apart(s)
     d2 = d2 + correction * (near / 2 + d2)
     return tuple(
@@ -91,10 +91,5 @@ def _half(omega: Array) -> _Parts:
 
 def _times(a: _Parts, q: _Parts, frame: Frame) -> _Parts:
     w, *v = q
-    b, c = (a, v) if frame == "fixed" else (v, a)
-    return (
-        -(a[0] * v[0] + a[1] * v[1] + a[2] * v[2]),
-        w * a[0] + (b[1] * c[2] - b[2] * c[1]),
-        w * a[1] + (b[2] * c[0] - b[0] * c[2]),
-        w * a[2] + (b[0] * c[1] - b[1] * c[0]),
-    )
+    across = cross(a, v) if frame == "fixed" else cross(v, a)
+    return (-dot(a, v), *(w * x + y for x, y in zip(a, across, strict=True)))

@@ -6,19 +6,15 @@ With a the matrix of the cross product with w, and Stumpff functions c_n of |w|^
 """
 
 import functools
-from collections.abc import Sequence
 from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
-from .._xla import pack
 from . import rotate
 from .stumpff import stumpff_1_to_3_apart
-
-# The entries of a vector: numbers, or the rows or columns of a matrix.
-_Vector = Sequence[Any]
+from .vectors import Vector, cross, dot, entries, pack
 
 
 @functools.partial(jax.jit, static_argnames="frame")
@@ -26,15 +22,15 @@ def tangent(
     w: Float[Array, "3"], v: Float[Array, "3"], x: Float[Array, "..."], frame: str
 ) -> Float[Array, "..."]:
     """The velocity of `x`: a point, shape `(3,)`, or a pose, shape `(4, 4)` or `(7,)`."""
-    ws, vs, xs = map(_entries, (w, v, x))
+    ws, vs, xs = map(entries, (w, v, x))
     if x.shape == (3,):
         return pack(_velocity(ws, vs, xs, 1), sums=True)
     if x.ndim == 2 and frame == "fixed":
         *rows, last = xs
         return pack([*_velocity(ws, vs, rows, last), jnp.zeros_like(last)], sums=True)
     if x.ndim == 2:
-        *columns, _ = _entries(x.T)
-        return pack([*_cross(columns, ws), _dot(columns, vs)], axis=1, sums=True)
+        *columns, _ = entries(x.T)
+        return pack([*cross(columns, ws), dot(columns, vs)], axis=1, sums=True)
     q, place = xs[:4], xs[4:]
     velocity = _velocity(ws, vs, place, 1) if frame == "fixed" else _rotated(q, vs)
     return pack([*_product(q, _half(ws), frame), *velocity], sums=True)
@@ -45,19 +41,19 @@ def increment(
     w: Float[Array, "3"], v: Float[Array, "3"], x: Float[Array, "..."], frame: str
 ) -> Float[Array, "..."]:
     """What `x` moves by in unit time, with a rounding as small as it is."""
-    ws, vs, xs = map(_entries, (w, v, x))
+    ws, vs, xs = map(entries, (w, v, x))
     if x.shape == (7,):
         return _increment_of_quaternion(ws, vs, xs, frame)
-    c = _Coefficients(*stumpff_1_to_3_apart(_dot(ws, ws)))
+    c = _Coefficients(*stumpff_1_to_3_apart(dot(ws, ws)))
     if x.ndim == 1:
         return pack(_along_screw(c, ws, vs, xs, 1), sums=True)
     if frame == "fixed":
         *rows, last = xs
         return pack([*_along_screw(c, ws, vs, rows, last), jnp.zeros_like(last)], sums=True)
-    *columns, _ = _entries(x.T)
-    once = _cross(columns, ws)
-    turned = _turned(c, once, _cross(once, ws))
-    return pack([*turned, _dot(columns, _way(c, ws, vs))], axis=1, sums=True)
+    *columns, _ = entries(x.T)
+    once = cross(columns, ws)
+    turned = _turned(c, once, cross(once, ws))
+    return pack([*turned, dot(columns, _way(c, ws, vs))], axis=1, sums=True)
 
 
 @jax.jit
@@ -65,9 +61,9 @@ def bracket(
     w1: Float[Array, "3"], v1: Float[Array, "3"], w2: Float[Array, "3"], v2: Float[Array, "3"]
 ) -> tuple[Float[Array, "3"], Float[Array, "3"]]:
     """`ab - ba` for the matrices a and b of two motions."""
-    a, b = map(_entries, (w1, w2))
-    v = [x - y for x, y in zip(_cross(a, _entries(v2)), _cross(b, _entries(v1)), strict=True)]
-    return pack(_cross(a, b), sums=True), pack(v, sums=True)
+    a, b = map(entries, (w1, w2))
+    v = [x - y for x, y in zip(cross(a, entries(v2)), cross(b, entries(v1)), strict=True)]
+    return pack(cross(a, b), sums=True), pack(v, sums=True)
 
 
 @jax.jit
@@ -82,10 +78,10 @@ def dexpinv(
     return jax.jvp(rotate.dexpinv, (w1, w2), (v1, v2))
 
 
-def _increment_of_quaternion(w: _Vector, v: _Vector, x: _Vector, frame: str) -> Array:
+def _increment_of_quaternion(w: Vector, v: Vector, x: Vector, frame: str) -> Array:
     q, x = x[:4], x[4:]
     half = _half(w)
-    s = _dot(half, half)
+    s = dot(half, half)
     c = _Coefficients(*stumpff_1_to_3_apart(s))
     once = _product(q, half, frame)
     turned = _turned(c, once, _product(once, half, frame))
@@ -119,62 +115,46 @@ def _doubled(s: Array, c: _Coefficients) -> _Coefficients:
     )
 
 
-def _turned(c: _Coefficients, once: _Vector, twice: _Vector) -> _Vector:
+def _turned(c: _Coefficients, once: Vector, twice: Vector) -> Vector:
     """`c_1 A x + c_2 A^2 x` from `A x` and `A^2 x`."""
     return [c.near * (a + b / 2) + (c.d1 * a + c.d2 * b) for a, b in zip(once, twice, strict=True)]
 
 
-def _velocity(w: _Vector, v: _Vector, x: _Vector, weight: Any) -> _Vector:
+def _velocity(w: Vector, v: Vector, x: Vector, weight: Any) -> Vector:
     """Of a point in homogeneous coordinates, the last of which is the weight."""
-    return [a + weight * b for a, b in zip(_cross(w, x), v, strict=True)]
+    return [a + weight * b for a, b in zip(cross(w, x), v, strict=True)]
 
 
-def _along_screw(c: _Coefficients, w: _Vector, v: _Vector, x: _Vector, weight: Any) -> _Vector:
+def _along_screw(c: _Coefficients, w: Vector, v: Vector, x: Vector, weight: Any) -> Vector:
     """What such a point moves by: with its velocity u, `c_1 u + c_2 a u + c_3 (w . v) w`."""
     once = _velocity(w, v, x, weight)
-    turned = _turned(c, once, _cross(w, once))
-    pitch = (c.c3 * _dot(w, v)) * weight
+    turned = _turned(c, once, cross(w, once))
+    pitch = (c.c3 * dot(w, v)) * weight
     return [a + pitch * b for a, b in zip(turned, w, strict=True)]
 
 
-def _way(c: _Coefficients, w: _Vector, v: _Vector) -> _Vector:
+def _way(c: _Coefficients, w: Vector, v: Vector) -> Vector:
     """`V v`, the way of the origin."""
     c2 = c.near / 2 + c.d2
-    once = _cross(w, v)
-    bend = _cross(w, [c2 * a + c.c3 * b for a, b in zip(v, once, strict=True)])
+    once = cross(w, v)
+    bend = cross(w, [c2 * a + c.c3 * b for a, b in zip(v, once, strict=True)])
     return [a + b for a, b in zip(v, bend, strict=True)]
 
 
-def _product(q: _Vector, w: _Vector, frame: str) -> _Vector:
+def _product(q: Vector, w: Vector, frame: str) -> Vector:
     """The quaternion `w q` in the fixed frame or `q w` in the body's, for a vector w."""
     p, *x = q
-    across = _cross(w, x) if frame == "fixed" else _cross(x, w)
-    return [-_dot(x, w), *(p * a + b for a, b in zip(w, across, strict=True))]
+    across = cross(w, x) if frame == "fixed" else cross(x, w)
+    return [-dot(x, w), *(p * a + b for a, b in zip(w, across, strict=True))]
 
 
-def _rotated(q: _Vector, y: _Vector) -> _Vector:
+def _rotated(q: Vector, y: Vector) -> Vector:
     """The vector `q y q*`."""
     p, *x = q
-    along, across = 2 * _dot(x, y), _cross(x, y)
-    shrink = p * p - _dot(x, x)
+    along, across = 2 * dot(x, y), cross(x, y)
+    shrink = p * p - dot(x, x)
     return [shrink * a + (along * b + (2 * p) * d) for a, b, d in zip(y, x, across, strict=True)]
 
 
-def _half(w: _Vector) -> _Vector:
+def _half(w: Vector) -> Vector:
     return [a / 2 for a in w]
-
-
-def _cross(a: _Vector, b: _Vector) -> _Vector:
-    return [
-        a[1] * b[2] - a[2] * b[1],
-        a[2] * b[0] - a[0] * b[2],
-        a[0] * b[1] - a[1] * b[0],
-    ]
-
-
-def _dot(a: _Vector, b: _Vector) -> Any:
-    return a[0] * b[0] + a[1] * b[1] + a[2] * b[2]
-
-
-def _entries(x: Float[Array, "n *k"]) -> list[Array]:
-    return [x[k] for k in range(x.shape[0])]

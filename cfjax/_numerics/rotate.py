@@ -3,13 +3,13 @@
 import jax
 from jaxtyping import Array, Float
 
-from .._xla import pack
 from .stumpff import cotangent_excess, stumpff_1_2_apart
+from .vectors import cross, dot, entries, pack
 
 
-def cross(a: Float[Array, "3"], x: Float[Array, "3 *k"]) -> Float[Array, "3 *k"]:
+def cross_product(a: Float[Array, "3"], x: Float[Array, "3 *k"]) -> Float[Array, "3 *k"]:
     """The cross product of `a` with a vector, or with every column of a matrix."""
-    return pack(_cross((a[0], a[1], a[2]), (x[0], x[1], x[2])), sums=True)
+    return pack(cross(entries(a), entries(x)), sums=True)
 
 
 @jax.jit  # One trace for the many rotations of a step.
@@ -30,11 +30,10 @@ def increment(a: Float[Array, "3"], x: Float[Array, "3 *k"]) -> Float[Array, "3 
     in proportion to the number of steps. What c_1 and c_2 are at zero is exact, and is kept apart:
     then the roundings are smaller by the square of the angle.
     """
-    a0, a1, a2 = a[0], a[1], a[2]
-    s = a0 * a0 + a1 * a1 + a2 * a2
-    near, d1, d2 = stumpff_1_2_apart(s)
-    once = _cross((a0, a1, a2), (x[0], x[1], x[2]))
-    twice = _cross((a0, a1, a2), once)
+    axis = entries(a)
+    near, d1, d2 = stumpff_1_2_apart(dot(axis, axis))
+    once = cross(axis, entries(x))
+    twice = cross(axis, once)
     return pack(
         [near * (once[i] + twice[i] / 2) + (d1 * once[i] + d2 * twice[i]) for i in range(3)],
         sums=True,
@@ -44,16 +43,8 @@ def increment(a: Float[Array, "3"], x: Float[Array, "3 *k"]) -> Float[Array, "3 
 @jax.jit
 def dexpinv(a: Float[Array, "3"], x: Float[Array, "3"]) -> Float[Array, "3"]:
     """The inverse derivative of the exponential at `a`, `x - a*x/2 + a*(a*x)/12 - ...`."""
-    a0, a1, a2 = a[0], a[1], a[2]
-    excess = cotangent_excess(a0 * a0 + a1 * a1 + a2 * a2)
-    once = _cross((a0, a1, a2), (x[0], x[1], x[2]))
-    twice = _cross((a0, a1, a2), once)
+    axis = entries(a)
+    excess = cotangent_excess(dot(axis, axis))
+    once = cross(axis, entries(x))
+    twice = cross(axis, once)
     return pack([x[i] + (excess * twice[i] - once[i] / 2) for i in range(3)], sums=True)
-
-
-def _cross(a, x):
-    return (
-        a[1] * x[2] - a[2] * x[1],
-        a[2] * x[0] - a[0] * x[2],
-        a[0] * x[1] - a[1] * x[0],
-    )

@@ -11,8 +11,8 @@ import numpy as np
 from jax import lax
 from jaxtyping import Array, Float
 
-from .._xla import smooth
 from .polynomial import polynomial
+from .vectors import smooth
 
 
 def stumpff(n: int, s: Float[Array | np.ndarray, "*batch"]) -> Float[Array, "*batch"]:
