@@ -17,7 +17,7 @@ from matplotlib.ticker import EngFormatter
 
 import cfjax
 import results
-from cfjax._integrate import batch as _batch
+from cfjax._batch import batch as _batch
 from cfjax._measure import style as _style
 from cfjax._measure.work_precision import take_turns
 from cfjax.scenes import rigid_body

@@ -9,7 +9,7 @@ from matplotlib.figure import Figure
 
 import results
 from cfjax import WorkPrecision
-from cfjax._integrate.progress import on_terminal
+from cfjax._batch.progress import on_terminal
 from cfjax._measure import report as _report
 from cfjax._paper import rigid_body as paper
 from cfjax.scenes import heat, rigid_body, stiefel

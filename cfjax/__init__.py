@@ -20,7 +20,7 @@ from ._fields.matrix import LeftMatrix as LeftMatrix
 from ._fields.matrix import RightMatrix as RightMatrix
 from ._fields.quaternion import QuaternionRotation as QuaternionRotation
 from ._fields.rotation import Rotation as Rotation
-from ._integrate.integrate import integrate as integrate
+from ._integrate import integrate as integrate
 from ._methods.order_conditions import error_constant as error_constant
 from ._methods.order_conditions import order as order
 from ._methods.tableau import Tableau as Tableau
@@ -48,8 +48,9 @@ from ._xla import rewriting as rewriting
 
 if TYPE_CHECKING:
     from . import scenes as scenes
+    from ._batch.batch import BatchResult as BatchResult
+    from ._batch.batch import map_batch as map_batch
     from ._fields.affine import Affine as Affine
-    from ._fields.check import check_field as check_field
     from ._fields.conjugation import Congruence as Congruence
     from ._fields.conjugation import Conjugation as Conjugation
     from ._fields.linear_affine import LinearAffine as LinearAffine
@@ -59,8 +60,6 @@ if TYPE_CHECKING:
     from ._fields.rigid_motion import PlanarMotion as PlanarMotion
     from ._fields.rigid_motion import RigidMotion as RigidMotion
     from ._fields.sphere import SphereRotation as SphereRotation
-    from ._integrate.batch import BatchResult as BatchResult
-    from ._integrate.batch import map_batch as map_batch
     from ._measure.work_precision import WorkPrecision as WorkPrecision
     from ._measure.work_precision import work_precision as work_precision
     from ._methods.stability import stability_function as stability_function
@@ -92,6 +91,7 @@ if TYPE_CHECKING:
     from ._solvers.munthe_kaas import RKMK8 as RKMK8
     from ._solvers.retraction import CayleyRK4 as CayleyRK4
     from ._solvers.richardson import Richardson as Richardson
+    from ._testing import check_field as check_field
 
 __version__ = "0.2.0"
 
@@ -99,14 +99,14 @@ __version__ = "0.2.0"
 # coefficients takes longer than all the rest of this import.
 _NAMES_LATER = {
     "_fields.affine": ("Affine",),
-    "_fields.check": ("check_field",),
+    "_testing": ("check_field",),
     "_fields.conjugation": ("Congruence", "Conjugation"),
     "_fields.linear_affine": ("LinearAffine",),
     "_fields.low_rank": ("BorderedSkew", "LowRankSkew"),
     "_fields.operator_sum": ("OperatorSum",),
     "_fields.rigid_motion": ("PlanarMotion", "RigidMotion"),
     "_fields.sphere": ("SphereRotation",),
-    "_integrate.batch": ("BatchResult", "map_batch"),
+    "_batch.batch": ("BatchResult", "map_batch"),
     "_measure.work_precision": ("WorkPrecision", "work_precision"),
     "_methods.stability": ("stability_function",),
     "_numerics.transforms": (

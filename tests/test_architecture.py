@@ -26,6 +26,7 @@ ROWS = [
     {"_fields", "_methods"},
     {"_solvers"},
     {"_integrate"},
+    {"_batch", "_testing"},
     {"_measure"},
     {FACE},
     # These use the public names, as a user would.
@@ -36,10 +37,10 @@ ROWS = [
 AGAINST_THE_DIRECTION = {
     (
         "_solvers.error_control",
-        "_integrate.integrate",
+        "_integrate",
     ): "a starting step takes states and times as `integrate` does, with the same checks",
     (
-        "_integrate.fingerprint",
+        "_batch.fingerprint",
         FACE,
     ): "the version is part of a fingerprint; it is read when one is made, not at import",
 }
@@ -50,7 +51,7 @@ PRIVATE = {
     ("scenes.wilson_flow", "_xla"): "its field in the form that XLA vectorises",
     ("_paper", "_measure"): "reports, charts and flops are what it shows",
     ("_paper", "scenes"): "its problems",
-    ("_paper", "_integrate.integrate"): "counts a step without what estimates its error",
+    ("_paper", "_integrate"): "counts a step without what estimates its error",
     ("_paper.stiefel", "_solvers.munthe_kaas"): "measures its element and its flow apart",
 }
 
@@ -167,7 +168,7 @@ def test_there_is_no_circle():
 def test_the_imports_are_found():
     found = edges()
     assert found["_fields.rotation", "_field"] is False
-    assert found["_integrate.fingerprint", FACE] is True
+    assert found["_batch.fingerprint", FACE] is True
     assert (FACE, "scenes") not in found
     assert ("scenes.heat", FACE) in found
 

@@ -26,7 +26,7 @@ from jax.interpreters import ad, batching, mlir
 
 import cfjax
 import cfjax._xla
-from cfjax._integrate import fingerprint
+from cfjax._batch import fingerprint
 from cfjax._measure import flops
 from cfjax._xla import understood
 

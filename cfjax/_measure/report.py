@@ -21,8 +21,8 @@ from rich.console import Console, RenderableType
 from rich.progress import Progress
 from rich.table import Table
 
-from .._integrate.integrate import integrate
-from .._integrate.progress import on_terminal, progress_bar
+from .._batch.progress import on_terminal, progress_bar
+from .._integrate import integrate
 from .._signals import busy
 from .._solvers.commutator_free import CF4
 from .style import new_figure

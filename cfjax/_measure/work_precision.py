@@ -16,7 +16,8 @@ import jax.tree_util as jtu
 import numpy as np
 from jaxtyping import Array, Float, Int, PyTree
 
-from .._integrate.integrate import (
+from .._batch.progress import progress_bar
+from .._integrate import (
     as_state,
     check_own_tolerances,
     check_term_and_solver,
@@ -26,7 +27,6 @@ from .._integrate.integrate import (
     time_scalar,
     without_estimate,
 )
-from .._integrate.progress import progress_bar
 from .cost import Problem, cost_of_steps
 from .extra import paper_extra
 

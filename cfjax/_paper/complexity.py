@@ -9,7 +9,7 @@ from rich.progress import Progress
 from rich.table import Table
 
 from .. import CF3, CF4, CG3, CG4, CG5, RKMK, RKMK3, RKMK4, AbstractAlgebraElement, LieTerm
-from .._integrate.integrate import without_estimate
+from .._integrate import without_estimate
 from .._measure.cost import Problem, calls_of_steps
 from .._measure.report import Report
 

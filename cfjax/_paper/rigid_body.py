@@ -16,7 +16,7 @@ from rich.progress import Progress
 from rich.table import Table
 
 from .. import CF3, CF4, RKMK, RKMK3, RKMK4, LieTerm, WorkPrecision, integrate, work_precision
-from .._integrate.integrate import without_estimate
+from .._integrate import without_estimate
 from .._measure.flops import count_flops
 from .._measure.report import Report
 from .._measure.style import STYLES, finish, new_figure, number

@@ -18,7 +18,7 @@ from rich.progress import Progress
 from rich.table import Table
 
 from .. import CF4, RKMK4, CayleyRK4, LieTerm, WorkPrecision, combine, work_precision
-from .._integrate.integrate import without_estimate
+from .._integrate import without_estimate
 from .._measure.flops import count_flops
 from .._measure.report import Report
 from .._measure.style import STYLES, finish, new_figure

@@ -10,7 +10,7 @@ from jax import lax
 from jaxtyping import Array, PyTree, Real
 
 from .._field import describe, flow, tangent
-from .._integrate.integrate import as_state, check_term_and_solver, time_dtype, time_scalar
+from .._integrate import as_state, check_term_and_solver, time_dtype, time_scalar
 from .._term import LieTerm
 
 

@@ -6,11 +6,11 @@ from pathlib import Path
 
 ROOT = Path(__file__).parents[2]
 FOLDERS = {
-    "_[a-z]*.py": "Term and state",
+    "_[a-z]*.py": "Term, state and equal steps",
     "_fields/*.py": "Fields",
     "_solvers/*.py": "Methods",
     "_methods/*.py": "Tableaus",
-    "_integrate/*.py": "Integration and batches",
+    "_batch/*.py": "Batches",
     "_measure/*.py": "Measuring",
     "_numerics/*.py": "Numerics",
 }

@@ -5,7 +5,7 @@ import sys
 import pytest
 from rich.progress import Progress
 
-from cfjax._integrate.progress import progress_bar
+from cfjax._batch.progress import progress_bar
 
 
 def work(progress):

@@ -21,8 +21,8 @@ import pytest
 from jax.experimental import io_callback
 
 import cfjax
-from cfjax._integrate import batch as _batch
-from cfjax._integrate import fingerprint as _fingerprint
+from cfjax._batch import batch as _batch
+from cfjax._batch import fingerprint as _fingerprint
 
 TERM = cfjax.LieTerm(problems.rigid_body)
 SIZE, CHUNK = 23, 5  # A last chunk of three.

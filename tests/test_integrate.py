@@ -14,7 +14,7 @@ import problems
 import pytest
 
 import cfjax
-from cfjax._integrate import integrate as _integrate
+from cfjax import _integrate
 
 Y0 = jnp.asarray(problems.MOMENTUM)
 ARGS = jnp.asarray(problems.INERTIA)

@@ -13,10 +13,10 @@ from jax import lax
 from jax.core import Tracer
 from jaxtyping import Array, Int, PyTree, Real
 
-from .._numerics.checks import checked, error_if, needing
-from .._numerics.squaring import max_over_batch
-from .._solvers.base import AbstractLieSolver, State, is_finite, result_of
-from .._xla import repeat
+from ._numerics.checks import checked, error_if, needing
+from ._numerics.squaring import max_over_batch
+from ._solvers.base import AbstractLieSolver, State, is_finite, result_of
+from ._xla import repeat
 
 # Steps whose derivative is not rewritten.
 _FEW = 10

@@ -21,8 +21,8 @@ from jax.experimental import multihost_utils
 from jax.sharding import Mesh, NamedSharding, PartitionSpec
 from jaxtyping import Array, Bool, Int, PyTree
 
+from .._integrate import count
 from .fingerprint import digest, environment, fingerprint
-from .integrate import count
 from .progress import progress_bar
 
 

@@ -12,8 +12,8 @@ import numpy as np
 from jax import lax
 from jaxtyping import PyTree
 
-from .._field import AbstractAlgebraElement, AbstractFrozenField, combine, describe, flow
-from .._term import checked_part
+from ._field import AbstractAlgebraElement, AbstractFrozenField, combine, describe, flow
+from ._term import checked_part
 
 # What is compared: the text of the promise, what was found, what is expected, and a size whose
 # rounding the difference may have.
