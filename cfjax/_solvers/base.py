@@ -85,7 +85,10 @@ class AbstractLieSolver(diffrax.AbstractSolver):
             return field, no_compensation(field, y0)
 
         field, compensation = eqx.filter_eval_shape(at_start, y0)
-        compensation = jtu.tree_map(lambda c: jnp.zeros(c.shape, c.dtype), compensation)
+        # Like the state, which may be spread over a mesh.
+        compensation = with_sums(
+            lambda c, y: None if c is None else jnp.zeros_like(y), compensation, y0
+        )
         first = terms.vf(t0, y0, args) if self.first_same_as_last else None
         return State.checked(compensation, first, _admitted(jnp.asarray(t0), t1, field, y0))
 
