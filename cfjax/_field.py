@@ -37,8 +37,8 @@ class AbstractFrozenField(eqx.Module):
     `acts_on_subtree = True`: then its point, and what `flow` and `tangent` return, is the pytree
     that stands in its place in the state.
 
-    A class may also work in coordinates of its own within a step, a chart, where that is what makes
-    it cheap. Then it overrides `to_chart` and `from_chart` too.
+    A class may also work in coordinates of its own within a step, a chart, where that makes it
+    cheap. It then overrides `to_chart` and `from_chart` too.
     """
 
     # Whether the point that the field acts on is a pytree instead of one array.
@@ -124,8 +124,9 @@ class AbstractFrozenField(eqx.Module):
         """This field and the point where it is frozen, in the chart of the step.
 
         A solver calls it after every evaluation. `earlier` holds the fields of this step that are
-        in the chart; where there is none, `point` is the state itself. All flows of the step start
-        from the point returned then, so drift can be corrected there. By default nothing changes.
+        in the chart; at the first evaluation it is empty and `point` is the state itself. All flows
+        of the step start from the point returned then, so drift can be corrected there. By default
+        nothing changes.
         """
         del earlier
         return self, point

@@ -44,12 +44,12 @@ def check_field(fields: Sequence[AbstractFrozenField], point: PyTree) -> None:
     **Arguments:**
 
     - `fields`: at least two frozen fields of one class, with coordinates of about size one and
-      without special relations, such as random ones: else a mistake may cancel. Where a class
+      without special relations, such as random ones: otherwise a mistake may cancel. Where a class
       carries structure, such as a spectrum, all have the same.
     - `point`: a point on the manifold, of about size one: an array, or the part of the state that
       a class with `acts_on_subtree` acts on. float32, float64 or complex.
 
-    **Raises** `TypeError` or `ValueError` for arguments that are something else; `ValueError` with
+    **Raises** `TypeError` or `ValueError` for arguments of other types; `ValueError` with
     the first promise that is not kept, and by how much.
     """
     point = jtu.tree_map(jnp.asarray, point)

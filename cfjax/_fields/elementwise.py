@@ -124,7 +124,7 @@ def elementwise(field: AbstractFrozenField, num_axes: int = 1) -> AbstractFrozen
 
     **Returns:** a frozen field. It is an algebra element if `field` is one.
 
-    **Raises** `TypeError` if `field` is no frozen field or `num_axes` no positive int, and
+    **Raises** `TypeError` if `field` is not a frozen field or `num_axes` not a positive int, and
     `ValueError` for an array with fewer axes.
     """
     if not isinstance(field, AbstractFrozenField):

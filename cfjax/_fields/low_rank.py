@@ -132,7 +132,7 @@ class BorderedSkew(AbstractSkewElement):
         def product(x: Array) -> Array:
             return jnp.concatenate([matmul(row, x), x[:p]])
 
-        # Norms that are no less than the 2-norm. A skew matrix has its singular values in pairs.
+        # Norms that bound the 2-norm. A skew matrix has its singular values in pairs.
         half = jnp.sqrt(lax.stop_gradient(jnp.sum(corner * corner)) / 2) / 2
         size = jnp.max(jnp.sum(jnp.abs(lax.stop_gradient(square)), axis=1))
 

@@ -134,7 +134,7 @@ class RightMatrix(AbstractOneSided):
     """The linear field `x' = x a`, whose flow is `x -> x exp(a)`.
 
     It acts on a row, shape `(*batch, n)`, or a matrix, shape `(*batch, k, n)`. For an attitude
-    matrix this is an angular velocity in the moving frame. All else as for `LeftMatrix`.
+    matrix this is an angular velocity in the moving frame. Otherwise as `LeftMatrix`.
     """
 
     axis: ClassVar[int] = -1
@@ -153,7 +153,7 @@ def exp_times(
 ) -> Array:
     """Where the flow of one matrix leads one point.
 
-    `bound` is no less than the 2-norm of `a`, and `is_skew` whether it is skew-Hermitian. That is
+    `bound` bounds the 2-norm of `a`, and `is_skew` whether it is skew-Hermitian. That is
     looked at unless it is said.
     """
     if _is_thin(a, point):

@@ -180,7 +180,7 @@ class PlanarMotion(AbstractMotion):
     - `v`: shape `(*batch, 2)`, in lengths per unit of time.
     - `frame`: `"body"` or `"fixed"`.
 
-    All else as for `cfjax.RigidMotion`.
+    Otherwise as `cfjax.RigidMotion`.
     """
 
     _: KW_ONLY

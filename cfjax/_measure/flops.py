@@ -34,7 +34,8 @@ def count_flops(fun: Callable[..., PyTree], *args: PyTree) -> int:
     - A Fourier transform of length n counts `5 n log2 n`, half of that where one side is real, as
       is usual whatever the algorithm.
     - A scan counts its body as often as it runs. A conditional counts the branch taken, if that
-      follows from `args`, which may be `jax.ShapeDtypeStruct`s; else its most expensive branch.
+      follows from `args`, which may be `jax.ShapeDtypeStruct`s; otherwise its most expensive
+      branch.
     - Changes of sign, comparisons, selections, roundings, conversions, moves of data and integer
       arithmetic count nothing.
 

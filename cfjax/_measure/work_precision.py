@@ -46,20 +46,20 @@ class WorkPrecision(NamedTuple):
     **Fields:**
 
     - `method`: the method's name.
-    - `tolerance`: of an adaptive run, else NaN.
+    - `tolerance`: of an adaptive run, otherwise NaN.
     - `error`: the distance of the final state from the reference.
     - `num_steps`, `num_rejected`: attempted steps, and those among them that were rejected.
     - `num_evaluations`: evaluations of the field, in all attempted steps. NaN for implicit
       methods, where steps differ.
     - `num_flows`: flows of frozen fields in all attempted steps. A state of several parts moves in
-      one flow; a translation is none.
+      one flow; a translation does not count.
     - `flops`: floating-point operations of all attempted steps, as traced. NaN where a step has an
       operation without a rule. The step size controller's own are not in it.
     - `compile_seconds`: time to trace and compile the solve. One program serves all settings of a
       method.
     - `seconds`: the time of every repeated run, without the first. Its minimum is the figure to
       compare.
-    - `note`: why a run failed, else empty.
+    - `note`: why a run failed, otherwise empty.
     """
 
     method: tuple[str, ...]

@@ -32,7 +32,7 @@ _ROUNDING = 1e-9
 
 @lru_cache
 def continuous_extension(tableau: Tableau) -> ContinuousExtension:
-    """The tableau's own, else one of uniform order p - 1 for a method of order p, but at most 4.
+    """The tableau's own, or one of uniform order p - 1 for a method of order p, but at most 4.
 
     It uses the field at the end of the step only where the stages do not suffice.
 

@@ -1,4 +1,4 @@
-"""Commutator-free Magnus methods, for fields that depend on time alone: coefficients on any nodes.
+"""Commutator-free Magnus methods, for fields that depend on t but not on y: their coefficients.
 
 A step of length h from t is
 

@@ -250,7 +250,7 @@ def _coefficient(where: str, value: Any) -> Coefficient:
         if not math.isfinite(number):
             raise ValueError(f"{where} must be finite, got {value}.")
         if number == value:
-            # Arrays of floats write "not used" as 0.0, which is no rounded number.
+            # Arrays of floats write "not used" as 0.0, which is exact.
             return number if number else Fraction(0)
     raise TypeError(
         f"{where} must be an int, a Fraction or a float, got {value!r} of type "

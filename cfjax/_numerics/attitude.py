@@ -167,7 +167,8 @@ def _checked_matrix(matrix: Array) -> Array:
 
 
 def _error_unless(holds: Bool[Array, "*batch"], x: Array, message: str) -> Array:
-    # A step of a small system would feel the check more than all else, and the flow keeps lengths.
+    # A step of a small system would spend most of its time on the check, and the flow keeps
+    # lengths.
     return x if is_rewritten() else eqx.error_if(x, ~jnp.all(holds), message)
 
 

@@ -151,7 +151,8 @@ def _series(
     `h_i` are the coefficients of the power series of g^m with
     `g(x) = 1 / (1 - c_(n-1) x - .. - c_0 x^n)`.
     """
-    # Else all that uses one of them would compute them anew: alone, a derivative.
+    # Otherwise every use of one of them would compute all of them anew: outside of batches, a
+    # derivative would.
     return held(_series_of((m, first, count), c), in_batches=True, alone=m > 1)
 
 

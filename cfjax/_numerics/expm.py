@@ -84,7 +84,7 @@ def _plus(*terms: T) -> T:
 def taylor_from_second(
     scheme: Scheme, a: T, a2: T, product: Callable[[T, T], T] = small_product
 ) -> T:
-    """`exp(a) - I - a`, for a matrix or what else has a product."""
+    """`exp(a) - I - a`, for a matrix or anything else that has a product."""
     known = [a, a2]
     if scheme.powers == 3:
         known.append(product(a2, a))
@@ -120,10 +120,10 @@ def expm(a: Inexact[Array | np.ndarray, "n n"]) -> Inexact[Array, "n n"]:
     s = ⌈log₂(‖a²‖^½ / θ)⌉ ≥ 0 in the 1-norm and θ = 1.687 (2.346 in single precision). In double
     precision 4 products are enough up to ‖a²‖^½ = 0.676, if n > 4. For n = 2 and 3 there are other
     formulas, 2 to 4 times faster, and s = ⌈log₂(‖a‖ / 2^½)⌉ ≥ 0 in the Frobenius norm of a matrix
-    that is Hermitian or skew-Hermitian; else s depends on products of entries around cycles, and a
-    change of units does not alter it. There is no linear solve and no custom call. Under `jax.vmap`
-    every matrix is scaled by its own norm, and the products are those of the largest. A derivative
-    of any order works, forward and reverse.
+    that is Hermitian or skew-Hermitian; otherwise s depends on products of entries around cycles,
+    and a change of units does not alter it. There is no linear solve and no custom call. Under
+    `jax.vmap` every matrix is scaled by its own norm, and the products are those of the largest. A
+    derivative of any order works, forward and reverse.
 
     **Accuracy:** a backward error of a few units in the last place of the scaled matrix, doubled
     by every squaring at worst. exp(0) = I holds exactly, and so does its derivative. s may be up to
@@ -144,12 +144,12 @@ def expm(a: Inexact[Array | np.ndarray, "n n"]) -> Inexact[Array, "n n"]:
 def expm_parts(
     a: Inexact[Array, "n n"],
 ) -> tuple[Inexact[Array, ""], Inexact[Array, "n n"]]:
-    """`expm(a)` as `weight * (I + a) + rest`, with `weight` 1 if no squaring is needed, else 0.
+    """`expm(a)` as `weight * (I + a) + rest`, with `weight` 0 if squaring is needed, otherwise 1.
 
     To apply an exponential near I, as a step of an integrator does, add up what each part does:
     `weight * (x + a @ x) + rest @ x`. The rounding of the rest is as small as the rest is, of the
     size of a^2, and the same in every step with one a. So what exp(a) conserves drifts more slowly.
-    All else as for `expm`.
+    Otherwise as `expm`.
     """
     if a.ndim != 2 or a.shape[0] != a.shape[1]:
         raise ValueError(f"expm: `a` must be a square matrix, shape (n, n), got shape {a.shape}.")

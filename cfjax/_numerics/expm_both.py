@@ -38,10 +38,10 @@ def expm_both_parts(
 ) -> tuple[Inexact[Array, ""], Inexact[Array, "n n"], Inexact[Array, "n n"]]:
     """`w, p, m` with `exp(a) = w (I + a) + p` and `exp(-a) = w (I - a) + m`.
 
-    The weight w is 1 if no squaring is needed, else 0, as in `expm_parts`.
+    The weight w is 1 if no squaring is needed, otherwise 0, as in `expm_parts`.
 
     **Cost:** 6 matrix products and 2 s more, with s = ⌈log₂(‖a²‖^½ / θ)⌉ ≥ 0 in the 1-norm and
-    θ = 0.862 (2.645 in single precision). All else as for `expm`.
+    θ = 0.862 (2.645 in single precision). Otherwise as `expm`.
 
     The even and the odd part of exp are polynomials in a², evaluated in the form of Sastre, Linear
     Algebra Appl. 539 (2018), doi:10.1016/j.laa.2017.11.010.

@@ -86,7 +86,7 @@ def expm_minus_one_multiply(
     - `product`: multiplies an array like `x` by A. It may close over traced values.
     - `norm`: no less than a consistent norm of A, or its spectral radius if A is skew.
     - `is_skew`: whether A is skew-Hermitian, in some inner product.
-    - `dense`: what else gives the result, where it is cheaper.
+    - `dense`: another way to the result, taken where it is cheaper.
 
     **Cost:** in double precision 9, 13, 17 and 25 products for norms of 0.09, 0.4, 0.93 and 2.4,
     and 10.3 for each unit of larger ones; if A is skew 9, 12, 16, 24, 40, 64 and 160 for norms of

@@ -18,7 +18,7 @@ _CHOICES = {"frame": ("body", "fixed"), "order": ("wxyz", "xyzw")}
 
 
 def check_choice(name: str, value: Any) -> None:
-    """Raises `ValueError` if `value` is no frame or order; `name` says which of these it is."""
+    """Raises `ValueError` if `value` is not a frame or an order; `name` says which it should be."""
     choices = _CHOICES[name]
     if value not in choices:
         raise ValueError(f"{name} must be {choices[0]!r} or {choices[1]!r}, got {value!r}.")

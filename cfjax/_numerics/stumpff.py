@@ -77,7 +77,7 @@ def stumpff_1_2(s: Float[Array, "*batch"]) -> tuple[Float[Array, "*batch"], Floa
 
 @jax.custom_jvp
 def stumpff_1_2_apart(s: Float[Array, "*batch"]) -> tuple[Float[Array, "*batch"], ...]:
-    """`n, d1, d2` with `c_1 = n + d1` and `c_2 = n / 2 + d2`; n is 1 up to half a turn, else 0.
+    """`n, d1, d2` with `c_1 = n + d1` and `c_2 = n / 2 + d2`. n is 1 up to half a turn, 0 beyond.
 
     So for a small s the roundings of d1 and d2 are as small as s.
     """
@@ -129,9 +129,10 @@ def _apart(s: Float[Array, "*batch"]) -> tuple[Float[Array, "*batch"], ...]:
 def cotangent_excess(s: Float[Array, "*batch"]) -> Float[Array, "*batch"]:
     """`(1 - x/2 cot(x/2)) / x^2` with `s = x^2`, which is 1/12 at zero, and smooth there.
 
-    In a Lie algebra with `ad_u^3 = -s ad_u` the inverse derivative of the exponential at u is
-    `1 - ad_u / 2 + (this) ad_u^2`. It is `sum_k 2 / (4 pi^2 k^2 - s)`: a pole at a full turn, and a
-    polynomial to rounding. From the full turn on, where the exponential is no chart, it is 1/12.
+    In a Lie algebra with `ad_u^3 = -s ad_u` the inverse derivative of the exponential at u is `1 -
+    ad_u / 2 + (this) ad_u^2`. It is `sum_k 2 / (4 pi^2 k^2 - s)`: a pole at a full turn, and a
+    polynomial to rounding. From the full turn on, where the exponential is not invertible, it is
+    1/12.
     """
     pole = 4 * pi**2
     s = jnp.where(s < pole, s, 0)

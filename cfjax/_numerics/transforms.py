@@ -116,7 +116,7 @@ class FourierTransform(AbstractTransform):
 class RealFourierTransform(AbstractTransform):
     """The unitary discrete Fourier transform of real points: coefficients `k = 0..n//2` alone.
 
-    All else as for `FourierTransform`. Costs a real FFT of length `n`. A difference operator of
+    Otherwise as `FourierTransform`. Costs a real FFT of length `n`. A difference operator of
     odd order must have the eigenvalue zero at `k = n/2`, n even: no real point has another.
 
     **Arguments:** `n`, the number of points, which the coefficients do not tell.

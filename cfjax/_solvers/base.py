@@ -147,8 +147,8 @@ class AbstractLieSolver(diffrax.AbstractSolver):
             if first is None:
                 last = None
             elif is_rewritten() and self.is_of_state:
-                # From the end alone: it is one evaluation more, where XLA would else compute the
-                # step for each of its entries.
+                # From the end alone. That is one evaluation more, but XLA would otherwise compute
+                # the step for each entry of the field.
                 last = evaluate(1.0, at(y0, end, compensation))
             else:
                 last = values[-1]
@@ -207,7 +207,7 @@ class State(eqx.Module):
 
     - `compensation`: what rounding has cut off the parts of the state that are compensated sums.
     - `first`: the field at the start of the next step, where the last evaluation was there.
-    - `zero`: what every step adds to its time, if there is nothing else to carry the checks of the
+    - `zero`: what every step adds to its time, if no other array carries the checks of the
       start. diffrax drops what no step uses.
     """
 
@@ -271,7 +271,7 @@ def _admitted(t0: Array, t1: Any, field: PyTree, y0: PyTree) -> Real[Array, ""]:
 def _shared(
     compensation: PyTree, end: PyTree, error: PyTree, is_followed: bool
 ) -> tuple[PyTree, PyTree]:
-    """The end of a step and its error, which XLA would else compute for each use of an entry.
+    """The end of a step and its error, which XLA would otherwise compute for each use of an entry.
 
     A compensated sum uses each increment several times, and so does what follows from the end.
     """

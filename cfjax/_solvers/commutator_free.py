@@ -32,8 +32,8 @@ class AbstractCommutatorFree(AbstractLieSolver):
     costs no flow. That is blind, whatever the commutators do, where these cancel: for fields that
     do not depend on the state and are linear in time, as in the Landau-Zener problem.
 
-    Under a controller of constant steps nobody needs it, but small systems take up to twice as long
-    with it on CPU. `estimate=None` switches it off. (`cfjax.integrate` does.)
+    Constant steps do not need it, but small systems take up to twice as long with it on CPU.
+    `estimate=None` switches it off. (`cfjax.integrate` does.)
 
     A class whose tableau has an embedded method is a `diffrax.AbstractAdaptiveSolver`.
 
@@ -87,8 +87,8 @@ class AbstractCommutatorFree(AbstractLieSolver):
         if self.first_same_as_last:
             # The end, the last field and the error are made of it.
             end = reach.points[beta] = cut(end)
-        # All that follows is for error control and output within the step. It is dead code, left
-        # out by the compiler, where nobody asks for them.
+        # All that follows is for error control and output within the step. The compiler leaves it
+        # out where the caller asks for neither.
         within = continuous_extension(tableau)
         if any(map(tableau.uses_last, (self._embedded or (), *within))):
             chart.frozen(1.0, end)
@@ -183,7 +183,7 @@ class CommutatorFree(AbstractCommutatorFree, diffrax.AbstractAdaptiveSolver):
     One step costs `tableau.num_evaluations` evaluations of the field and `tableau.num_flows`
     flows. Its order is `cfjax.order(tableau)`. With an embedded method in the tableau there is an
     error estimate, which costs `tableau.num_embedded_flows` more. Dense output is by the tableau's
-    continuous extension, else by one that the order conditions decide, of order one below the
+    continuous extension, or by one that the order conditions decide, of order one below the
     method's but at most 4: for that a step evaluates the field at its end where the stages do not
     suffice.
 

@@ -33,7 +33,7 @@ def no_compensation(field: PyTree, y0: PyTree) -> PyTree:
 
 
 def with_sums(fun: Callable[..., Any], compensation: PyTree, *trees: PyTree) -> PyTree:
-    """`fun(c, *leaves)` for each part of the state, where c is None if it is no sum."""
+    """`fun(c, *leaves)` for each part of the state, where c is None unless the part is a sum."""
     return jtu.tree_map(fun, compensation, *trees, is_leaf=lambda x: x is None)
 
 

@@ -26,7 +26,7 @@ class ErrorNorm(eqx.Module):
     **Arguments:** `scales`, a pytree of positive real scalars whose structure is a prefix of the
     state's: one for each part, in its unit.
 
-    **Raises** `ValueError` for a scale that is not a scalar, or a structure that is no prefix of
+    **Raises** `ValueError` for a scale that is not a scalar, or a structure that is not a prefix of
     the state's; `TypeError` for a scale that is not real; a runtime error for a scale that is not
     positive.
     """

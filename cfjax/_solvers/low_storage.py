@@ -70,7 +70,7 @@ class AbstractLowStorage(AbstractCommutatorFree):
             jnp.asarray([float(x) for x in row[1:]]) for row in (self.a, self.b, self.tableau.c)
         )
         (_, end, before), later = lax.scan(stage, (first, after, start), coefficients)
-        # Not kept where nobody asks for output within the step.
+        # The compiler drops them where the caller asks for no output within the step.
         fields = [first, *(jtu.tree_map(itemgetter(i), later) for i in range(len(self.b) - 1))]
         path = Path.of(continuous_extension(self.tableau), chart.without_sums(start), fields)
         error = chart.difference(end, before) if penultimate else None
@@ -120,8 +120,8 @@ class BWRRK33(AbstractLowStorage):
 
 
 class BWRRK53(AbstractLowStorage, diffrax.AbstractAdaptiveSolver):
-    """Order 3, 5 evaluations, 5 flows. The estimate, of order 2, costs nothing. Dense output
-    of order 3.
+    """Order 3, 5 evaluations, 5 flows. The estimate, of order 2, comes at no extra cost.
+    Dense output of order 3.
 
     Source: Bazavov, BIT 62 (2022), doi:10.1007/s10543-021-00892-x.
     """
@@ -144,8 +144,8 @@ class BWRRK53(AbstractLowStorage, diffrax.AbstractAdaptiveSolver):
 
 
 class CK34(AbstractLowStorage, diffrax.AbstractAdaptiveSolver):
-    """Order 3, 4 evaluations, 4 flows. The estimate, of order 2, costs nothing. Dense output
-    of order 3.
+    """Order 3, 4 evaluations, 4 flows. The estimate, of order 2, comes at no extra cost.
+    Dense output of order 3.
 
     Source: Carpenter & Kennedy, NASA TM-109112 (1994).
     """

@@ -1,4 +1,4 @@
-"""Commutator-free Magnus methods: high order for fields that depend on time alone."""
+"""Commutator-free Magnus methods: high order for fields that depend on t but not on y."""
 
 from collections.abc import Callable
 from typing import Any, ClassVar, Literal
@@ -24,10 +24,10 @@ from .stages import can_roll, rolled_flows
 class AbstractMagnus(AbstractLieSolver):
     """Flows of linear combinations of the fields at some times within the step.
 
-    For `y' = A(t) y`, and any other field whose coordinates depend on time alone.
+    For `y' = A(t) y`, and any other field whose coordinates depend on t but not on y.
 
     Where the method has an embedded one, the end of that is compared with the step's: the error
-    estimate is `y1 - embedded`. Under a controller of constant steps nobody needs it:
+    estimate is `y1 - embedded`. Constant steps do not need it:
     `estimate=None` switches it off. (`cfjax.integrate` does.)
 
     `unroll` says whether the flows stand one by one in the program (True) or in a loop (False);
@@ -72,10 +72,10 @@ class AbstractMagnus(AbstractLieSolver):
             # What is wrong with the field itself, it says itself.
             eqx.filter_eval_shape(field, y0)
             raise TypeError(
-                f"{name} takes fields that depend on time alone, and the field gives the state to "
+                f"{name} takes fields that depend on t but not on y, and the field gives y to "
                 "an operation that jax.vmap does not take, such as a function of the host "
-                "(jax.pure_callback) without vmap_method. What that returns counts as dependent on "
-                "the state: give it the time alone, or use another method, for example "
+                "(jax.pure_callback) without vmap_method. What it returns counts as dependent on "
+                "y: call it with t only, or use another method, for example "
                 "cfjax.CF4()."
             ) from error
         if found:
@@ -149,7 +149,7 @@ def _depends_on_state(solver: str, place: str, part: Any) -> str:
     name = type(part).__name__ if is_field(part) else "a translation"
     advice = "" if is_field(part) else " Return y' = A(t) y as cfjax.LeftMatrix(A(t))."
     return (
-        f"{solver} takes fields that depend on time alone, and for y{place} the field, {name}, "
+        f"{solver} takes fields that depend on t but not on y, and for y{place} the field, {name}, "
         f"depends on the state.{advice} Use a method for such fields, for example cfjax.CF4()."
     )
 

@@ -91,8 +91,8 @@ class AbstractMuntheKaas(AbstractLieSolver):
         v = _combine_nonzero(self.b, elements)
         end = chart.flow(v, chart.start)
         error = None
-        # All that follows is for error control and output within the step. It is dead code, left
-        # out by the compiler, where nobody asks for them.
+        # All that follows is for error control and output within the step. The compiler leaves it
+        # out where the caller asks for neither.
         if self.estimate is not None and self.b_error is not None:
             elements = self.estimating(elements, v, end, chart)
             off = _combine_nonzero(self.b_error, elements)
@@ -101,7 +101,7 @@ class AbstractMuntheKaas(AbstractLieSolver):
             else:
                 embedded = chart.flow(combine((1.0, -1.0), (v, off)), chart.start)
                 error = chart.difference(end, embedded)
-        # All are results then, and XLA would compute those before anew for each.
+        # All of them are results then, and XLA would compute the step anew for each.
         elements = once_together(elements, alone=True)
         path = Path.of(self.continuous_extension, chart.without_sums(chart.start), elements)
         return Move(chart.from_start(end), path, error)
@@ -127,7 +127,8 @@ def _sixths(*numerators: int | Fraction) -> Row:
 class RKMK3(AbstractMuntheKaas, diffrax.AbstractAdaptiveSolver):
     """Munthe-Kaas method of order 3 with one commutator: 3 evaluations, 3 flows.
 
-    The estimate, with the midpoint rule as embedded method, costs nothing. Dense output of order 2.
+    The estimate, with the midpoint rule as embedded method, comes at no extra cost. Dense output of
+    order 2.
 
     Source: Munthe-Kaas & Owren, Computations in a free Lie algebra, Phil. Trans. R. Soc. A 357
     (1999), doi:10.1098/rsta.1999.0361.
@@ -185,12 +186,12 @@ class RKMK(AbstractMuntheKaas, diffrax.AbstractAdaptiveSolver):
 
     Each stage but the first takes the inverse derivative of the exponential, `dexpinv` of the
     field: a closed form for `Rotation`, `QuaternionRotation`, `RigidMotion` and `PlanarMotion`,
-    else a series. That of a method of order q has up to q - 2 commutators, q - 3 if q is odd and
-    above 3. A step must not make full turns, where the exponential cannot be inverted.
+    otherwise a series. That of a method of order q has up to q - 2 commutators, q - 3 if q is odd
+    and above 3. A step must not make full turns, where the exponential cannot be inverted.
 
-    The estimate costs nothing, but where the tableau is first same as last: then it needs the field
-    at the end of the step, which is the next one's first. Dense output of order q - 1: from the
-    stages alone, with 4 evaluations more for that of `diffrax.Dopri8`.
+    The estimate comes at no extra cost, unless the tableau is first same as last: then it needs the
+    field at the end of the step, which is the next one's first. Dense output of order q - 1: from
+    the stages alone, with 4 evaluations more for that of `diffrax.Dopri8`.
 
     **Arguments:** `tableau`, a `diffrax.ButcherTableau`, for example `diffrax.Dopri5.tableau`;
     `estimate`, `"algebra"`, `"group"` or None, and `unroll`, as in the other methods.
@@ -346,8 +347,8 @@ class RKMK8(RKMK):
     """Munthe-Kaas method of order 8 of Dormand and Prince's pair 8(7): 13 evaluations, 13 flows.
 
     `RKMK(diffrax.Dopri8.tableau)`, for fields whose `dexpinv` is a closed form: of others it takes
-    72 commutators a step. The estimate costs nothing. Dense output of order 7, for 4 evaluations
-    and flows more.
+    72 commutators a step. The estimate comes at no extra cost. Dense output of order 7, for 4
+    evaluations and flows more.
 
     Source: Prince & Dormand, High order embedded Runge-Kutta formulae, J. Comput. Appl. Math. 7
     (1981), doi:10.1016/0771-050X(81)90010-3.

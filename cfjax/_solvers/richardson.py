@@ -18,8 +18,8 @@ class Richardson(diffrax.AbstractAdaptiveSolver, diffrax.AbstractWrappedSolver):
     Every step is made twice: as one step, to `y1`, and as two halves, to `y2`. For a solver of
     order p the error of `y2` is `e = (y1 - y2) / (2^p - 1)`, up to terms of higher order. The
     solver goes on from `y2`, whose error it estimates; with `as_in_paper` from `y1`, see there. The
-    difference is taken in the ambient space: it is no tangent vector, but on a manifold too it is
-    of order `h^(p+1)`.
+    difference is taken in the ambient space: it is not a tangent vector, but on a manifold too it
+    is of order `h^(p+1)`.
 
     A tolerance for `e` would be one for each step, and tighter tolerances take more steps: the
     error at the end over the tolerance would grow like `tol^(-1/(p+1))`. So the estimate is that

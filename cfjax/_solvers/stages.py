@@ -238,7 +238,7 @@ def _rolled(chart: Chart, flows: Sequence[_Flow], num_stages: int) -> list[PyTre
         )
         return (_put(points, target, point), _put(fields, stage, field)), None
 
-    # One more row for what is no stage.
+    # One more row for the flows that lead to no stage.
     carry = _stack(start, len(flows) + 1), _stack(first, num_stages + 1)
     (points, fields), _ = lax.scan(body, carry, _turns(flows, num_stages))
     chart.fields[:] = [_at(fields, k) for k in range(num_stages)]

@@ -11,7 +11,7 @@ from jax.experimental.xla_metadata import set_xla_metadata
 def call(fun: Callable[..., Any]) -> Callable[..., Any]:
     """`fun` of arrays as a function of its own in the program, on CPU.
 
-    Else XLA fuses it with what follows, and computes it anew for every entry that this makes of it.
+    Otherwise XLA fuses it with what follows, and computes it anew for every entry of that.
     For functions of large arrays: what goes in and comes out goes through memory.
     """
     compiled = jax.jit(fun)

@@ -124,7 +124,7 @@ class _Call(NamedTuple):
 
 
 def in_columns(eqn: JaxprEqn, values: Sequence[Any], fixed: Sequence[bool]) -> list[Any] | None:
-    """The results of one operation, if there is a rule for it, else None."""
+    """The results of one operation, if there is a rule for it, otherwise None."""
     name = eqn.primitive.name
     avals: list[Any] = [v.aval for v in (*eqn.invars, *eqn.outvars)]
     if eqn.effects or not is_understood(eqn):

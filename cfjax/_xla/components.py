@@ -63,7 +63,7 @@ def literal(v: Literal) -> Any:
 
 
 def in_components(jaxpr: Jaxpr, eqn: JaxprEqn, values: list[Any]) -> Sequence[Any] | None:
-    """The results of one operation, if there is a rule for it, else None."""
+    """The results of one operation, if there is a rule for it, otherwise None."""
     name = eqn.primitive.name
     avals: list[Any] = [v.aval for v in eqn.outvars]
     if not all(is_numeric(v.aval) for v in (*eqn.invars, *eqn.outvars)):

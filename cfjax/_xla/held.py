@@ -30,7 +30,7 @@ def held(
 ) -> list[Array]:
     """The same arrays, through memory.
 
-    Else XLA may compute them anew for everything that uses them. In a batch, where memory is what
+    Otherwise XLA may compute them anew for every use. In a batch, where memory is what
     takes time, only if asked for, on CPU; outside of batches only if `alone`; and if not `now`,
     only where this is differentiated; and if `is_cut`, only in a program that is long.
     """
@@ -49,7 +49,7 @@ def cut(tree: PyTree) -> PyTree:
 def once_together(tree: PyTree, alone: bool) -> PyTree:
     """The same arrays, all of which are used several times in what follows.
 
-    Else each use would compute the step anew: in a batch, in our own loop, and if `alone` also
+    Otherwise each use would compute the step anew: in a batch, in our own loop, and if `alone` also
     outside of these. They go together, as what one is made of others may be made of too.
     """
     leaves, structure = jtu.tree_flatten(tree)

@@ -132,7 +132,7 @@ def by_components(fun: Callable[[PyTree], PyTree], y: PyTree) -> PyTree:
         plain=program.plain,
         order=1 if is_derived else 0,
     )
-    # One by one: what nobody uses is not computed.
+    # One by one: what is not used is not computed.
     return jtu.tree_map(lambda x: _whole(through(x)), out, is_leaf=_is_apart)
 
 
@@ -359,7 +359,7 @@ def _results(
 def _apart(
     jaxpr: Jaxpr, eqn: JaxprEqn, values: list[Any], fixed: Sequence[bool], form: _Form
 ) -> Sequence[Any] | None:
-    """The results of one operation, taken apart, if there is a rule for it, else None."""
+    """The results of one operation, taken apart, if there is a rule for it, otherwise None."""
     if eqn.primitive is held_p:
         if eqn.params["is_cut"] and not form.is_long:
             return values

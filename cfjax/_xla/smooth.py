@@ -70,7 +70,7 @@ class _NotSmooth(Exception):
 def by_fixed(eqn: JaxprEqn, fixed: Sequence[bool]) -> bool:
     """Whether this is a real division by what is fixed, of what is not; in no half precision.
 
-    A division by a literal is XLA's affair, which has the products itself.
+    XLA itself makes a product of a division by a literal.
     """
     if eqn.primitive.name != "div" or isinstance(eqn.invars[1], Literal):
         return False
@@ -83,8 +83,8 @@ def by_fixed(eqn: JaxprEqn, fixed: Sequence[bool]) -> bool:
 def scaled_reciprocal(divisor: PyTree) -> tuple[PyTree, PyTree]:
     """s and 1 / (s a), for each number a: x / a is (x s) / (s a).
 
-    1 / a is no normal number where a is one of the largest, and XLA takes it for zero. s is a power
-    of two, small there and otherwise one. x s is zero only where x / a is.
+    Where a is one of the largest numbers, 1 / a is not a normal one, and XLA takes it for zero. s
+    is a power of two, small there and otherwise one. x s is zero only where x / a is.
     """
 
     def scale(a: Array) -> Array:

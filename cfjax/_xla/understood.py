@@ -123,7 +123,7 @@ def is_readable(jaxpr: Jaxpr) -> bool:
 
     - It has no branches and loops, as in the exponential of a matrix. They would stay whole, and
       what is around them, taken apart, XLA would compute anew for each of the entries that go in.
-    - It has no function with a rule for reverse mode alone.
+    - It has no function with a rule for reverse mode only.
     - It is on one device, as far as the types of its values say, in no `jax.shard_map`.
     - It says nothing to the compiler about some of its operations.
     """

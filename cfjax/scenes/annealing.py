@@ -6,7 +6,7 @@ field. If the ramp is slow against the smallest gap on the way, it ends in that 
 chain, with all spins up. Energies are in units of the coupling, times in units of its inverse.
 
 A state has shape `(2^n,)`, with the first spin as the highest bit; a bit of 0 is up. No matrix is
-formed: the X_j flip axes of a view, and all else is a diagonal. Frozen, the field is a sum of two
+formed: the X_j flip axes of a view, and the rest is a diagonal. Frozen, the field is a sum of two
 fixed operators, and the state keeps its norm.
 
 Source: Kadowaki & Nishimori, Quantum annealing in the transverse Ising model, Phys. Rev. E 58

@@ -5,7 +5,7 @@ the coupling the levels would cross at t = 0; with it they avoid each other by t
 slowly the state follows its level, and fast it stays what it is: from minus to plus infinity it
 stays with the probability `exp(-2 pi coupling^2 / rate)`.
 
-The field depends on time alone, and linearly. Frozen, it is a skew-Hermitian matrix, whose flow
+The field depends on t but not on y, and linearly. Frozen, it is a skew-Hermitian matrix, whose flow
 keeps the norm.
 
 Source: Zener, Non-adiabatic crossing of energy levels, Proc. R. Soc. A 137 (1932),

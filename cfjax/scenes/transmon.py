@@ -15,7 +15,7 @@ So the pulse begins and ends with zero. It is to swap the two lowest levels. Wha
 the third level, whose distance from the second is nearly the same: a short pulse reaches it too. A
 quadrature in proportion to the slope of the in-phase part mends most of it.
 
-The field depends on time alone. Frozen, it is a skew-Hermitian matrix, whose flow keeps a
+The field depends on t but not on y. Frozen, it is a skew-Hermitian matrix, whose flow keeps a
 propagator unitary and a state's norm. Nothing is averaged: the drive has its fast oscillation.
 
 Source: Motzoi, Gambetta, Rebentrost & Wilhelm, Simple pulses for elimination of leakage in weakly
