@@ -152,7 +152,7 @@ def equal_steps(
     order = 0 if isinstance(num_steps, int) and num_steps < _FEW else 1
 
     def advance(carry, number):
-        # XLA would take apart a loop of one turn, and compute the step anew for each of its uses.
+        # XLA would scalarise a loop of one turn, and compute the step anew for each of its uses.
         if isinstance(number, int) and number == 1:
             return step(carry)
         if checkpoint_every is None:

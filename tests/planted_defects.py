@@ -627,23 +627,23 @@ DEFECTS = [
     # Programs for XLA.
     Defect(
         "_solvers/base.py",
-        "moving, error = once_together((moving, error), alone=is_used)",
-        "moving = once_together(moving, alone=is_used)",
+        "moving, error = materialised_together((moving, error), alone=is_used)",
+        "moving = materialised_together(moving, alone=is_used)",
         "an error that XLA computes together with its norm",
-        "xla/test_held.py -k error_of_a_step",
+        "xla/test_materialise.py -k error_of_a_step",
     ),
     Defect(
         "_solvers/commutator_free.py",
-        "reach.points[beta] = cut(end)",
+        "reach.points[beta] = materialised_if_long(end)",
         "reach.points[beta] = end",
         "a long step that is not cut",
-        "xla/test_held.py -k long_step",
+        "xla/test_materialise.py -k long_step",
     ),
     Defect(
         "_xla/table.py",
         "if where() or not is_on()",
         "if True or not is_on()",
-        "stages of a long step that are not taken apart",
+        "stages of a long step that are not scalarised",
         "xla/test_table.py",
     ),
     Defect(
@@ -675,18 +675,18 @@ DEFECTS = [
         "xla/test_loop.py",
     ),
     Defect(
-        "_xla/columns.py",
+        "_xla/struct_of_arrays.py",
         "sides[k] = x.sides[k]",
         "pass",
         "in a sum, entries that are equal along an axis count once",
-        "xla/test_columns.py",
+        "xla/test_struct_of_arrays.py",
     ),
     Defect(
-        "_xla/columns.py",
+        "_xla/struct_of_arrays.py",
         "[n + x.places for n, x in zip(firsts, arrays, strict=True)]",
         "[x.places for n, x in zip(firsts, arrays, strict=True)]",
         "joined arrays that all have the entries of the first",
-        "xla/test_columns.py",
+        "xla/test_struct_of_arrays.py",
     ),
     Defect(
         "_xla/understood.py",
@@ -696,7 +696,7 @@ DEFECTS = [
         "xla/test_understood.py",
     ),
     Defect(
-        "_xla/components.py",
+        "_xla/scalars.py",
         'params | {"fill_value": -1, "mode": mode}',
         'params | {"mode": mode}',
         "what fills out of bounds is taken for an entry",
@@ -717,7 +717,7 @@ DEFECTS = [
         "xla/test_understood.py",
     ),
     Defect(
-        "_xla/components.py",
+        "_xla/scalars.py",
         "return extreme, total / functools.reduce(operator.add, shares)",
         "return extreme, total",
         "a derivative of a maximum that counts each of its ties",
@@ -727,7 +727,7 @@ DEFECTS = [
         "_xla/program.py",
         "raise _Declined",
         "pass",
-        "updates in place within a program that is taken apart",
+        "updates in place within a program that is scalarised",
         "xla/test_understood.py",
     ),
 ]

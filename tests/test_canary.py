@@ -275,7 +275,7 @@ def test_a_primitive_has_one_of_its_names(names):
 
 @pytest.mark.parametrize("name", [*EXAMPLES, *EITHER])
 def test_the_rules_know_all_parameters(name):
-    """An operation with one more is not taken apart any more, and its programs are slow."""
+    """An operation with one more is not scalarised any more, and its programs are slow."""
     fun, args, _ = EITHER[name] if isinstance(name, tuple) else EXAMPLES[name]
     for found, eqn in equations(jax.make_jaxpr(fun)(*args)).items():
         if found in RULES:
@@ -419,7 +419,7 @@ def test_a_function_learns_that_it_is_batched():
         return jnp.asarray(True), False
 
     assert not is_batched(1.0)
-    assert jax.vmap(is_batched, out_axes=None)(X), "cfjax/_xla/components.py asks custom_vmap."
+    assert jax.vmap(is_batched, out_axes=None)(X), "cfjax/_xla/scalars.py asks custom_vmap."
 
 
 def test_metadata_reaches_a_call():
@@ -433,7 +433,7 @@ def test_metadata_reaches_a_call():
 
     text = jax.jit(fun).lower(X).as_text()
     assert re.search(r'call @identity.*inlineable = "false"', text), (
-        "cfjax/_xla/held.py keeps a call from being inlined by this attribute of the call."
+        "cfjax/_xla/materialise.py keeps a call from being inlined by this attribute of the call."
     )
 
 

@@ -14,7 +14,7 @@ from jax.sharding import NamedSharding
 from jax.sharding import PartitionSpec as P
 
 import cfjax
-from cfjax._xla.held import held
+from cfjax._xla.materialise import materialised
 from cfjax._xla.pack import pack, unpack
 
 ARGS = np.array([0.9, 0.6, 0.3])
@@ -63,7 +63,7 @@ def packed(ys):
         entries = unpack(y)
         # Of an entry of the batch, and one that all have.
         whole = pack([*entries, jnp.asarray(2.0)])
-        along = held([whole, *entries], in_batches=True)
+        along = materialised([whole, *entries], in_batches=True)
         return jnp.sum(along[0]) * pack(along[1:], sums=True)
 
     return jax.vmap(one)(ys) + jax.grad(lambda ys: jnp.sum(jax.vmap(one)(ys) ** 2))(ys)

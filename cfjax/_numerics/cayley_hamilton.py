@@ -16,7 +16,7 @@ import numpy as np
 from jax import lax
 from jaxtyping import Array, Inexact
 
-from .._xla import held, unpack
+from .._xla import materialised, unpack
 from .matmul import small_product
 from .squaring import exponent, max_over_batch, squared, squarings
 
@@ -153,7 +153,7 @@ def _series(
     """
     # Otherwise every use of one of them would compute all of them anew: outside of batches, a
     # derivative would.
-    return held(_series_of((m, first, count), c), in_batches=True, alone=m > 1)
+    return materialised(_series_of((m, first, count), c), in_batches=True, alone=m > 1)
 
 
 @functools.partial(jax.custom_jvp, nondiff_argnums=(0,))

@@ -19,7 +19,7 @@ from .._field import is_field
 from .._numerics.checks import needing
 from .._numerics.squaring import max_over_batch
 from .._term import product, velocity
-from .._xla import by_components, is_rewritten, once_in_rows, once_together
+from .._xla import is_rewritten, materialised_in_rows, materialised_together, scalarised
 from .chart import Chart
 from .compensation import added, at, no_compensation, with_sums
 from .dense import Interpolation, Path
@@ -108,7 +108,7 @@ class AbstractLieSolver(diffrax.AbstractSolver):
         return changed
 
     def step(self, terms, t0, t1, y0, args, solver_state, made_jump):
-        # Not in a loop that is taken apart, which JAX does not know of, nor where times are known.
+        # Not in a loop that is scalarised, which JAX does not know of, nor where times are known.
         is_usual = isinstance(t0, Tracer) and not is_rewritten()
         step = _step_once if is_usual else AbstractLieSolver._step
         return step(self, terms, t0, t1, y0, args, solver_state, made_jump)
@@ -127,7 +127,7 @@ class AbstractLieSolver(diffrax.AbstractSolver):
             else:
                 c = jnp.asarray(c, jnp.result_type(t0))
                 t = jnp.where(c == 1, t1, t0 + c * (t1 - t0))
-            return once_in_rows(terms.vf(t, y, args))
+            return materialised_in_rows(terms.vf(t, y, args))
 
         def move(y0):
             control = terms.contr(t0, t1)
@@ -154,7 +154,7 @@ class AbstractLieSolver(diffrax.AbstractSolver):
                 last = values[-1]
             return (end, last), (error, made.path)
 
-        (end, last), (error, path) = by_components(move, y0)
+        (end, last), (error, path) = scalarised(move, y0)
         path = self.extended(path, lambda c, y: product(terms, evaluate(c, y), terms.contr(t0, t1)))
         y1, compensation = added(y0, end, compensation)
         state = State(compensation, last, solver_state.zero)
@@ -168,7 +168,7 @@ class AbstractLieSolver(diffrax.AbstractSolver):
 class Move(eqx.Module):
     """A step: where it ends, the way there for output within it, and an estimate of its error.
 
-    `is_shared` says that the end has gone through memory, with all that the estimate is made of.
+    `is_shared` says that the end is materialised, with all that the estimate is made of.
     """
 
     end: PyTree
@@ -277,7 +277,7 @@ def _shared(
     """
     is_used = is_followed or error is not None
     moving = with_sums(lambda c, z: z if is_used or c is not None else None, compensation, end)
-    moving, error = once_together((moving, error), alone=is_used)
+    moving, error = materialised_together((moving, error), alone=is_used)
     return with_sums(
         lambda c, z, new: new if is_used or c is not None else z, compensation, end, moving
     ), error

@@ -8,7 +8,7 @@ import jax.tree_util as jtu
 from jaxtyping import Array, PyTree, Real
 
 from .._field import flow, from_chart, is_field, to_chart
-from .._xla import once_in_rows
+from .._xla import materialised_in_rows
 from .compensation import at, with_sums
 
 
@@ -73,7 +73,7 @@ class Chart:
             return carried(field, point)
 
         def part(f: Any, p: PyTree, y: Array | None) -> PyTree:
-            return carried(f, p) if y is None else once_in_rows(p + f.increment(y + p))
+            return carried(f, p) if y is None else materialised_in_rows(p + f.increment(y + p))
 
         starts = with_sums(lambda c, y: None if c is None else y, self._compensation, self._y0)
         return jtu.tree_map(part, field, point, starts, is_leaf=is_field)
@@ -98,7 +98,7 @@ class Chart:
 def carried(field: PyTree, point: PyTree) -> PyTree:
     """`flow(field, point)`, computed once: with leading axes neighbours would compute it anew."""
     return jtu.tree_map(
-        lambda f, p: once_in_rows(flow(f, p)) if is_field(f) else flow(f, p),
+        lambda f, p: materialised_in_rows(flow(f, p)) if is_field(f) else flow(f, p),
         field,
         point,
         is_leaf=is_field,

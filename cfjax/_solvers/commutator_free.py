@@ -16,7 +16,7 @@ from .._methods import tableau as _tableau
 from .._methods.continuous_extension import continuous_extension
 from .._methods.proved import order_of
 from .._methods.tableau import Product, Row, Tableau
-from .._xla import cut, once_together, smooth
+from .._xla import materialised_if_long, materialised_together, smooth
 from .base import AbstractLieSolver, Move, check_choice
 from .chart import Chart
 from .dense import Path
@@ -86,7 +86,7 @@ class AbstractCommutatorFree(AbstractLieSolver):
         end = reach(beta)
         if self.first_same_as_last:
             # The end, the last field and the error are made of it.
-            end = reach.points[beta] = cut(end)
+            end = reach.points[beta] = materialised_if_long(end)
         # All that follows is for error control and output within the step. The compiler leaves it
         # out where the caller asks for neither.
         within = continuous_extension(tableau)
@@ -104,7 +104,7 @@ class AbstractCommutatorFree(AbstractLieSolver):
             return Move(chart.from_start(end), path, error)
         apart = chart.difference(end, reach(alpha[-1]))
         # A ratio is where a function of XLA's ends, and all of it is needed before.
-        end, error, apart = once_together((chart.from_start(end), error, apart), alone=True)
+        end, error, apart = materialised_together((chart.from_start(end), error, apart), alone=True)
         way = jtu.tree_map(jnp.subtract, end, chart.from_start(chart.start))
         return Move(end, path, jtu.tree_map(_seen, error, apart, way), is_shared=True)
 

@@ -14,7 +14,7 @@ from jaxtyping import Array, Float, PyTree, Real
 
 from .._field import combine, from_chart
 from .._methods.tableau import ContinuousExtension
-from .._xla import by_components
+from .._xla import scalarised
 from .chart import carried
 from .stages import can_roll, rolled_flows
 
@@ -95,7 +95,7 @@ class Path(eqx.Module):
                 point = self.move(combine(*zip(*row, strict=True)), point)
             return from_chart(fields[0], point)
 
-        return by_components(end, self.arrays)
+        return scalarised(end, self.arrays)
 
 
 @lru_cache

@@ -23,7 +23,7 @@ from .._field import (
 from .._methods.continuous_extension import RungeKuttaExtension, runge_kutta_extension
 from .._methods.order_conditions import runge_kutta_order
 from .._methods.tableau import ContinuousExtension, Row
-from .._xla import are_long, is_rewritten, once_together
+from .._xla import are_long, is_rewritten, materialised_together
 from .base import AbstractLieSolver, Move, check_choice
 from .chart import Chart
 from .dense import Path
@@ -102,7 +102,7 @@ class AbstractMuntheKaas(AbstractLieSolver):
                 embedded = chart.flow(combine((1.0, -1.0), (v, off)), chart.start)
                 error = chart.difference(end, embedded)
         # All of them are results then, and XLA would compute the step anew for each.
-        elements = once_together(elements, alone=True)
+        elements = materialised_together(elements, alone=True)
         path = Path.of(self.continuous_extension, chart.without_sums(chart.start), elements)
         return Move(chart.from_start(end), path, error)
 

@@ -32,10 +32,10 @@ def repeat(
     `step` may close over traced values. Reverse mode keeps one carry a step, and computes the step
     again. It needs a Python int; an array makes one program for every number of steps, without
     `keep`. What `keep` returns are parts of the carry; each is stacked along a new first axis. Of
-    derivatives those up to `order` are taken apart, as the step is; they take long to compile.
+    derivatives those up to `order` are scalarised, as the step is; they take long to compile.
 
     On CPU a loop of small steps is fast if XLA has few operations left after fusion, and it fuses
-    towards each result all that leads to it. So where the step is taken apart there is one result:
+    towards each result all that leads to it. So where the step is scalarised there is one result:
     the numbers of the carry travel as one vector, which is kept as it is. In a derivative the
     numbers among the parameters, that is, what `step` closes over, travel with them unchanged: in
     the reversed loop they are the sums of the derivatives, which otherwise would be results of
@@ -81,7 +81,7 @@ def _loop(
 
 
 class _Step(NamedTuple):
-    """A step of leaves and parameters that are split, and the same before it was taken apart; and
+    """A step of leaves and parameters that are split, and the same before it was scalarised; and
     up to which derivative it is.
     """
 
@@ -128,7 +128,7 @@ def _scan(
     parameters_move: Sequence[bool],
     is_kept: bool,
 ) -> tuple[list[Array], list[Array] | None]:
-    """The loop, where those parameters travel that are in components, if they move.
+    """The loop, where those parameters travel that are scalars, if they move.
 
     Numbers of the carry that do not move, such as what sums have lost, are a vector of their own:
     a derivative does not carry it.

@@ -3,11 +3,11 @@
 A derivative of a program of scalars has several times its operations. It becomes a program of its
 own here, so that when it is compiled its length is known. A long program is a sequence of pieces,
 between which few values are on their way, and its derivatives are sequences of derivatives of the
-pieces. What is too long for one of XLA's functions is compiled as several, with these values sent
-through memory.
+pieces. What is too long for one of XLA's functions is compiled as several, which materialise
+these values.
 
 A derivative that would take too long to compile is JAX's own of the program as it was before it was
-taken apart (`_Plain`).
+scalarised (`_Plain`).
 """
 
 import functools
@@ -35,7 +35,7 @@ from jax.extend.core import (
 from jax.interpreters import ad, batching, mlir
 from jaxtyping import Array, PyTree
 
-from .held import held
+from .materialise import materialised
 from .pack import pack_p, unpack_p
 from .scope import Place
 
@@ -43,7 +43,7 @@ from .scope import Place
 # In long programs it then computes single ones exponentially often: in values never as measured, in
 # first derivatives from some 8000 operations on, counted as they are written, within diffrax's loop
 # from 4000, in batches from 5000, and in second ones earlier. Those are compiled as several, though
-# to send what they share through memory takes time.
+# to materialise what they share takes time.
 _WHOLE = {"loop": (math.inf, 6000, 3000), "step": (math.inf, 3500, 3000)}
 _WHOLE_IN_BATCHES = (math.inf, 4500, 3000)
 _GROUP = 1000
@@ -69,7 +69,7 @@ def operation(
 
     `fun` may close over traced values, and has no effects. Reverse mode keeps the arguments and
     computes everything again, as with `jax.checkpoint`. `plain` is the same function before it was
-    taken apart, and closes over nothing that is traced: derivatives beyond `order` are of that.
+    scalarised, and closes over nothing that is traced: derivatives beyond `order` are of that.
     """
     leaves, structure = jtu.tree_flatten(args)
     leaves = list(map(jnp.asarray, leaves))
@@ -109,7 +109,7 @@ def operation(
     if plain is not None and is_closed:
 
         def of_plain_leaves(*operands):
-            # What comes first are constants of the program that was taken apart.
+            # What comes first are constants of the program that was scalarised.
             leaves = operands[len(operands) - structure.num_leaves :]
             outs = jtu.tree_leaves(plain(*jtu.tree_unflatten(structure, leaves)))
             return [outs[k] for k in smooth]
@@ -122,7 +122,7 @@ def operation(
 
 
 class _Plain:
-    """The program of an operation before it was taken apart. It is traced if it is needed."""
+    """The program of an operation before it was scalarised. It is traced if it is needed."""
 
     def __init__(self, fun: Callable[..., Sequence[Array]], operands: Sequence[Any]):
         self.fun, self.operands = fun, operands
@@ -298,13 +298,16 @@ def _run(*operands, program, kind, plain):
     env = dict(zip((*jaxpr.constvars, *jaxpr.invars), (*program.consts, *operands), strict=True))
     # Together with the operands, so that no other operation shares what is computed from them.
     smooth = [v for v in jaxpr.invars if _is_inexact(env[v])]
-    env.update(zip(smooth, held([env[v] for v in smooth], in_batches=True), strict=True))
+    new = materialised([env[v] for v in smooth], in_batches=True)
+    env.update(zip(smooth, new, strict=True))
     for start, stop in groups:
         part, taken, given = _part(jaxpr, start, stop)
         outs = _flattened(part, *(env[v] for v in taken))
         smooth = [k for k, x in enumerate(outs) if _is_inexact(x)]
         if smooth and stop < len(jaxpr.eqns):
-            for k, x in zip(smooth, held([outs[k] for k in smooth], in_batches=True), strict=True):
+            for k, x in zip(
+                smooth, materialised([outs[k] for k in smooth], in_batches=True), strict=True
+            ):
                 outs[k] = x
         env.update(zip(given, outs, strict=True))
     return _results(jaxpr, env)

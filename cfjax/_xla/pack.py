@@ -1,4 +1,4 @@
-"""Arrays taken apart along an axis and put together, in a form that XLA fuses.
+"""Arrays scalarised along an axis and put together, in a form that XLA fuses.
 
 As primitives of JAX, because the derivatives matter most. `jnp.stack` makes XLA compute what it
 stacks once for every entry, and what JAX transposes `x[i]` or `jnp.where` into breaks a program of

@@ -1,8 +1,8 @@
 """A step on single numbers instead of short vectors, and on one array for each of their entries.
 
 XLA fuses numbers well and vectors of three badly: it computes what several entries need once for
-each of them, or sends it through memory. So the program of a step is read, and evaluated again with
-every small array held as its entries. In a state with leading axes, many short vectors, the entries
+each of them, or materialises it. So the program of a step is read, and evaluated again with
+every small array as its entries. In a state with leading axes, many short vectors, the entries
 are arrays of these axes.
 """
 
@@ -25,19 +25,18 @@ from jax.extend.core import (
 )
 from jaxtyping import Array, PyTree
 
-from .columns import Columns, columns, conformed, in_columns
-from .components import (
+from .materialise import materialised, materialised_p
+from .operation import evaluate, operation, without_dead_code
+from .pack import pack_p, unpack_p
+from .scalars import (
     MOVES,
-    Components,
-    components,
-    in_components,
+    Scalars,
     is_inexact,
     is_small,
     literal,
+    on_scalars,
+    scalars,
 )
-from .held import held, held_p
-from .operation import evaluate, operation, without_dead_code
-from .pack import pack_p, unpack_p
 from .scope import (
     MAX_LENGTH,
     MAX_SIZE,
@@ -52,9 +51,10 @@ from .scope import (
     within,
 )
 from .smooth import by_fixed, has_reciprocals, scaled_reciprocal
+from .struct_of_arrays import StructOfArrays, conformed, on_struct_of_arrays, struct_of_arrays
 from .understood import REDUCTIONS, is_in_place, is_readable
 
-# A state is taken apart if all of it is numbers and short vectors, so many entries together, and if
+# A state is scalarised if all of it is numbers and short vectors, so many entries together, and if
 # a step is not longer than that, counted in operations on single numbers: the time to compile grows
 # with it, and more so in derivatives. `README.md` here has what that buys and costs. What a loop
 # carries may have what sums have lost of each entry too, the number of the step and a result.
@@ -72,23 +72,23 @@ _CALLS = frozenset(("jit", "pjit"))
 
 
 def split(tree: PyTree, rows: bool = False) -> PyTree:
-    """The tree with every small array in components, and with `rows` short vectors in columns."""
+    """The tree, small arrays as scalars and with `rows` short vectors as structs of arrays."""
 
     def apart(x: Any) -> Any:
         if is_small(x):
-            return components(x)
-        return columns(x) if rows and is_rows(x) else x
+            return scalars(x)
+        return struct_of_arrays(x) if rows and is_rows(x) else x
 
     return jtu.tree_map(apart, tree, is_leaf=_is_apart)
 
 
 def split_like(other: PyTree, tree: PyTree) -> PyTree:
-    """The tree taken apart as another one of its structure, shapes and dtypes is."""
+    """The tree scalarised as another one of its structure, shapes and dtypes is."""
 
     def apart(like: Any, x: Any) -> Any:
-        if isinstance(like, Columns):
+        if isinstance(like, StructOfArrays):
             return conformed(x, like)
-        return components(x) if isinstance(like, Components) else _whole(x)
+        return scalars(x) if isinstance(like, Scalars) else _whole(x)
 
     return jtu.tree_map(apart, other, tree, is_leaf=_is_apart)
 
@@ -99,19 +99,19 @@ def join(tree: PyTree) -> PyTree:
 
 
 def _is_apart(x: Any) -> bool:
-    return isinstance(x, Components | Columns)
+    return isinstance(x, Scalars | StructOfArrays)
 
 
 def _whole(x: Any) -> Any:
     return x.whole() if _is_apart(x) else x
 
 
-def by_components(fun: Callable[[PyTree], PyTree], y: PyTree) -> PyTree:
+def scalarised(fun: Callable[[PyTree], PyTree], y: PyTree) -> PyTree:
     """`fun(y)`, computed on single numbers where `y` is a small state of short vectors.
 
     The result agrees with that of `fun` to rounding. `fun` may close over traced values. Operations
     that have no rule here get the array whole. Where `y` is another state, the program is too long
-    or cannot be taken apart, and inside of `trace`, this is `fun(y)`.
+    or cannot be scalarised, and inside of `trace`, this is `fun(y)`.
     """
     program = None if where() else trace(fun, y, "step")
     if program is None:
@@ -120,10 +120,10 @@ def by_components(fun: Callable[[PyTree], PyTree], y: PyTree) -> PyTree:
     # What is around may use single entries, so that XLA computes anew what these share. It does
     # little harm to a step, but much to a derivative.
     is_derived = program.length <= _SHORT_TO_DIFFERENTIATE
-    through = _held if is_derived else lambda x: x
+    through = _materialised if is_derived else lambda x: x
     # The derivative of an adaptive loop computes a step at one place and uses its derivative at
     # another. What that needs of the step is many numbers: to compute them again is cheaper than to
-    # send them there through memory.
+    # materialise them.
     out = operation(
         program.run,
         *through((y, parameters)),
@@ -137,13 +137,13 @@ def by_components(fun: Callable[[PyTree], PyTree], y: PyTree) -> PyTree:
 
 
 def are_long(fun: Callable[[PyTree], PyTree], y: PyTree, times: int) -> bool:
-    """Whether so many of `fun(y)`, and what combines them, are too long to be taken apart."""
+    """Whether so many of `fun(y)`, and what combines them, are too long to be scalarised."""
     code = without_dead_code(jax.make_jaxpr(fun)(y).jaxpr)
     return times * _operations(code) > _MAX_OPERATIONS - _COMBINATIONS
 
 
 class Program(NamedTuple):
-    """A function that is taken apart, and what it closes over.
+    """A function that is scalarised, and what it closes over.
 
     `run(y, parameters)` takes both split, returns what is split and closes over nothing traced.
     `plain` is the same, but for how it computes: as the function does. With `rows` the state has
@@ -158,11 +158,11 @@ class Program(NamedTuple):
 
 
 class _Declined(Exception):
-    """A program has something that is not to be taken apart."""
+    """A program has something that is not to be scalarised."""
 
 
 def trace(fun: Callable[[PyTree], PyTree], y: PyTree, place: Place) -> Program | None:
-    """`fun` as a program that is taken apart at `y`; None if that does not pay or cannot be done.
+    """`fun` as a program that is scalarised at `y`; None if that does not pay or cannot be done.
 
     It must have no effects and be readable (`is_readable`).
     """
@@ -181,7 +181,7 @@ def trace(fun: Callable[[PyTree], PyTree], y: PyTree, place: Place) -> Program |
         return unread(error)
     before = ClosedJaxpr(code, jaxpr.consts)
     if place == "loop" or num_operations > _SHORT_TO_DIFFERENTIATE:
-        # Where a step is not taken apart its stages may be one loop.
+        # Where a step is not scalarised its stages may be one loop.
         with rewriting(False):
             rolled, shape = jax.make_jaxpr(fun, return_shape=True)(y)
         before = rolled if jtu.tree_structure(shape) == structure else before
@@ -273,14 +273,14 @@ def _operations_of(eqn: JaxprEqn) -> int:
 
 
 def _entries(shape: tuple[int, ...]) -> int:
-    """About how many numbers or whole arrays an array is taken apart into, if it is."""
+    """About how many numbers or whole arrays an array is scalarised into, if it is."""
     if math.prod(shape) <= MAX_SIZE:
         return math.prod(shape)
     return shape[-1] if len(shape) > 1 and shape[-1] <= MAX_LENGTH else 1
 
 
 class _Form(NamedTuple):
-    """How a program is taken apart.
+    """How a program is scalarised.
 
     Whether arrays have leading axes, the program is long, and products with reciprocals take the
     place of divisions by what is fixed.
@@ -309,7 +309,7 @@ def _evaluate(
 
     variables = (*jaxpr.constvars, *jaxpr.invars)
     for variable, value, is_one in zip(variables, values, fixed, strict=True):
-        env[variable] = components(value) if is_small(value) else value
+        env[variable] = scalars(value) if is_small(value) else value
         if not is_one:
             loose.add(variable)
     # Each reciprocal once.
@@ -347,7 +347,7 @@ _PARAMETERS_OF_A_PRODUCT = jax.make_jaxpr(lax.mul)(1.0, 1.0).jaxpr.eqns[0].param
 def _results(
     jaxpr: Jaxpr, eqn: JaxprEqn, values: list[Any], fixed: Sequence[bool], form: _Form
 ) -> list[Any]:
-    """The results of one operation: taken apart, if there is a rule for it."""
+    """The results of one operation: scalarised, if there is a rule for it."""
     outs = _apart(jaxpr, eqn, values, fixed, form)
     if outs is None and is_in_place(eqn):
         raise _Declined
@@ -359,27 +359,27 @@ def _results(
 def _apart(
     jaxpr: Jaxpr, eqn: JaxprEqn, values: list[Any], fixed: Sequence[bool], form: _Form
 ) -> Sequence[Any] | None:
-    """The results of one operation, taken apart, if there is a rule for it, otherwise None."""
-    if eqn.primitive is held_p:
+    """The results of one operation, scalarised, if there is a rule for it, otherwise None."""
+    if eqn.primitive is materialised_p:
         if eqn.params["is_cut"] and not form.is_long:
             return values
         # What is whole is in memory anyway.
         groups = [jtu.tree_flatten(x) for x in values]
-        new = iter(held([x for group, _ in groups for x in group], **eqn.params))
+        new = iter(materialised([x for group, _ in groups for x in group], **eqn.params))
         return [shape.unflatten(next(new) for _ in group) for group, shape in groups]
     if form.rows:
         sizes = (math.prod(getattr(v.aval, "shape", ())) for v in (*eqn.invars, *eqn.outvars))
-        if any(isinstance(x, Columns) for x in values) or max(sizes) > MAX_SIZE:
-            return in_columns(eqn, values, fixed)
-    return in_components(jaxpr, eqn, values)
+        if any(isinstance(x, StructOfArrays) for x in values) or max(sizes) > MAX_SIZE:
+            return on_struct_of_arrays(eqn, values, fixed)
+    return on_scalars(jaxpr, eqn, values)
 
 
-def _held(tree: Any) -> Any:
-    """The same, with all single numbers through memory where this is differentiated."""
+def _materialised(tree: Any) -> Any:
+    """The same, with all single numbers materialised where this is differentiated."""
     leaves, structure = jtu.tree_flatten(tree)
     places = [k for k, x in enumerate(leaves) if _is_number(x)]
     if places:
-        new = held([leaves[k] for k in places], in_batches=True, now=False)
+        new = materialised([leaves[k] for k in places], in_batches=True, now=False)
         for k, x in zip(places, new, strict=True):
             leaves[k] = x
     return jtu.tree_unflatten(structure, leaves)

@@ -9,9 +9,9 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-# Of vectors that are taken apart. A pose is a quaternion and a position.
+# Of vectors that are scalarised. A pose is a quaternion and a position.
 MAX_LENGTH = 7
-# Of arrays all of whose entries are taken apart, as they come up within a step: the 4 x 4 matrix of
+# Of arrays all of whose entries are scalarised, as they come up within a step: the 4 x 4 matrix of
 # a quaternion, and the 4 x 4 x 4 numbers that multiply two.
 MAX_SIZE = 64
 
@@ -62,7 +62,7 @@ Place = Literal["step", "loop"]
 
 
 class _Around(NamedTuple):
-    """What is taken apart around a function that is being traced."""
+    """What is scalarised around a function that is being traced."""
 
     place: Place | None = None
     has_rows: bool = False
@@ -75,7 +75,7 @@ _around = jax.make_user_context(_Around())
 
 
 def within(place: Place, rows: bool) -> contextlib.AbstractContextManager:
-    """The time in which a program is traced that is to be taken apart as a whole.
+    """The time in which a program is traced that is to be scalarised as a whole.
 
     With `rows` its state has short vectors along leading axes.
     """
@@ -83,7 +83,7 @@ def within(place: Place, rows: bool) -> contextlib.AbstractContextManager:
 
 
 def within_equal_steps() -> contextlib.AbstractContextManager:
-    """The time in which a step is traced that a loop makes, but not taken apart as a whole."""
+    """The time in which a step is traced that a loop makes, but not scalarised as a whole."""
     return _around(_around.value._replace(in_equal_steps=True))
 
 
@@ -93,22 +93,22 @@ def in_equal_steps() -> bool:
 
 
 def where() -> Place | None:
-    """What is taken apart around here: one step, or a loop of many."""
+    """What is scalarised around here: one step, or a loop of many."""
     return _around.value.place
 
 
 def has_rows() -> bool:
-    """Whether short vectors along leading axes are taken apart around here."""
+    """Whether short vectors along leading axes are scalarised around here."""
     return _around.value.has_rows
 
 
 def is_rewritten() -> bool:
-    """Whether this is part of a program that is taken apart."""
+    """Whether this is part of a program that is scalarised."""
     return where() is not None
 
 
 def is_short(x: Any) -> bool:
-    """Whether this is a vector that is taken apart."""
+    """Whether this is a vector that is scalarised."""
     return np.ndim(x) == 1 and 1 <= np.size(x) <= MAX_LENGTH and is_numeric(x)
 
 

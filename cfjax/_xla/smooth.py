@@ -123,7 +123,7 @@ def _follow(jaxpr: Jaxpr, is_fixed: dict[Any, bool], inexact: set[Any], is_smoot
 
 def _is_smooth(eqn: JaxprEqn, reached: Sequence[bool]) -> bool:
     name = eqn.primitive.name
-    if name == "cfjax_held":
+    if name == "cfjax_materialised":
         return True
     if name == "convert_element_type":
         aval: Any = eqn.outvars[0].aval

@@ -22,7 +22,7 @@ def table(
 ) -> list[PyTree] | None:
     """After the known trees k, for each row and x the tree `fun(x, sum_j row[j] k[j])`.
 
-    For what is too long to be taken apart as a whole: a turn of the loop is on single numbers, and
+    For what is too long to be scalarised as a whole: a turn of the loop is on single numbers, and
     a tree is one vector, so that XLA makes few functions of a turn. `fun` must return a tree of the
     structure, shapes and dtypes that it gets.
 

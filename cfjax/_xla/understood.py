@@ -119,10 +119,10 @@ _CONTROL = frozenset(("cond", "scan", "while"))
 
 
 def is_readable(jaxpr: Jaxpr) -> bool:
-    """Whether a program can be taken apart.
+    """Whether a program can be scalarised.
 
     - It has no branches and loops, as in the exponential of a matrix. They would stay whole, and
-      what is around them, taken apart, XLA would compute anew for each of the entries that go in.
+      what is around them, scalarised, XLA would compute anew for each of the entries that go in.
     - It has no function with a rule for reverse mode only.
     - It is on one device, as far as the types of its values say, in no `jax.shard_map`.
     - It says nothing to the compiler about some of its operations.

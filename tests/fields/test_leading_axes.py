@@ -357,7 +357,7 @@ def test_the_program_does_not_grow_with_the_batch():
 
         return len(jax.jit(run).lower(jnp.ones((n, 3))).as_text().splitlines())
 
-    # Few vectors are left as they are, many are taken apart.
+    # Few vectors are left as they are, many are scalarised.
     assert lines(7) == lines(20)
     assert lines(100) == lines(1000)
 

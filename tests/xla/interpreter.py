@@ -451,7 +451,7 @@ _RULES: dict[str, Callable[..., Any]] = {
     "bitcast_convert_type": _bitcast,
     "shift_right_logical": _logical,
     "shift_right_arithmetic": _shifted_right,
-    "cfjax_held": lambda *xs, aval, **_: list(xs),
+    "cfjax_materialised": lambda *xs, aval, **_: list(xs),
     "cfjax_pack": lambda *xs, aval, axis, **_: np.stack(xs, axis),
     "cfjax_unpack": lambda x, *, aval, axis: [x.take(k, axis) for k in range(x.shape[axis])],
     "clamp": _clamp,

@@ -28,7 +28,7 @@ import jax.tree_util as jtu
 import numpy as np
 
 import cfjax
-from cfjax._xla import by_components
+from cfjax._xla import scalarised
 
 sys.path.insert(0, str(Path(__file__).parents[1]))
 from xla.interpreter import calls, run
@@ -995,7 +995,7 @@ CHANCES = {
 
 
 def rewritten(fun: Callable[..., Any]) -> Callable[..., Any]:
-    return lambda y, p: by_components(lambda y: fun(y, p), y)
+    return lambda y, p: scalarised(lambda y: fun(y, p), y)
 
 
 @functools.partial(jax.custom_jvp, nondiff_argnums=(1, 2, 3))
@@ -1055,7 +1055,7 @@ def difference(
     change in kind, a comparison or an infinity, is not compared, and nor are numbers of one sign
     near the largest of their dtype, which a sum in another order may exceed. A derivative may be
     finite where that of the program is NaN: an entry that is overwritten is dead code when it is
-    taken apart, where the program multiplies its infinite derivative by zero.
+    scalarised, where the program multiplies its infinite derivative by zero.
     """
     got, want = jtu.tree_leaves(got), jtu.tree_leaves(want)
     if len(got) != len(want):

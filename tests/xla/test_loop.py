@@ -40,7 +40,7 @@ CASES = {
     "vector and parameters": (VECTOR, {"a": VECTOR * 2, "b": jnp.asarray(0.4)}),
     "parts": ((VECTOR, {"x": jnp.asarray(0.5), "m": MATRIX, "n": jnp.asarray(3)}), (LONG, VECTOR)),
     "matrix": (ATTITUDE, (VECTOR, MATRIX)),
-    "matrix in components forward only": ((ATTITUDE, MATRIX, VECTOR), VECTOR),
+    "matrix as scalars forward only": ((ATTITUDE, MATRIX, VECTOR), VECTOR),
     "no short vector": ((MATRIX, LONG), VECTOR),
     "two precisions": ((VECTOR, VECTOR.astype(np.float32)), (VECTOR.astype(np.float32), VECTOR)),
     "more parameters than travel": (VECTOR, [VECTOR * k for k in range(1, 9)]),

@@ -5,7 +5,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from cfjax._xla.held import held
+from cfjax._xla.materialise import materialised
 from cfjax._xla.pack import pack, unpack
 
 RNG = np.random.default_rng(0)
@@ -67,11 +67,11 @@ def weighted(stack):
     [
         pack,
         lambda entries: pack(entries, sums=True),
-        lambda entries: pack(held(entries)),
-        lambda entries: pack(held(entries, in_batches=True)),
-        lambda entries: pack(held(entries, in_batches=True, alone=False, now=False)),
+        lambda entries: pack(materialised(entries)),
+        lambda entries: pack(materialised(entries, in_batches=True)),
+        lambda entries: pack(materialised(entries, in_batches=True, alone=False, now=False)),
     ],
-    ids=["pack", "pack with sums", "held", "held in batches", "held in derivatives"],
+    ids=["pack", "pack with sums", "materialised", "in batches", "in derivatives"],
 )
 def test_transformations(transform, stack):
     x, y = jnp.asarray(0.7), jnp.asarray(RNG.normal(size=3))

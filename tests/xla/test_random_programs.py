@@ -86,14 +86,14 @@ def test_what_is_wrong_is_seen(name, monkeypatch):
     line, wrong = WRONG[name]
     program = _program(line, [3.0, 5.0, 5.0])
     assert random_programs.failure(program, "value") is None
-    monkeypatch.setattr(random_programs, "by_components", lambda fun, y: (wrong(y),))
+    monkeypatch.setattr(random_programs, "scalarised", lambda fun, y: (wrong(y),))
     assert random_programs.failure(program, "value") is not None
 
 
 def test_a_lost_gradient_is_seen(monkeypatch):
     program = _program("jnp.max(y)", [3.0, 5.0, 5.0])
     assert random_programs.failure(program, "value") is None
-    monkeypatch.setattr(random_programs, "by_components", lambda fun, y: (y[1],))
+    monkeypatch.setattr(random_programs, "scalarised", lambda fun, y: (y[1],))
     assert random_programs.failure(program, "value") is None
     assert random_programs.failure(program, "grad") is not None
 
@@ -103,7 +103,7 @@ def test_a_warning_is_seen(monkeypatch):
         warnings.warn("cfjax could not rewrite a program", RuntimeWarning, stacklevel=1)
         return fun(y)
 
-    monkeypatch.setattr(random_programs, "by_components", warns)
+    monkeypatch.setattr(random_programs, "scalarised", warns)
     message = random_programs.failure(_program("jnp.sin(y)", [1.0]), "value")
     assert message is not None and message.startswith("RuntimeWarning")
 
@@ -113,7 +113,7 @@ def test_rounding_is_allowed(monkeypatch):
     y = np.array([1e8, 0.1, -1e8, 0.3])
     program = _program("jnp.sum(y)", y, exact=False)
     monkeypatch.setattr(
-        random_programs, "by_components", lambda fun, y: (y[0] + (y[2] + (y[3] + y[1])),)
+        random_programs, "scalarised", lambda fun, y: (y[0] + (y[2] + (y[3] + y[1])),)
     )
     assert random_programs.failure(program, "value") is None
 

@@ -1,4 +1,4 @@
-"""The stages of a step that is too long to be taken apart as a whole."""
+"""The stages of a step that is too long to be scalarised as a whole."""
 
 import diffrax
 import jax
@@ -23,7 +23,7 @@ def _loss(scene, num_steps):
 
 
 def test_only_where_the_whole_step_is_too_long(rewritten):
-    """A body of three numbers is taken apart as a whole, which is three times as fast."""
+    """A body of three numbers is scalarised as a whole, which is three times as fast."""
     for scene, is_loop in ((spacecraft, True), (heavy_top, True), (rigid_body, False)):
         loss, *start = _loss(scene, 3)
         program = str(jax.make_jaxpr(loss)(*start))

@@ -1,4 +1,4 @@
-"""Rules look at every parameter of what they take apart: programs that once gave other numbers."""
+"""Rules look at every parameter of what they scalarise: programs that once gave other numbers."""
 
 import re
 
@@ -10,7 +10,7 @@ from jax import lax
 from jax.experimental.xla_metadata import set_xla_metadata
 
 import cfjax
-from cfjax._xla.program import by_components, trace
+from cfjax._xla.program import scalarised, trace
 from cfjax._xla.understood import is_readable, is_understood
 
 pytestmark = pytest.mark.usefixtures("rewritten")
@@ -59,21 +59,21 @@ def grad(fun, y):
 def test_values(name):
     fun, y = SMALL[name][0], jnp.asarray(SMALL[name][1])
     # Each entry is the same few operations in one order or another.
-    np.testing.assert_allclose(by_components(fun, y), fun(y), rtol=1e-15, atol=1e-15)
+    np.testing.assert_allclose(scalarised(fun, y), fun(y), rtol=1e-15, atol=1e-15)
 
 
 @pytest.mark.parametrize("name", SAME_GRADIENT)
 def test_gradients(name):
     fun, y = SMALL[name]
     y = jnp.asarray(y)
-    ours = grad(lambda y: by_components(fun, y), y)
+    ours = grad(lambda y: scalarised(fun, y), y)
     # Sums of up to 36 products.
     np.testing.assert_allclose(ours, grad(fun, y), rtol=1e-14, atol=1e-14)
 
 
 def test_apply():
     # Its derivative JAX does not have.
-    ours = by_components(lambda y: y.at[1].apply(jnp.exp), jnp.asarray(SIX))
+    ours = scalarised(lambda y: y.at[1].apply(jnp.exp), jnp.asarray(SIX))
     np.testing.assert_allclose(ours, np.where(np.arange(6) == 1, np.exp(SIX), SIX), rtol=1e-15)
 
 
@@ -89,13 +89,13 @@ def test_apply():
 def test_a_quotient_is_exact_where_its_last_bit_counts(fun):
     y = jnp.full(7, 49.0)
     assert np.float64(49.0) * (1 / np.float64(49.0)) < 1  # or this would test nothing
-    ours = jax.jit(lambda y, a: by_components(lambda y: fun(y, a), y))(y, y)
+    ours = jax.jit(lambda y, a: scalarised(lambda y: fun(y, a), y))(y, y)
     np.testing.assert_array_equal(ours, fun(np.asarray(y), np.asarray(y)))
 
 
 def divisions(fun, y, a):
     """How many by what is not a number of the program, whose reciprocal XLA takes by itself."""
-    program = jax.make_jaxpr(lambda y, a: by_components(lambda y: fun(y, a), y))(y, a)
+    program = jax.make_jaxpr(lambda y, a: scalarised(lambda y: fun(y, a), y))(y, a)
     return len(re.findall(r" div \w+ [a-z]", str(program)))
 
 
@@ -125,7 +125,7 @@ def test_a_quotient_by_any_number_is_that_of_jax(dtype):
 
         return jax.jit(jax.vmap(jax.value_and_grad(quotient, (0, 1))))(xs, divisors)
 
-    ours, (dx, da) = results(lambda fun: lambda y: by_components(fun, y))
+    ours, (dx, da) = results(lambda fun: lambda y: scalarised(fun, y))
     plain, (dx_plain, da_plain) = results(lambda fun: fun)
     # XLA takes numbers below the smallest normal one for zero.
     tolerance = dict(rtol=4 * ends.eps, atol=2 * ends.tiny)

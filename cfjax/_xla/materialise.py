@@ -1,4 +1,4 @@
-"""Values sent through memory, so that XLA computes them once and on their own."""
+"""Materialised values, which XLA computes once and on their own."""
 
 import functools
 from collections.abc import Sequence
@@ -20,7 +20,7 @@ from .scope import MAX_SIZE, has_rows, is_short, where
 _MAX_TOGETHER = 15
 
 
-def held(
+def materialised(
     entries: Sequence[Array],
     *,
     in_batches: bool = False,
@@ -28,17 +28,17 @@ def held(
     now: bool = True,
     is_cut: bool = False,
 ) -> list[Array]:
-    """The same arrays, through memory.
+    """The same arrays, materialised: sent through memory.
 
     Otherwise XLA may compute them anew for every use. In a batch, where memory is what
     takes time, only if asked for, on CPU; outside of batches only if `alone`; and if not `now`,
     only where this is differentiated; and if `is_cut`, only in a program that is long.
     """
-    return held_p.bind(*entries, in_batches=in_batches, alone=alone, now=now, is_cut=is_cut)
+    return materialised_p.bind(*entries, in_batches=in_batches, alone=alone, now=now, is_cut=is_cut)
 
 
-def cut(tree: PyTree) -> PyTree:
-    """The same, through memory where a step is too long for one of XLA's functions.
+def materialised_if_long(tree: PyTree) -> PyTree:
+    """The same, materialised where a step is too long for one of XLA's functions.
 
     That has some 2000 operations. What needs several entries of the function before calls it for
     each, and so on to the start: values never as measured took 20 ms a step.
@@ -46,7 +46,7 @@ def cut(tree: PyTree) -> PyTree:
     return _once(tree, in_batches=True, is_cut=True)
 
 
-def once_together(tree: PyTree, alone: bool) -> PyTree:
+def materialised_together(tree: PyTree, alone: bool) -> PyTree:
     """The same arrays, all of which are used several times in what follows.
 
     Otherwise each use would compute the step anew: in a batch, in our own loop, and if `alone` also
@@ -64,7 +64,7 @@ def once_together(tree: PyTree, alone: bool) -> PyTree:
     )
 
 
-def once_in_rows(tree: PyTree) -> PyTree:
+def materialised_in_rows(tree: PyTree) -> PyTree:
     """The same arrays, computed once in states with leading axes.
 
     Along these axes a point needs its neighbours, and would compute them anew.
@@ -74,7 +74,7 @@ def once_in_rows(tree: PyTree) -> PyTree:
     leaves, structure = jtu.tree_flatten(tree)
     places = [k for k, x in enumerate(leaves) if np.size(x) > MAX_SIZE]
     for k in places:
-        (leaves[k],) = held([leaves[k]], in_batches=True)
+        (leaves[k],) = materialised([leaves[k]], in_batches=True)
     return structure.unflatten(leaves)
 
 
@@ -83,19 +83,19 @@ def _once(tree: PyTree, **options: bool) -> PyTree:
         return tree
     leaves, structure = jtu.tree_flatten(tree)
     pieces = [unpack(x) if is_short(x) else [] for x in leaves]
-    new = iter(held([entry for entries in pieces for entry in entries], **options))
+    new = iter(materialised([entry for entries in pieces for entry in entries], **options))
     return structure.unflatten(
         pack([next(new) for _ in entries]) if entries else x
         for x, entries in zip(leaves, pieces, strict=True)
     )
 
 
-held_p = Primitive("cfjax_held")
-held_p.multiple_results = True
+materialised_p = Primitive("cfjax_materialised")
+materialised_p.multiple_results = True
 
 
-@held_p.def_impl
-def _held_impl(*entries, in_batches, alone, now, is_cut, has_calls=False):
+@materialised_p.def_impl
+def _materialised_impl(*entries, in_batches, alone, now, is_cut, has_calls=False):
     outs = list(entries)
     if not now:
         return outs
@@ -138,41 +138,41 @@ def _identity(x: Array) -> Array:
     return x
 
 
-@held_p.def_abstract_eval
+@materialised_p.def_abstract_eval
 def _(*entries, **params):
     return list(entries)
 
 
-def _held_jvp(entries, tangents, *, now, **params):
+def _materialised_jvp(entries, tangents, *, now, **params):
     moving = [k for k, tangent in enumerate(tangents) if type(tangent) is not ad.Zero]
     outs = list(tangents)
     if moving:
-        new = held_p.bind(*(tangents[k] for k in moving), now=True, **params)
+        new = materialised_p.bind(*(tangents[k] for k in moving), now=True, **params)
         for k, tangent in zip(moving, new, strict=True):
             outs[k] = tangent
-    return held_p.bind(*entries, now=True, **params), outs
+    return materialised_p.bind(*entries, now=True, **params), outs
 
 
-def _held_transpose(cotangents, *entries, **params):
+def _materialised_transpose(cotangents, *entries, **params):
     if all(type(cotangent) is ad.Zero for cotangent in cotangents):
         return [None] * len(entries)
-    return held_p.bind(*map(ad.instantiate_zeros, cotangents), **params)
+    return materialised_p.bind(*map(ad.instantiate_zeros, cotangents), **params)
 
 
-def _held_batch(entries, dims, **params):
+def _materialised_batch(entries, dims, **params):
     if not params["in_batches"]:
         return entries, dims
     moved = [x if d is None else jnp.moveaxis(x, d, 0) for x, d in zip(entries, dims, strict=True)]
-    return held_p.bind(*moved, **params), [None if d is None else 0 for d in dims]
+    return materialised_p.bind(*moved, **params), [None if d is None else 0 for d in dims]
 
 
-ad.primitive_jvps[held_p] = _held_jvp
-ad.primitive_transposes[held_p] = _held_transpose
-batching.primitive_batchers[held_p] = _held_batch
-mlir.register_lowering(held_p, mlir.lower_fun(_held_impl, multiple_results=True))
+ad.primitive_jvps[materialised_p] = _materialised_jvp
+ad.primitive_transposes[materialised_p] = _materialised_transpose
+batching.primitive_batchers[materialised_p] = _materialised_batch
+mlir.register_lowering(materialised_p, mlir.lower_fun(_materialised_impl, multiple_results=True))
 # Only there the calls are known to work.
 mlir.register_lowering(
-    held_p,
-    mlir.lower_fun(functools.partial(_held_impl, has_calls=True), multiple_results=True),
+    materialised_p,
+    mlir.lower_fun(functools.partial(_materialised_impl, has_calls=True), multiple_results=True),
     platform="cpu",
 )

@@ -19,29 +19,29 @@ from jax import lax
 from jax.extend.core import JaxprEqn
 from jaxtyping import Array
 
-from .components import (
+from .materialise import materialised
+from .pack import pack, pack_p, unpack, unpack_p
+from .scalars import (
     MAX_PRODUCT,
     SCATTERS,
-    Components,
-    components,
+    Scalars,
     is_extreme,
     is_lexicographic,
     known,
     moved,
     reduction,
+    scalars,
     scattered_into,
 )
-from .held import held
-from .pack import pack, pack_p, unpack, unpack_p
 from .scope import MAX_LENGTH, MAX_SIZE, is_numeric, is_rows
 from .understood import ELEMENTWISE, REDUCTIONS, is_understood
 
 
 @jtu.register_pytree_node_class
-class Columns:
+class StructOfArrays:
     """An array as one array for each place along its short axes, row by row.
 
-    `shape` is that of the whole. `is_short` says along which axes it is taken apart; an axis of
+    `shape` is that of the whole. `is_short` says along which axes it is scalarised; an axis of
     length 1 always is. A column has the other axes, the long ones, in their order. Where all its
     entries along one of these are equal, it may have length 1 there.
     """
@@ -53,22 +53,22 @@ class Columns:
 
     @property
     def inner(self) -> tuple[int, ...]:
-        """The shape of the array of columns."""
+        """The shape of the array of entries."""
         return tuple(n if short else 1 for n, short in zip(self.shape, self.is_short, strict=True))
 
     @property
     def places(self) -> np.ndarray:
-        """The numbers of the columns, in that shape."""
+        """The numbers of the entries, in that shape."""
         return np.arange(len(self.entries)).reshape(self.inner)
 
     @property
     def long(self) -> list[int]:
-        """The axes of the columns."""
+        """The axes of each entry."""
         return [k for k, short in enumerate(self.is_short) if not short]
 
     @property
     def sides(self) -> tuple[int, ...]:
-        """The lengths of the columns, without repetitions."""
+        """The lengths of these axes, without repetitions."""
         return tuple(self.shape[k] for k in self.long)
 
     def whole(self) -> Array:
@@ -84,30 +84,30 @@ class Columns:
         return cls(children, *aux)
 
 
-def columns(x: Any) -> Columns:
-    """An array in columns; short vectors along leading axes by their entries."""
-    if isinstance(x, Columns):
+def struct_of_arrays(x: Any) -> StructOfArrays:
+    """An array as a struct of arrays; short vectors along leading axes by their entries."""
+    if isinstance(x, StructOfArrays):
         return x
-    if isinstance(x, Components | np.ndarray):
-        x = components(x)
-        return Columns(x.entries, x.shape, [True] * len(x.shape))
+    if isinstance(x, Scalars | np.ndarray):
+        x = scalars(x)
+        return StructOfArrays(x.entries, x.shape, [True] * len(x.shape))
     is_short = [n == 1 for n in x.shape]
-    flat = Columns([x.reshape([n for n in x.shape if n != 1])], x.shape, is_short)
+    flat = StructOfArrays([x.reshape([n for n in x.shape if n != 1])], x.shape, is_short)
     return _to(flat, x.shape, [*is_short[:-1], True]) if is_rows(x) else flat
 
 
-def conformed(x: Any, like: Columns) -> Columns:
+def conformed(x: Any, like: StructOfArrays) -> StructOfArrays:
     """The array apart along the axes of another of its shape, and repeating where that does."""
-    x = _to(columns(x), like.shape, like.is_short)
+    x = _to(struct_of_arrays(x), like.shape, like.is_short)
     entries = []
     for e, other in zip(x.entries, like.entries, strict=True):
         sides = np.broadcast_shapes(jnp.shape(e), jnp.shape(other))
         entries.append(lax.slice(_spread(e, sides), [0] * len(sides), jnp.shape(other)))
-    return Columns(entries, x.shape, x.is_short)
+    return StructOfArrays(entries, x.shape, x.is_short)
 
 
 class _Call(NamedTuple):
-    """One operation on arrays in columns."""
+    """One operation on structs of arrays."""
 
     eqn: JaxprEqn
     values: Sequence[Any]
@@ -115,15 +115,17 @@ class _Call(NamedTuple):
     # Of the only result.
     shape: tuple[int, ...]
 
-    def arrays(self) -> list[Columns]:
-        return [columns(x) for x in self.values]
+    def arrays(self) -> list[StructOfArrays]:
+        return [struct_of_arrays(x) for x in self.values]
 
-    def through(self, x: Columns) -> Columns:
+    def through(self, x: StructOfArrays) -> StructOfArrays:
         """The first operand, computed once for all that neighbours along long axes take of it."""
         return x if self.fixed[0] else _once(x)
 
 
-def in_columns(eqn: JaxprEqn, values: Sequence[Any], fixed: Sequence[bool]) -> list[Any] | None:
+def on_struct_of_arrays(
+    eqn: JaxprEqn, values: Sequence[Any], fixed: Sequence[bool]
+) -> list[Any] | None:
     """The results of one operation, if there is a rule for it, otherwise None."""
     name = eqn.primitive.name
     avals: list[Any] = [v.aval for v in (*eqn.invars, *eqn.outvars)]
@@ -145,7 +147,7 @@ def in_columns(eqn: JaxprEqn, values: Sequence[Any], fixed: Sequence[bool]) -> l
     return None if outs is None else list(map(_settled, outs))
 
 
-def _rule(eqn: JaxprEqn) -> Callable[[_Call], Columns | None] | None:
+def _rule(eqn: JaxprEqn) -> Callable[[_Call], StructOfArrays | None] | None:
     name = eqn.primitive.name
     if eqn.primitive is pack_p:
         return _stacked
@@ -154,18 +156,20 @@ def _rule(eqn: JaxprEqn) -> Callable[[_Call], Columns | None] | None:
     return _RULES.get(name)
 
 
-def _settled(x: Columns) -> Any:
+def _settled(x: StructOfArrays) -> Any:
     """Without long axes: a small array or a number."""
     if x.long or len(x.entries) > MAX_SIZE:
         return x
-    return Components(x.entries, x.shape) if x.shape else x.entries[0]
+    return Scalars(x.entries, x.shape) if x.shape else x.entries[0]
 
 
-def _at(x: Columns, places: np.ndarray, shape: Sequence[int], is_short: Sequence[bool]) -> Columns:
-    return Columns([x.entries[k] for k in places.flat], shape, is_short)
+def _at(
+    x: StructOfArrays, places: np.ndarray, shape: Sequence[int], is_short: Sequence[bool]
+) -> StructOfArrays:
+    return StructOfArrays([x.entries[k] for k in places.flat], shape, is_short)
 
 
-def _to(x: Columns, shape: Sequence[int], is_short: Sequence[bool]) -> Columns:
+def _to(x: StructOfArrays, shape: Sequence[int], is_short: Sequence[bool]) -> StructOfArrays:
     """The array broadcast to a shape of as many axes, apart along some of them."""
     entries, places, was_short = list(x.entries), x.places, list(x.is_short)
     for axis, n in enumerate(shape):
@@ -189,7 +193,7 @@ def _to(x: Columns, shape: Sequence[int], is_short: Sequence[bool]) -> Columns:
             entries = [_together([entries[k] for k in row], position) for row in flat]
             places = np.expand_dims(np.arange(len(flat)).reshape(rows.shape[:-1]), axis)
         was_short[axis] = is_short[axis]
-    return Columns([entries[k] for k in places.flat], shape, is_short)
+    return StructOfArrays([entries[k] for k in places.flat], shape, is_short)
 
 
 def _apart(x: Any, n: int, position: int) -> Sequence[Any]:
@@ -213,7 +217,7 @@ def _spread(x: Any, sides: Sequence[int]) -> Any:
     return lax.broadcast_in_dim(x, sides, range(x.ndim))
 
 
-def _common(arrays: Sequence[Columns], shape: Sequence[int]) -> list[bool]:
+def _common(arrays: Sequence[StructOfArrays], shape: Sequence[int]) -> list[bool]:
     """Along which axes arrays that belong together are to be apart."""
 
     def decide(axis: int, n: int) -> bool:
@@ -229,28 +233,28 @@ def _common(arrays: Sequence[Columns], shape: Sequence[int]) -> list[bool]:
     return list(itertools.starmap(decide, enumerate(shape)))
 
 
-def _repeats(x: Columns, axis: int) -> bool:
+def _repeats(x: StructOfArrays, axis: int) -> bool:
     """Whether it has the same entries everywhere along a long axis."""
     position = x.long.index(axis)
     return all(jnp.shape(e)[position] == 1 for e in x.entries)
 
 
-def _once(x: Columns) -> Columns:
-    """The same, through memory: what moves entries along long axes would compute them anew."""
+def _once(x: StructOfArrays) -> StructOfArrays:
+    """The same, materialised: what moves entries along long axes would compute them anew."""
     distinct = list({id(e): e for e in x.entries}.values())
-    new = dict(zip(map(id, distinct), held(distinct, in_batches=True), strict=True))
-    return Columns([new[id(e)] for e in x.entries], x.shape, x.is_short)
+    new = dict(zip(map(id, distinct), materialised(distinct, in_batches=True), strict=True))
+    return StructOfArrays([new[id(e)] for e in x.entries], x.shape, x.is_short)
 
 
-def _mapped(x: Columns, fun: Callable[[Any], Any], shape: Sequence[int]) -> Columns:
+def _mapped(x: StructOfArrays, fun: Callable[[Any], Any], shape: Sequence[int]) -> StructOfArrays:
     """`fun` of every column, which keeps what is short. Long axes may become 1."""
     outs = map(fun, x.entries)
     gone = [k for k, axis in enumerate(x.long) if shape[axis] == 1]
-    return Columns([jnp.squeeze(e, gone) if gone else e for e in outs], shape, x.is_short)
+    return StructOfArrays([jnp.squeeze(e, gone) if gone else e for e in outs], shape, x.is_short)
 
 
-def _elementwise(call: _Call, fun: Callable[..., Any]) -> Columns:
-    arrays = {k: columns(x) for k, x in enumerate(call.values) if _ndim(x)}
+def _elementwise(call: _Call, fun: Callable[..., Any]) -> StructOfArrays:
+    arrays = {k: struct_of_arrays(x) for k, x in enumerate(call.values) if _ndim(x)}
     is_short = _common(list(arrays.values()), call.shape)
     arrays = {k: _to(x, call.shape, is_short) for k, x in arrays.items()}
     made: dict[Any, Any] = {}
@@ -265,33 +269,33 @@ def _elementwise(call: _Call, fun: Callable[..., Any]) -> Columns:
         return made[key][0]
 
     first = next(iter(arrays.values()))
-    return Columns(map(entry, range(len(first.entries))), first.shape, first.is_short)
+    return StructOfArrays(map(entry, range(len(first.entries))), first.shape, first.is_short)
 
 
 def _ndim(x: Any) -> int:
-    return len(x.shape) if isinstance(x, Components | Columns) else np.ndim(x)
+    return len(x.shape) if isinstance(x, Scalars | StructOfArrays) else np.ndim(x)
 
 
-def _broadcast(call: _Call) -> Columns | None:
+def _broadcast(call: _Call) -> StructOfArrays | None:
     x = call.values[0]
     if len(call.values) > 1:
         return None  # Of a shape that is not known.
     if not _ndim(x):
         is_short = [n == 1 for n in call.shape]
-        return Columns([jnp.reshape(x, [1] * is_short.count(False))], call.shape, is_short)
-    x = columns(x)
+        return StructOfArrays([jnp.reshape(x, [1] * is_short.count(False))], call.shape, is_short)
+    x = struct_of_arrays(x)
     axes = dict(zip(call.eqn.params["broadcast_dimensions"], range(len(x.shape)), strict=True))
     # First with the new axes, of length 1.
     spread = [axes.get(k) for k in range(len(call.shape))]
     sides = [1 if k is None else x.shape[k] for k in spread]
-    x = Columns(x.entries, sides, [k is None or x.is_short[k] for k in spread])
+    x = StructOfArrays(x.entries, sides, [k is None or x.is_short[k] for k in spread])
     # What is new repeats.
     flags = [m != 1 and short for m, short in zip(sides, x.is_short, strict=True)]
     return _to(x, call.shape, flags)
 
 
-def _reshaped(call: _Call) -> Columns | None:
-    x = columns(call.values[0])
+def _reshaped(call: _Call) -> StructOfArrays | None:
+    x = struct_of_arrays(call.values[0])
     groups = _groups(x.shape, call.shape)
     is_short = list(x.is_short)
     for old, new in groups:
@@ -322,7 +326,7 @@ def _reshaped(call: _Call) -> Columns | None:
                 after += [call.shape[k] for k in new]
         return _spread(e, between).reshape(after)
 
-    return Columns(map(column, x.entries), call.shape, flags)
+    return StructOfArrays(map(column, x.entries), call.shape, flags)
 
 
 def _groups(old: Sequence[int], new: Sequence[int]) -> list[tuple[list[int], list[int]]]:
@@ -343,18 +347,18 @@ def _groups(old: Sequence[int], new: Sequence[int]) -> list[tuple[list[int], lis
     return groups
 
 
-def _transposed(call: _Call) -> Columns:
-    x = columns(call.values[0])
+def _transposed(call: _Call) -> StructOfArrays:
+    x = struct_of_arrays(call.values[0])
     order = call.eqn.params["permutation"]
     position = {axis: k for k, axis in enumerate(x.long)}
     moves = [position[axis] for axis in order if not x.is_short[axis]]
     if moves != sorted(moves):
-        x = Columns([jnp.transpose(e, moves) for e in x.entries], x.shape, x.is_short)
+        x = StructOfArrays([jnp.transpose(e, moves) for e in x.entries], x.shape, x.is_short)
     return _at(x, x.places.transpose(order), call.shape, [x.is_short[k] for k in order])
 
 
-def _sliced(call: _Call) -> Columns:
-    x, params = columns(call.values[0]), call.eqn.params
+def _sliced(call: _Call) -> StructOfArrays:
+    x, params = struct_of_arrays(call.values[0]), call.eqn.params
     strides = params["strides"] or [1] * len(x.shape)
     ends = list(zip(params["start_indices"], params["limit_indices"], strides, strict=True))
     whole = [(0, n, 1) for n in x.shape]
@@ -373,8 +377,8 @@ def _sliced(call: _Call) -> Columns:
     return _at(x, places, call.shape, x.is_short)
 
 
-def _reversed(call: _Call) -> Columns:
-    x, dimensions = columns(call.values[0]), call.eqn.params["dimensions"]
+def _reversed(call: _Call) -> StructOfArrays:
+    x, dimensions = struct_of_arrays(call.values[0]), call.eqn.params["dimensions"]
     positions = [k for k, axis in enumerate(x.long) if axis in dimensions]
     if positions:
         x = _mapped(call.through(x), lambda e: lax.rev(e, positions), x.shape)
@@ -382,14 +386,14 @@ def _reversed(call: _Call) -> Columns:
     return _at(x, np.flip(x.places, tuple(short)), x.shape, x.is_short)
 
 
-def _concatenated(call: _Call) -> Columns:
+def _concatenated(call: _Call) -> StructOfArrays:
     axis = call.eqn.params["dimension"]
     arrays = call.arrays()
     # Without the axis along which they differ.
     sides = [1 if k == axis else n for k, n in enumerate(call.shape)]
     flags = _common(
         [
-            Columns(x.entries, (*x.shape[:axis], 1, *x.shape[axis + 1 :]), x.is_short)
+            StructOfArrays(x.entries, (*x.shape[:axis], 1, *x.shape[axis + 1 :]), x.is_short)
             if x.is_short[axis]
             else x
             for x in arrays
@@ -407,10 +411,10 @@ def _concatenated(call: _Call) -> Columns:
             entries += x.entries
         places = np.concatenate([n + x.places for n, x in zip(firsts, arrays, strict=True)], axis)
         flags[axis] = True
-        return Columns([entries[k] for k in places.flat], call.shape, flags)
+        return StructOfArrays([entries[k] for k in places.flat], call.shape, flags)
     position = flags[:axis].count(False)
 
-    def long(x: Columns) -> list[Any]:
+    def long(x: StructOfArrays) -> list[Any]:
         x = _to(x, x.shape, flags)
         if x.shape[axis] == 1:
             return [jnp.expand_dims(e, position) for e in x.entries]
@@ -429,14 +433,14 @@ def _concatenated(call: _Call) -> Columns:
             position,
         )
 
-    return Columns(map(joined, *map(long, arrays)), call.shape, flags)
+    return StructOfArrays(map(joined, *map(long, arrays)), call.shape, flags)
 
 
-def _stacked(call: _Call) -> Columns:
+def _stacked(call: _Call) -> StructOfArrays:
     axis = call.eqn.params["axis"]
     if not _ndim(call.values[0]):
         entries = list(call.values)
-        return Columns(entries, call.shape, [True])
+        return StructOfArrays(entries, call.shape, [True])
     sides = (*call.shape[:axis], *call.shape[axis + 1 :])
     arrays = call.arrays()
     flags = _common(arrays, sides)
@@ -445,11 +449,11 @@ def _stacked(call: _Call) -> Columns:
     entries = [e for x in arrays for e in x.entries]
     places = np.stack([k * n + x.places for k, x in enumerate(arrays)], axis)
     flags.insert(axis, True)
-    return Columns([entries[k] for k in places.flat], call.shape, flags)
+    return StructOfArrays([entries[k] for k in places.flat], call.shape, flags)
 
 
-def _split(call: _Call) -> list[Columns]:
-    x, axis = columns(call.values[0]), call.eqn.params["axis"]
+def _split(call: _Call) -> list[StructOfArrays]:
+    x, axis = struct_of_arrays(call.values[0]), call.eqn.params["axis"]
     is_unpacked = call.eqn.primitive is unpack_p
     shapes: list[Any] = [v.aval.shape for v in call.eqn.outvars]  # pyright: ignore
     if not x.is_short[axis]:
@@ -470,10 +474,14 @@ def _split(call: _Call) -> list[Columns]:
     return outs
 
 
-def _padded(call: _Call) -> Columns | None:
+def _padded(call: _Call) -> StructOfArrays | None:
     if _ndim(call.values[1]):
         return None
-    x, fill, config = columns(call.values[0]), call.values[1], call.eqn.params["padding_config"]
+    x, fill, config = (
+        struct_of_arrays(call.values[0]),
+        call.values[1],
+        call.eqn.params["padding_config"],
+    )
     sides = [call.shape[k] if not short else x.shape[k] for k, short in enumerate(x.is_short)]
     if any(tuple(config[k]) != (0, 0, 0) for k in x.long):
         x, along = call.through(x), [config[k] for k in x.long]
@@ -481,16 +489,16 @@ def _padded(call: _Call) -> Columns | None:
     none = [(0, 0, 0) if not short else c for c, short in zip(config, x.is_short, strict=True)]
     inner = [n if short else 1 for n, short in zip(call.shape, x.is_short, strict=True)]
     eqn = call.eqn.replace(params={"padding_config": tuple(none)})
-    outs = moved(eqn, [Components(x.entries, x.inner), fill], tuple(inner))
+    outs = moved(eqn, [Scalars(x.entries, x.inner), fill], tuple(inner))
     if outs is None:
         return None
     # The number that fills repeats.
     entries = (e if jnp.ndim(e) else jnp.reshape(e, [1] * len(x.long)) for e in outs[0].entries)
-    return Columns(entries, call.shape, x.is_short)
+    return StructOfArrays(entries, call.shape, x.is_short)
 
 
-def _reduced(call: _Call) -> Columns | None:
-    x, axes = columns(call.values[0]), call.eqn.params["axes"]
+def _reduced(call: _Call) -> StructOfArrays | None:
+    x, axes = struct_of_arrays(call.values[0]), call.eqn.params["axes"]
     positions = tuple(k for k, axis in enumerate(x.long) if axis in axes)
     entries = list(x.entries)
     kept = [k for k in range(len(x.shape)) if k not in axes]
@@ -518,11 +526,11 @@ def _reduced(call: _Call) -> Columns | None:
         return combine([_spread(e, sides) for e in parts])
 
     outs = list(map(reduced, rows))
-    return Columns(outs, call.shape, [x.is_short[k] for k in kept])
+    return StructOfArrays(outs, call.shape, [x.is_short[k] for k in kept])
 
 
-def _cumulative(call: _Call) -> Columns | None:
-    x, axis = columns(call.values[0]), call.eqn.params["axis"]
+def _cumulative(call: _Call) -> StructOfArrays | None:
+    x, axis = struct_of_arrays(call.values[0]), call.eqn.params["axis"]
     if x.is_short[axis]:
         return None
     params = call.eqn.params | {"axis": x.long.index(axis)}
@@ -530,9 +538,9 @@ def _cumulative(call: _Call) -> Columns | None:
     return _mapped(x, fun, x.shape)
 
 
-def _transformed(call: _Call) -> Columns | None:
+def _transformed(call: _Call) -> StructOfArrays | None:
     """Fourier transforms along the last axes."""
-    x = columns(call.values[0])
+    x = struct_of_arrays(call.values[0])
     lengths = call.eqn.params["fft_lengths"]
     if any(x.is_short[len(x.shape) - len(lengths) :]) or 1 in call.shape[-len(lengths) :]:
         return None
@@ -540,8 +548,8 @@ def _transformed(call: _Call) -> Columns | None:
     return _mapped(x, fun, call.shape)
 
 
-def _gathered(call: _Call) -> Columns | None:
-    x, indices = columns(call.values[0]), known(call.values[1])
+def _gathered(call: _Call) -> StructOfArrays | None:
+    x, indices = struct_of_arrays(call.values[0]), known(call.values[1])
     params = call.eqn.params
     numbers, sizes = params["dimension_numbers"], params["slice_sizes"]
     gone = (*numbers.collapsed_slice_dims, *numbers.operand_batching_dims)
@@ -556,13 +564,13 @@ def _gathered(call: _Call) -> Columns | None:
     inner = tuple(n if short else 1 for n, short in zip(call.shape, flags, strict=True))
     sizes = tuple(n if short else 1 for n, short in zip(sizes, x.is_short, strict=True))
     eqn = call.eqn.replace(params=params | {"slice_sizes": sizes})
-    outs = moved(eqn, [Components(x.entries, x.inner), indices], inner)
-    return None if outs is None else Columns(outs[0].entries, call.shape, flags)
+    outs = moved(eqn, [Scalars(x.entries, x.inner), indices], inner)
+    return None if outs is None else StructOfArrays(outs[0].entries, call.shape, flags)
 
 
-def _scattered(call: _Call) -> Columns | None:
+def _scattered(call: _Call) -> StructOfArrays | None:
     name = call.eqn.primitive.name
-    x, updates = columns(call.values[0]), columns(call.values[2])
+    x, updates = struct_of_arrays(call.values[0]), struct_of_arrays(call.values[2])
     numbers = call.eqn.params["dimension_numbers"]
     gone = (*numbers.inserted_window_dims, *numbers.operand_batching_dims)
     kept = [k for k in range(len(x.shape)) if k not in gone]
@@ -574,19 +582,19 @@ def _scattered(call: _Call) -> Columns | None:
         return None
     flags = [k not in window or x.is_short[window[k]] for k in range(len(updates.shape))]
     updates = _to(updates, updates.shape, flags)
-    inner, more = Components(x.entries, x.inner), Components(updates.entries, updates.inner)
+    inner, more = Scalars(x.entries, x.inner), Scalars(updates.entries, updates.inner)
     parts = [inner, call.values[1], more]
     if name == "scatter":
         outs = moved(call.eqn, parts, x.inner)
     else:
         outs = scattered_into(SCATTERS[name], parts, call.eqn.params, x.inner)
-    return None if outs is None else Columns(outs[0].entries, x.shape, x.is_short)
+    return None if outs is None else StructOfArrays(outs[0].entries, x.shape, x.is_short)
 
 
 class _Factor(NamedTuple):
     """One side of a product, with its axes in the order that both agree on."""
 
-    # Of the columns: by batch, by row, by what is summed.
+    # Of the entries: by batch, by row, by what is summed.
     places: np.ndarray
     entries: list[Any]
     # Those that are neither of the batch nor summed.
@@ -595,7 +603,7 @@ class _Factor(NamedTuple):
     long: list[int]
 
 
-def _factor(x: Columns, batch: Sequence[int], summed: Sequence[int]) -> _Factor:
+def _factor(x: StructOfArrays, batch: Sequence[int], summed: Sequence[int]) -> _Factor:
     free = [k for k in range(len(x.shape)) if k not in (*batch, *summed)]
     groups = batch, free, summed
     order = [*batch, *free, *summed]
@@ -615,7 +623,7 @@ def _factor(x: Columns, batch: Sequence[int], summed: Sequence[int]) -> _Factor:
     return _Factor(places, list(map(column, x.entries)), free, long)
 
 
-def _product(call: _Call) -> Columns | None:
+def _product(call: _Call) -> StructOfArrays | None:
     """Small products for each place along the long axes, or products along these."""
     params = call.eqn.params
     sums, batches = params["dimension_numbers"]
@@ -661,10 +669,10 @@ def _product(call: _Call) -> Columns | None:
         for column in below
     ]
     is_short = [x.is_short[k] for k in (*batches[0], *left.free)]
-    return Columns(outs, call.shape, [*is_short, *(y.is_short[k] for k in right.free)])
+    return StructOfArrays(outs, call.shape, [*is_short, *(y.is_short[k] for k in right.free)])
 
 
-_RULES: dict[str, Callable[[_Call], Columns | None]] = {
+_RULES: dict[str, Callable[[_Call], StructOfArrays | None]] = {
     "broadcast_in_dim": _broadcast,
     "concatenate": _concatenated,
     "cumprod": _cumulative,

@@ -19,7 +19,7 @@ from .pack import pack, pack_p, unpack, unpack_p
 from .scope import MAX_SIZE, is_numeric
 from .understood import ELEMENTWISE, REDUCTIONS, is_understood
 
-# Of the products of numbers that a product of arrays is taken apart into.
+# Of the products of numbers that a product of arrays is scalarised into.
 MAX_PRODUCT = 216
 
 SCATTERS: dict[str, Callable[[Any, Any], Any]] = {
@@ -31,7 +31,7 @@ SCATTERS: dict[str, Callable[[Any, Any], Any]] = {
 
 
 @jtu.register_pytree_node_class
-class Components:
+class Scalars:
     """A small array as its entries, which are numbers, row by row."""
 
     def __init__(self, entries: Iterable[Any], shape: tuple[int, ...]):
@@ -42,7 +42,7 @@ class Components:
         """The entries at some places, which are their numbers: an array, or one entry."""
         if places.ndim == 0:
             return self.entries[int(places)]
-        return Components([self.entries[k] for k in places.flat], places.shape)
+        return Scalars([self.entries[k] for k in places.flat], places.shape)
 
     def whole(self) -> Array:
         return pack(list(map(jnp.asarray, self.entries))).reshape(self.shape)
@@ -62,7 +62,7 @@ def literal(v: Literal) -> Any:
     return number(v.val, aval.dtype)
 
 
-def in_components(jaxpr: Jaxpr, eqn: JaxprEqn, values: list[Any]) -> Sequence[Any] | None:
+def on_scalars(jaxpr: Jaxpr, eqn: JaxprEqn, values: list[Any]) -> Sequence[Any] | None:
     """The results of one operation, if there is a rule for it, otherwise None."""
     name = eqn.primitive.name
     avals: list[Any] = [v.aval for v in eqn.outvars]
@@ -77,7 +77,7 @@ def in_components(jaxpr: Jaxpr, eqn: JaxprEqn, values: list[Any]) -> Sequence[An
     if not is_understood(eqn) or not all(1 <= math.prod(shape) <= MAX_SIZE for shape in shapes):
         return None
     if eqn.primitive is unpack_p or name == "split":
-        if not is_components(values[0]):
+        if not is_scalars(values[0]):
             return None
         axis = eqn.params["axis"]
         places = places_of(values[0])
@@ -89,17 +89,17 @@ def in_components(jaxpr: Jaxpr, eqn: JaxprEqn, values: list[Any]) -> Sequence[An
     if eqn.primitive.multiple_results or any(map(_is_whole, values)):
         return None
     if name in MOVES:
-        if not any(map(is_components, values)) and name not in _FROM_NUMBERS:
+        if not any(map(is_scalars, values)) and name not in _FROM_NUMBERS:
             return None
         return moved(eqn, values, shapes[0])
     if eqn.primitive is pack_p or name == "stack":
         return _arranged(values, lambda *places: np.stack(places, eqn.params["axis"]))
-    if name in SCATTERS and is_components(values[0]):
+    if name in SCATTERS and is_scalars(values[0]):
         return scattered_into(SCATTERS[name], values, eqn.params, shapes[0])
     if shapes[0] != () and name in ELEMENTWISE:
-        rows = zip(*(components(v, shapes[0]).entries for v in values), strict=True)
-        return [Components((eqn.primitive.bind(*row, **eqn.params) for row in rows), shapes[0])]
-    if name in REDUCTIONS and is_components(values[0]) and not is_lexicographic(eqn):
+        rows = zip(*(scalars(v, shapes[0]).entries for v in values), strict=True)
+        return [Scalars((eqn.primitive.bind(*row, **eqn.params) for row in rows), shapes[0])]
+    if name in REDUCTIONS and is_scalars(values[0]) and not is_lexicographic(eqn):
         return [_reduced(reduction(eqn), values[0], eqn.params["axes"], shapes[0])]
     if name == "dot_general" and _is_plain_product(eqn):
         return [_product(values[0], values[1], eqn.params["dimension_numbers"], shapes[0])]
@@ -194,7 +194,7 @@ def scattered_into(
     indices = known(values[1])
     if indices is None:
         return None
-    x, updates = components(values[0]), components(values[2])
+    x, updates = scalars(values[0]), scalars(values[2])
     with jax.ensure_compile_time_eval():
         none = jnp.full(shape, -1, np.int32)
         places = jnp.asarray(np.asarray(places_of(updates), np.int32))
@@ -206,18 +206,18 @@ def scattered_into(
         combine(entry, updates.entries[k]) if k >= 0 else entry
         for entry, k in zip(x.entries, taken.flat, strict=True)
     )
-    return [Components(outs, shape)]
+    return [Scalars(outs, shape)]
 
 
 def _arranged(values: Sequence[Any], move: Callable[..., np.ndarray]) -> list[Any] | None:
     """What results from moving entries; None if it has others too."""
-    arrays = list(map(components, values))
+    arrays = list(map(scalars, values))
     entries = [entry for x in arrays for entry in x.entries]
     firsts = np.cumsum([0, *(len(x.entries) for x in arrays)])
     places = move(*(np.asarray(n + places_of(x)) for n, x in zip(firsts, arrays, strict=False)))
     if places.size and not (0 <= places.min() and places.max() < len(entries)):
         return None
-    return [Components(entries, (len(entries),)).at(np.asarray(places))]
+    return [Scalars(entries, (len(entries),)).at(np.asarray(places))]
 
 
 def reduction(eqn: JaxprEqn) -> Callable[[Sequence[Any]], Any]:
@@ -263,7 +263,7 @@ def _(combine, primals, tangents):
 
 def _reduced(
     combine: Callable[[Sequence[Any]], Any],
-    x: Components,
+    x: Scalars,
     axes: Sequence[int],
     shape: tuple[int, ...],
 ) -> Any:
@@ -282,9 +282,9 @@ def _is_plain_product(eqn: JaxprEqn) -> bool:
 
 def _product(left: Any, right: Any, dimensions: Any, shape: tuple[int, ...]) -> Any:
     contracted, batched = dimensions
-    left, right = map(components, (left, right))
+    left, right = map(scalars, (left, right))
 
-    def rows(x: Components, contracted: Sequence[int], batched: Sequence[int]) -> np.ndarray:
+    def rows(x: Scalars, contracted: Sequence[int], batched: Sequence[int]) -> np.ndarray:
         """The places, by batch, by row, by what is summed."""
         free = [k for k in range(len(x.shape)) if k not in (*contracted, *batched)]
         batch, terms = (math.prod(x.shape[k] for k in axes) for axes in (batched, contracted))
@@ -311,38 +311,38 @@ def is_inexact(aval: Any) -> bool:
     return not hasattr(aval, "dtype") or jnp.issubdtype(aval.dtype, jnp.inexact)
 
 
-def is_components(x: Any) -> bool:
-    return isinstance(x, Components)
+def is_scalars(x: Any) -> bool:
+    return isinstance(x, Scalars)
 
 
 def _is_whole(x: Any) -> bool:
-    return not isinstance(x, Components | np.ndarray) and np.ndim(x) > 0
+    return not isinstance(x, Scalars | np.ndarray) and np.ndim(x) > 0
 
 
 def is_small(x: Any) -> bool:
-    """Whether this is an array to take apart. NumPy's are known while the program is made."""
+    """Whether this is an array to scalarise. NumPy's are known while the program is made."""
     return _is_whole(x) and 1 <= np.size(x) <= MAX_SIZE and is_numeric(x)
 
 
 def known(x: Any) -> np.ndarray | None:
-    if isinstance(x, Components):
+    if isinstance(x, Scalars):
         entries = list(map(known, x.entries))
         return None if any(e is None for e in entries) else np.asarray(entries).reshape(x.shape)
     return np.asarray(x) if isinstance(x, np.ndarray | np.generic) else None
 
 
 def _shaped(entries: Sequence[Any], shape: tuple[int, ...]) -> Any:
-    return Components(entries, shape) if shape else entries[0]
+    return Scalars(entries, shape) if shape else entries[0]
 
 
-def places_of(x: Components) -> np.ndarray:
+def places_of(x: Scalars) -> np.ndarray:
     return np.arange(len(x.entries)).reshape(x.shape)
 
 
-def components(x: Any, shape: tuple[int, ...] = ()) -> Components:
-    """An array in components; with a shape, broadcast to it."""
+def scalars(x: Any, shape: tuple[int, ...] = ()) -> Scalars:
+    """An array as its entries; with a shape, broadcast to it."""
     if isinstance(x, np.ndarray):
-        x = Components([np.asarray(entry) for entry in x.flat], x.shape)
-    elif not isinstance(x, Components):
-        x = Components(unpack(jnp.ravel(x)) if jnp.ndim(x) else [x], jnp.shape(x))
+        x = Scalars([np.asarray(entry) for entry in x.flat], x.shape)
+    elif not isinstance(x, Scalars):
+        x = Scalars(unpack(jnp.ravel(x)) if jnp.ndim(x) else [x], jnp.shape(x))
     return x if shape in ((), x.shape) else x.at(np.broadcast_to(places_of(x), shape))

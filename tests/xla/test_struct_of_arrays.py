@@ -8,9 +8,9 @@ from jax import lax
 
 import cfjax
 from cfjax._xla import program
-from cfjax._xla.columns import Columns, columns
-from cfjax._xla.program import by_components, join, split
+from cfjax._xla.program import join, scalarised, split
 from cfjax._xla.scope import is_rows
+from cfjax._xla.struct_of_arrays import StructOfArrays, struct_of_arrays
 
 pytestmark = pytest.mark.usefixtures("rewritten")
 
@@ -129,7 +129,7 @@ def leftover(monkeypatch):
 @pytest.mark.representatives(6)
 @pytest.mark.parametrize("fun", FUNCTIONS)
 def test_as_the_function_itself(fun, leftover):
-    apart = jax.jit(lambda y: by_components(fun, y))(Y)
+    apart = jax.jit(lambda y: scalarised(fun, y))(Y)
     # Sums in another order. The products have at most 9 terms of size 10.
     np.testing.assert_allclose(apart, fun(jnp.asarray(Y)), rtol=1e-13, atol=1e-13)
     # The largest of all stays whole, as all ties have a share in its derivative.
@@ -144,7 +144,7 @@ def test_derivatives(fun):
         tangent = lambda y: jax.jvp(fun, (y,), (jnp.cos(y),))[1]  # noqa: E731
         return lambda y: (jax.grad(loss)(y), tangent(y))
 
-    found = jax.jit(both(lambda y: by_components(fun, y)))(Y)
+    found = jax.jit(both(lambda y: scalarised(fun, y)))(Y)
     with cfjax.rewriting(False):
         want = jax.jit(both(fun))(Y)
     for a, b in zip(found, want, strict=True):
@@ -155,7 +155,7 @@ def test_derivatives(fun):
 def test_in_batches():
     ys = jnp.stack([Y, 2 * Y, -Y])
     for fun in (crosses, products, sums):
-        apart = jax.jit(jax.vmap(lambda y: by_components(fun, y)))(ys)  # noqa: B023
+        apart = jax.jit(jax.vmap(lambda y: scalarised(fun, y)))(ys)  # noqa: B023
         np.testing.assert_allclose(apart, jax.vmap(fun)(ys), rtol=1e-13, atol=1e-13)
 
 
@@ -168,12 +168,12 @@ def test_what_has_no_rule_gets_arrays_whole(leftover):
         return jnp.sin(y)
 
     odd.defjvp(lambda p, t: (odd(*p), 7.0 * t[0]))
-    apart = jax.jit(lambda y: by_components(fun, y))(Y)
+    apart = jax.jit(lambda y: scalarised(fun, y))(Y)
     np.testing.assert_allclose(apart, fun(jnp.asarray(Y)), rtol=1e-14, atol=1e-14)
     assert set(leftover) == {"sort", "cummax", "custom_jvp_call"}
     slope = lambda f: jax.jvp(f, (jnp.asarray(Y),), (jnp.ones_like(Y),))[1]  # noqa: E731
     # Sums of three numbers, in another order. The rule of `odd` survives.
-    np.testing.assert_allclose(slope(lambda y: by_components(fun, y)), slope(fun), atol=1e-14)
+    np.testing.assert_allclose(slope(lambda y: scalarised(fun, y)), slope(fun), atol=1e-14)
 
 
 def test_a_matrix_is_no_lattice():
@@ -181,13 +181,13 @@ def test_a_matrix_is_no_lattice():
     y = jnp.asarray(RNG.normal(size=(100, 4)))
     fun = lambda y: y @ (y.T @ y)  # noqa: E731
     # A sum of 100 terms, with another order.
-    np.testing.assert_allclose(by_components(fun, y), fun(y), rtol=1e-12, atol=1e-12)
+    np.testing.assert_allclose(scalarised(fun, y), fun(y), rtol=1e-12, atol=1e-12)
 
 
 def test_split_and_join():
     tree = {"y": jnp.asarray(Y), "w": jnp.asarray(W), "few": jnp.ones((4, 3)), "big": jnp.ones(200)}
     parts = split(tree, True)
-    assert isinstance(parts["y"], Columns) and len(parts["y"].entries) == 3
+    assert isinstance(parts["y"], StructOfArrays) and len(parts["y"].entries) == 3
     assert parts["y"].entries[0].shape == (9, 8)
     assert parts["big"] is tree["big"]
     assert len(parts["few"].entries) == 12
@@ -205,7 +205,7 @@ def test_which_states_are_rows(shape, expected):
 
 
 def test_parts_that_repeat_stay_small():
-    x = columns(jnp.asarray(Y))
+    x = struct_of_arrays(jnp.asarray(Y))
     assert x.inner == (1, 1, 3) and x.sides == (9, 8)
     seen = []
 
@@ -214,7 +214,7 @@ def test_parts_that_repeat_stay_small():
         seen.append(field * 2.0)
         return y + seen[-1]
 
-    text = str(jax.make_jaxpr(lambda y: by_components(fun, y))(jnp.asarray(Y)))
+    text = str(jax.make_jaxpr(lambda y: scalarised(fun, y))(jnp.asarray(Y)))
     # W is doubled before it is spread, on arrays of one entry.
     assert "f64[1,1] = mul" in text
 

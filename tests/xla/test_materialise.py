@@ -9,12 +9,12 @@ import numpy as np
 import pytest
 
 import cfjax
-from cfjax._xla.held import held
+from cfjax._xla.materialise import materialised
 from cfjax._xla.pack import pack, unpack
 from cfjax.scenes import rigid_body, spacecraft
 
 
-def test_what_is_held_is_computed_once():
+def test_what_is_materialised_is_computed_once():
     """Without it XLA computes the entries anew for each of two results."""
 
     def program(keep):
@@ -28,7 +28,7 @@ def test_what_is_held_is_computed_once():
 
         return jax.jit(fun).lower(jnp.ones(3)).compile().cost_analysis()["flops"]
 
-    assert program(held) < program(list)
+    assert program(materialised) < program(list)
 
 
 def test_increments_of_a_step_are_computed_together(rewritten):
@@ -44,7 +44,7 @@ def test_increments_of_a_step_are_computed_together(rewritten):
 
     y0 = {"q": jnp.array([1.0, 0.0, 0.0, 0.0]), "m": jnp.ones(3)}
     text = str(jax.make_jaxpr(solve)(y0, jnp.array([0.9, 0.6, 0.3])))
-    groups = [line.split("=")[0] for line in text.splitlines() if "= cfjax_held[" in line]
+    groups = [line.split("=")[0] for line in text.splitlines() if "= cfjax_materialised[" in line]
     assert 7 in [len(group.split()) for group in groups]
 
 
@@ -92,7 +92,7 @@ def test_in_a_batch_only_if_asked_for(in_batches):
     """There a call is what XLA does not fuse."""
 
     def fun(x):
-        return pack(held(unpack(x * x), in_batches=in_batches)) * x
+        return pack(materialised(unpack(x * x), in_batches=in_batches)) * x
 
     program = str(jax.jit(jax.vmap(fun)).lower(jnp.ones((5, 3))).compile().as_text())
     assert (" call(" in program) == in_batches
@@ -101,7 +101,7 @@ def test_in_a_batch_only_if_asked_for(in_batches):
 @pytest.mark.parametrize("now", [False, True])
 def test_in_a_derivative_only_if_asked_for(now):
     def fun(x):
-        return jnp.sum(jnp.sin(pack(held(unpack(x * x), in_batches=True, now=now))))
+        return jnp.sum(jnp.sin(pack(materialised(unpack(x * x), in_batches=True, now=now))))
 
     for f, is_held in ((fun, now), (jax.grad(fun), True)):
         program = str(jax.jit(jax.vmap(f)).lower(jnp.ones((5, 3))).compile().as_text())
@@ -110,5 +110,5 @@ def test_in_a_derivative_only_if_asked_for(now):
 
 def test_other_dtypes_stay():
     x = [jnp.asarray(True), jnp.asarray(3), jnp.asarray(0.5), jnp.asarray(2j, np.complex64)]
-    for got, want in zip(jax.jit(lambda x: held(x))(x), x, strict=True):
+    for got, want in zip(jax.jit(lambda x: materialised(x))(x), x, strict=True):
         assert got.dtype == want.dtype and got == want

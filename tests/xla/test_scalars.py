@@ -1,4 +1,4 @@
-"""`by_components`: the same numbers as the function itself, under every transformation."""
+"""`scalarised`: the same numbers as the function itself, under every transformation."""
 
 import equinox as eqx
 import hypothesis
@@ -12,8 +12,8 @@ from jax.experimental import io_callback
 
 import cfjax
 from cfjax._xla import program
-from cfjax._xla.held import held
-from cfjax._xla.program import by_components
+from cfjax._xla.materialise import materialised
+from cfjax._xla.program import scalarised
 
 pytestmark = pytest.mark.usefixtures("rewritten")
 
@@ -218,11 +218,10 @@ MATRIX = {
     "matrix and vector": (
         lambda y: (y["v"] * y["m"][0] @ y["m"].T, {"v": y["m"] @ jnp.cross(y["v"], W)}),
         {"m": M[:2], "v": Y},
-    ),
-    "complex matrix": (lambda u: (u @ u.conj().T, u.real * 2, jnp.exp(u) @ (u[0] * 1j)), U),
+    ), "complex matrix": (lambda u: (u @ u.conj().T, u.real * 2, jnp.exp(u) @ (u[0] * 1j)), U),
     "through a branch": (lambda m: lax.cond(m[0, 0] > 0, lambda m: m @ m, jnp.sin, m + 1.0), M),
-    "too many": (lambda y: [jnp.cross(y[0] @ y[1], y[1]), y[1] @ y[2]], [M, M + 1, M * 2]),
-    "held": (lambda m: (held([m, m * m])[1] @ m, *held([m[0, 0], m[0, 1] * m[2, 2]])), M),
+    "too many": (lambda y: [jnp.cross(y[0] @ y[1], y[1]), y[1] @ y[2]], [M, M + 1, M * 2]), "held":
+    (lambda m: (materialised([m, m * m])[1] @ m, *materialised([m[0, 0], m[0, 1] * m[2, 2]])), M),
 }  # fmt: skip
 
 ZOO = {
@@ -274,7 +273,7 @@ def loss_of(fun, back):
 
 
 def whole(fun):
-    return lambda y: by_components(fun, y)
+    return lambda y: scalarised(fun, y)
 
 
 def assert_same(got, want, units, least=np.float64):
@@ -325,7 +324,7 @@ def test_branches_and_loops_are_left_alone(fun):
 @pytest.mark.parametrize("name", ["arithmetic", "elementary", "constants out", "integers", "loops"])
 def test_values_outside_of_jit(name):
     fun, y = ZOO[name]
-    got, want = by_components(fun, jnp.asarray(y)), jax.jit(fun)(y)
+    got, want = scalarised(fun, jnp.asarray(y)), jax.jit(fun)(y)
     assert all(isinstance(x, jax.Array) for x in jax.tree.leaves(got))
     assert_same(got, want, VALUE)
 
@@ -430,7 +429,7 @@ def test_jacobians_and_hessians(n):
 def test_custom_vmap_rule_is_kept():
     fun = lambda y: odd_vmap(y) + y  # noqa: E731
     batch = jnp.stack([jnp.asarray(Y), jnp.asarray(W)])
-    np.testing.assert_allclose(by_components(fun, jnp.asarray(Y)), 3 * Y, rtol=1e-15)
+    np.testing.assert_allclose(scalarised(fun, jnp.asarray(Y)), 3 * Y, rtol=1e-15)
     np.testing.assert_allclose(jax.vmap(whole(fun))(batch), 4 * batch, rtol=1e-15)
 
 
@@ -439,11 +438,11 @@ def test_custom_vmap_rule_is_kept():
 def test_special_values_stay_where_they_are(bad):
     y = jnp.asarray([0.5, bad, 2.0])
     for fun in (lambda y: y, lambda y: y * 1.0, lambda y: jnp.where(y == y, y, 0.0), jnp.sqrt):
-        got, want = by_components(fun, y), fun(y)
+        got, want = scalarised(fun, y), fun(y)
         np.testing.assert_array_equal(got, want)
         np.testing.assert_array_equal(np.signbit(got), np.signbit(want))
     # A cotangent that is not finite stays in its component too.
-    gradient = jax.grad(lambda y: jnp.sum(by_components(lambda y: 1 / y[1:] * y[0], y)[1:]))(
+    gradient = jax.grad(lambda y: jnp.sum(scalarised(lambda y: 1 / y[1:] * y[0], y)[1:]))(
         jnp.asarray([1.0, 0.0, 2.0])
     )
     assert np.isfinite(gradient[2])
@@ -454,7 +453,7 @@ def test_closing_over_traced_values():
     y, w, m = map(jnp.asarray, (Y, W, M))
 
     def scale(w, s, m):
-        return by_components(lambda y: jnp.exp(s * y) * w + m @ y / w, y)
+        return scalarised(lambda y: jnp.exp(s * y) * w + m @ y / w, y)
 
     def plain(w, s, m):
         return jnp.exp(s * y) * w + m @ y / w
@@ -489,7 +488,7 @@ def test_effects_happen_once_in_a_derivative_too():
         io_callback(lambda: seen.append(1), None)
         return y * jnp.sum(y)
 
-    slope = jax.jit(jax.grad(lambda y: jnp.sum(by_components(fun, y))))(jnp.asarray(Y))
+    slope = jax.jit(jax.grad(lambda y: jnp.sum(scalarised(fun, y))))(jnp.asarray(Y))
     jax.effects_barrier()
     np.testing.assert_allclose(slope, 2 * Y.sum(), rtol=1e-15)  # Four roundings.
     assert seen == [1]
@@ -498,7 +497,7 @@ def test_effects_happen_once_in_a_derivative_too():
 def test_callback_without_arguments():
     shape = jax.ShapeDtypeStruct((), jnp.float64)
     fun = lambda y: y * jax.pure_callback(lambda: np.float64(3.0), shape)  # noqa: E731
-    np.testing.assert_array_equal(by_components(fun, jnp.asarray(Y)), 3 * Y)
+    np.testing.assert_array_equal(scalarised(fun, jnp.asarray(Y)), 3 * Y)
 
 
 def test_error_if_still_raises():
@@ -523,7 +522,7 @@ def test_random_keys_as_state():
         noise = jax.random.normal(y["key"], (3,), jnp.float64)
         return y["a"] * noise, y["keys"], jax.random.bits(y["keys"][1], (2,))
 
-    for run in (by_components, jax.jit(by_components, static_argnums=0)):
+    for run in (scalarised, jax.jit(scalarised, static_argnums=0)):
         a, keys, bits = run(fun, y)
         np.testing.assert_allclose(a, fun(y)[0], rtol=1e-15)
         np.testing.assert_array_equal(jax.random.key_data(keys), jax.random.key_data(y["keys"]))
@@ -541,7 +540,7 @@ def test_random_keys_as_state():
 )
 def test_constants_overflow_as_in_jax(fun):
     # Without the warnings that numpy's own scalars give.
-    np.testing.assert_array_equal(by_components(fun, jnp.asarray(Y)), fun(jnp.asarray(Y)))
+    np.testing.assert_array_equal(scalarised(fun, jnp.asarray(Y)), fun(jnp.asarray(Y)))
 
 
 def turn(y, n):
@@ -552,22 +551,22 @@ def turn(y, n):
 
 def test_derivatives_keep_the_inputs_alone():
     """Not the scalars in between, which the loops of diffrax would send through memory."""
-    _, slope = jax.vjp(lambda y: by_components(lambda y: turn(y, 10), y), jnp.asarray(Y))
-    # The start, whole and as held entries. Without the rule there are 80 numbers.
+    _, slope = jax.vjp(lambda y: scalarised(lambda y: turn(y, 10), y), jnp.asarray(Y))
+    # The start, whole and as materialised entries. Without the rule there are 80 numbers.
     assert sum(x.size for x in jax.tree.leaves(slope)) <= 2 * Y.size
 
 
 def test_python_numbers_as_state():
-    got = by_components(lambda y: (y[0] * y[1], y[0]), (1.5, jnp.asarray(Y)))
+    got = scalarised(lambda y: (y[0] * y[1], y[0]), (1.5, jnp.asarray(Y)))
     np.testing.assert_array_equal(got[0], 1.5 * Y)
     assert got[1] == 1.5
 
 
 def test_errors_of_the_function_come_through():
     with pytest.raises(ZeroDivisionError):
-        by_components(lambda y: y * (1 // 0), jnp.asarray(Y))
+        scalarised(lambda y: y * (1 // 0), jnp.asarray(Y))
     with pytest.raises(TypeError):
-        by_components(lambda y: y @ jnp.ones(4), jnp.asarray(Y))
+        scalarised(lambda y: y @ jnp.ones(4), jnp.asarray(Y))
 
 
 @pytest.mark.parametrize(
@@ -601,7 +600,7 @@ def test_no_small_array_is_built_inside(fun):
 
 def test_the_switch():
     fun = lambda y: jnp.cross(W, y)  # noqa: E731
-    once, twice = (lambda y: by_components(fun, y) for _ in range(2))
+    once, twice = (lambda y: scalarised(fun, y) for _ in range(2))
     for run, on in ((once, True), (twice, False)):
         with cfjax.rewriting(on):
             names = [e.primitive.name for e in jax.make_jaxpr(run)(Y).jaxpr.eqns]
@@ -610,7 +609,7 @@ def test_the_switch():
 
 def test_a_compiled_solve_obeys_the_switch():
     """Though its arguments are the same."""
-    solve = jax.jit(lambda y: by_components(lambda y: jnp.cross(W, y * y), y))
+    solve = jax.jit(lambda y: scalarised(lambda y: jnp.cross(W, y * y), y))
     texts = []
     for on in (True, False, True):
         with cfjax.rewriting(on):
@@ -688,6 +687,6 @@ def test_random_programs(n, steps):
     rng = np.random.default_rng(n)
     y = {"a": jnp.asarray(rng.normal(size=n)), "b": jnp.asarray(rng.normal(size=n))}
     # Eight steps that each amplify by less than ten, but rarely more than one of them.
-    for got, want in zip(by_components(fun, y), fun(y), strict=True):
+    for got, want in zip(scalarised(fun, y), fun(y), strict=True):
         assert got.shape == want.shape
         np.testing.assert_allclose(got, want, rtol=1e-11, atol=1e-11)
