@@ -90,7 +90,7 @@ class AbstractLieSolver(diffrax.AbstractSolver):
             lambda c, y: None if c is None else jnp.zeros_like(y), compensation, y0
         )
         first = terms.vf(t0, y0, args) if self.first_same_as_last else None
-        return State.checked(compensation, first, _admitted(jnp.asarray(t0), t1, field, y0))
+        return State(compensation, first, _admitted(jnp.asarray(t0), t1, field, y0))
 
     def without_estimate(self) -> "AbstractLieSolver":
         """The same method for steps that nobody controls: it keeps nothing for an estimate."""
@@ -114,9 +114,9 @@ class AbstractLieSolver(diffrax.AbstractSolver):
         return step(self, terms, t0, t1, y0, args, solver_state, made_jump)
 
     def _step(self, terms, t0, t1, y0, args, solver_state, made_jump):
-        compensation, first, zero = solver_state.parts()
-        if zero is not None:
-            t0 = t0 + zero
+        compensation, first = solver_state.compensation, solver_state.first
+        if solver_state.zero is not None:
+            t0 = t0 + lax.stop_gradient(solver_state.zero)
         if first is not None and made_jump is not False:
             first = _select(made_jump, lambda: terms.vf(t0, y0, args), first)
 
@@ -207,34 +207,19 @@ class State(eqx.Module):
 
     - `compensation`: what rounding has cut off the parts of the state that are compensated sums.
     - `first`: the field at the start of the next step, where the last evaluation was there.
-    - `zero`: what every step adds to its time, if no other array carries the checks of the
-      start. diffrax drops what no step uses.
+    - `zero`: what every step adds to its time. It carries the checks of the start: diffrax drops
+      what no step uses.
     """
 
     compensation: PyTree
     first: PyTree
     zero: Real[Array, ""] | None
 
-    @classmethod
-    def checked(cls, compensation: PyTree, first: PyTree, zero: Real[Array, ""]) -> "State":
-        """With `zero` within one of the other arrays: a loop of small steps feels every one."""
-        arrays, structure = jtu.tree_flatten((compensation, first))
-        if not arrays:
-            return cls(compensation, first, zero)
-        arrays[0] = needing(zero, arrays[0])
-        compensation, first = jtu.tree_unflatten(structure, arrays)
-        return cls(compensation, first, None)
-
-    def parts(self) -> tuple[PyTree, PyTree, Real[Array, ""] | None]:
-        zero = None if self.zero is None else lax.stop_gradient(self.zero)
-        return self.compensation, self.first, zero
-
     def started(self, y0: PyTree) -> tuple[PyTree, "State"]:
-        """The start, with the checks in it, and a state for steps that do not know of them."""
-        zero = self.zero
-        if zero is not None:
-            y0 = needing(zero, y0)
-        return y0, State(self.compensation, self.first, None)
+        """The start, with the checks in it, and a state for steps that do not carry them."""
+        if self.zero is None:
+            return y0, self
+        return needing(self.zero, y0), State(self.compensation, self.first, None)
 
 
 # By how much a start is off, in the message. The error itself may be in a compiled program.
