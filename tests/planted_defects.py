@@ -337,8 +337,8 @@ DEFECTS = [
     ),
     Defect(
         "_numerics/rigid_motion.py",
-        "pitch = (c.c3 * _dot(w, v)) * weight",
-        "pitch = (c.d2 * _dot(w, v)) * weight",
+        "pitch = (c.c3 * dot(w, v)) * weight",
+        "pitch = (c.d2 * dot(w, v)) * weight",
         "a screw of the wrong pitch",
         "fields/test_contract.py -k Rigid",
     ),
@@ -655,8 +655,8 @@ DEFECTS = [
     ),
     Defect(
         "_numerics/quaternion.py",
-        'b, c = (a, v) if frame == "fixed" else (v, a)',
-        'b, c = (v, a) if frame == "fixed" else (a, v)',
+        'cross(a, v) if frame == "fixed" else cross(v, a)',
+        'cross(v, a) if frame == "fixed" else cross(a, v)',
         "angular velocities of quaternions in the other frame",
         "fields/test_quaternion.py",
     ),

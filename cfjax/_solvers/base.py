@@ -116,7 +116,8 @@ class AbstractLieSolver(diffrax.AbstractSolver):
     def _step(self, terms, t0, t1, y0, args, solver_state, made_jump):
         compensation, first = solver_state.compensation, solver_state.first
         if solver_state.zero is not None:
-            t0 = t0 + lax.stop_gradient(solver_state.zero)
+            # Of a weak type, if the time is.
+            t0 = jnp.where(solver_state.zero == 0, t0, jnp.nan)
         if first is not None and made_jump is not False:
             first = _select(made_jump, lambda: terms.vf(t0, y0, args), first)
 
@@ -207,8 +208,8 @@ class State(eqx.Module):
 
     - `compensation`: what rounding has cut off the parts of the state that are compensated sums.
     - `first`: the field at the start of the next step, where the last evaluation was there.
-    - `zero`: what every step adds to its time. It carries the checks of the start: diffrax drops
-      what no step uses.
+    - `zero`: carries the checks of the start. Every step needs it, as diffrax drops what no step
+      uses.
     """
 
     compensation: PyTree
