@@ -126,8 +126,8 @@ DEFECTS = [
     ),
     Defect(
         "_solvers/stages.py",
-        "flows.append(_Flow(found[product[:-1]], product[-1],",
-        "flows.append(_Flow(found[product[:-1]], product[0],",
+        "flows.append(_Flow(place[product[:-1]], product[-1],",
+        "flows.append(_Flow(place[product[:-1]], product[0],",
         "the first row in place of the last one in rolled stages",
         "solvers/test_one_step.py",
     ),
@@ -641,7 +641,7 @@ DEFECTS = [
     ),
     Defect(
         "_solvers/commutator_free.py",
-        "reach.points[beta] = materialised_if_long(end)",
+        "reach.points[beta] = chart.narrow(end)",
         "reach.points[beta] = end",
         "a long step that is not cut",
         "xla/test_materialise.py -k long_step",

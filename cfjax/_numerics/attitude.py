@@ -11,9 +11,8 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Float
 
-from .._xla import is_rewritten
 from .quaternion import Order, check_choice, from_parts, parts
-from .vectors import cross, pack, smooth
+from .vectors import cross, is_rewritten, pack, smooth
 
 
 def quaternion_to_matrix(
@@ -138,7 +137,7 @@ def _quaternion(q: Array | np.ndarray, order: Order) -> tuple[tuple[Array, ...],
     is_near = jnp.abs(off) <= 0.1
     inverse = _error_unless(
         is_near,
-        jnp.where(is_near, inverse, jnp.nan),
+        inverse,
         "q must have length 1, and is off by more than 0.1 in q @ q. Divide it by its length.",
     )
     return (w, x, y, z), 2 * inverse
@@ -167,8 +166,9 @@ def _checked_matrix(matrix: Array) -> Array:
 
 
 def _error_unless(holds: Bool[Array, "*batch"], x: Array, message: str) -> Array:
-    # A step of a small system would spend most of its time on the check, and the flow keeps
-    # lengths.
+    x = jnp.where(holds.reshape(*holds.shape, *[1] * (x.ndim - holds.ndim)), x, jnp.nan)
+    # A step of a small system would spend most of its time on the call. NaN ends the solve with an
+    # error too.
     return x if is_rewritten() else eqx.error_if(x, ~jnp.all(holds), message)
 
 

@@ -16,9 +16,9 @@ import numpy as np
 from jax import lax
 from jaxtyping import Array, Inexact
 
-from .._xla import materialised, unpack
 from .matmul import small_product
 from .squaring import exponent, max_over_batch, squared, squarings
+from .vectors import materialised, unpack
 
 # Of Taylor's polynomial.
 _DEGREE = {"float32": 13, "float64": 22}

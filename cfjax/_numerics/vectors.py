@@ -8,6 +8,8 @@ from typing import Any
 
 from jaxtyping import Array, Float
 
+from .._xla import is_rewritten as is_rewritten
+from .._xla import materialised as materialised
 from .._xla import pack as pack
 from .._xla import smooth as smooth
 from .._xla import unpack as unpack

@@ -62,13 +62,13 @@ class AbstractLieSolver(diffrax.AbstractSolver):
         return False
 
     @abc.abstractmethod
-    def move(self, chart: Chart) -> "Move":
+    def step_in(self, chart: Chart) -> "Step":
         """A step from `chart.start`, with the fields that `chart.frozen` evaluates."""
 
     def extended(self, path: Path, field: Callable[[Any, PyTree], PyTree]) -> Path:
         """The way of a step with what only output within it takes.
 
-        `field(c, y)` is `h f(t + c h, y)`. Apart from `move`, which is compiled whether anybody
+        `field(c, y)` is `h f(t + c h, y)`. Apart from `step_in`, which is compiled whether anybody
         asks for that or not.
         """
         return path
@@ -130,7 +130,7 @@ class AbstractLieSolver(diffrax.AbstractSolver):
                 t = jnp.where(c == 1, t1, t0 + c * (t1 - t0))
             return materialised_in_rows(terms.vf(t, y, args))
 
-        def move(y0):
+        def stepped(y0):
             control = terms.contr(t0, t1)
             values = []
 
@@ -141,9 +141,9 @@ class AbstractLieSolver(diffrax.AbstractSolver):
                     values.append(first)
                 return product(terms, values[-1], control)
 
-            made = self.move(Chart(field, y0, compensation))
-            end, error = made.end, made.error
-            if not made.is_shared:
+            step = self.step_in(Chart(field, y0, compensation))
+            end, error = step.end, step.error
+            if not step.is_shared:
                 end, error = _shared(compensation, end, error, is_followed=first is not None)
             if first is None:
                 last = None
@@ -153,9 +153,9 @@ class AbstractLieSolver(diffrax.AbstractSolver):
                 last = evaluate(1.0, at(y0, end, compensation))
             else:
                 last = values[-1]
-            return (end, last), (error, made.path)
+            return (end, last), (error, step.path)
 
-        (end, last), (error, path) = scalarised(move, y0)
+        (end, last), (error, path) = scalarised(stepped, y0)
         path = self.extended(path, lambda c, y: product(terms, evaluate(c, y), terms.contr(t0, t1)))
         y1, compensation = added(y0, end, compensation)
         state = State(compensation, last, solver_state.zero)
@@ -166,7 +166,7 @@ class AbstractLieSolver(diffrax.AbstractSolver):
         return velocity(terms, terms.vf(t0, y0, args), y0)
 
 
-class Move(eqx.Module):
+class Step(eqx.Module):
     """A step: where it ends, the way there for output within it, and an estimate of its error.
 
     `is_shared` says that the end is materialised, with all that the estimate is made of.

@@ -8,7 +8,7 @@ import jax.tree_util as jtu
 from jaxtyping import Array, PyTree, Real
 
 from .._field import flow, from_chart, is_field, to_chart
-from .._xla import materialised_in_rows
+from .._xla import materialised_if_long, materialised_in_rows, materialised_together
 from .compensation import at, with_sums
 
 
@@ -93,6 +93,17 @@ class Chart:
     def difference(self, a: PyTree, b: PyTree) -> PyTree:
         """How far two points are apart in the ambient space."""
         return jtu.tree_map(jnp.subtract, self.from_start(a), self.from_start(b))
+
+    def shared(self, tree: PyTree) -> PyTree:
+        """The same arrays, of each of which several results are made.
+
+        XLA computes them once then, and not anew for each result.
+        """
+        return materialised_together(tree, alone=True)
+
+    def narrow(self, point: PyTree) -> PyTree:
+        """The same point, on which all depends that follows: where a long step may be cut."""
+        return materialised_if_long(point)
 
 
 def carried(field: PyTree, point: PyTree) -> PyTree:

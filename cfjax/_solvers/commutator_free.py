@@ -16,11 +16,11 @@ from .._methods import tableau as _tableau
 from .._methods.continuous_extension import continuous_extension
 from .._methods.proved import order_of
 from .._methods.tableau import Product, Row, Tableau
-from .._xla import materialised_if_long, materialised_together, smooth
-from .base import AbstractLieSolver, Move, check_choice
+from .._numerics.vectors import smooth
+from .base import AbstractLieSolver, Step, check_choice
 from .chart import Chart
 from .dense import Path
-from .stages import can_roll_stages, rolled
+from .stages import rolled
 
 
 class AbstractCommutatorFree(AbstractLieSolver):
@@ -73,20 +73,21 @@ class AbstractCommutatorFree(AbstractLieSolver):
         """The field of the last of some rows; `kept` is for what is used again in the step."""
         return _combined(rows[-1], chart.fields)
 
-    def move(self, chart):
+    def step_in(self, chart):
         tableau = self.tableau
         alpha, beta = [trimmed(rows) for rows in tableau.alpha], trimmed(tableau.beta)
         reach = _Reach(chart, self.direction)
         if not chart.fields:
             chart.frozen(0.0, chart.start)
-        if self._can_roll(chart):
-            reach.points |= rolled(chart, [*alpha, beta], tableau.c)
+        # Two stages at one point would be one flow with two times.
+        if self._is_usual and len(set(alpha)) == len(alpha):
+            reach.points |= rolled(self.unroll, chart, [*alpha, beta], tableau.c)
         for c, rows in list(zip(tableau.c, alpha, strict=True))[len(chart.fields) :]:
             chart.frozen(float(c), reach(rows))
         end = reach(beta)
         if self.first_same_as_last:
             # The end, the last field and the error are made of it.
-            end = reach.points[beta] = materialised_if_long(end)
+            end = reach.points[beta] = chart.narrow(end)
         # All that follows is for error control and output within the step. The compiler leaves it
         # out where the caller asks for neither.
         within = continuous_extension(tableau)
@@ -94,30 +95,27 @@ class AbstractCommutatorFree(AbstractLieSolver):
             chart.frozen(1.0, end)
         path = Path.of(within, chart.without_sums(chart.start), chart.fields)
         if self._embedded is None:
-            return Move(chart.from_start(end), path)
+            return Step(chart.from_start(end), path)
         if self.estimate == "algebra":
             difference = _combined(_difference(self._embedded, tableau.beta), chart.fields)
             error = tangent(difference, chart.state(end))
         else:
             error = chart.difference(end, reach(trimmed(self._embedded)))
         if not tableau.uses_last(self._embedded):
-            return Move(chart.from_start(end), path, error)
+            return Step(chart.from_start(end), path, error)
         apart = chart.difference(end, reach(alpha[-1]))
-        # A ratio is where a function of XLA's ends, and all of it is needed before.
-        end, error, apart = materialised_together((chart.from_start(end), error, apart), alone=True)
+        # All of them are needed before the ratio of their sizes.
+        end, error, apart = chart.shared((chart.from_start(end), error, apart))
         way = jtu.tree_map(jnp.subtract, end, chart.from_start(chart.start))
-        return Move(end, path, jtu.tree_map(_seen, error, apart, way), is_shared=True)
+        return Step(end, path, jtu.tree_map(_seen, error, apart, way), is_shared=True)
 
     @property
     def _embedded(self) -> Product | None:
         return None if self.estimate is None else self.tableau.embedded
 
-    def _can_roll(self, chart: Chart) -> bool:
-        is_usual = type(self).direction is AbstractCommutatorFree.direction
-        # Two stages at one point would be one flow with two times.
-        is_distinct = len(set(map(trimmed, self.tableau.alpha))) == len(self.tableau.c)
-        num_stages = len(self.tableau.c)
-        return is_usual and is_distinct and can_roll_stages(self.unroll, chart, num_stages)
+    @property
+    def _is_usual(self) -> bool:
+        return type(self).direction is AbstractCommutatorFree.direction
 
 
 class _Reach:

@@ -56,7 +56,7 @@ class Path(eqx.Module):
     structure: Any = eqx.field(static=True)
     continuous_extension: ContinuousExtension = eqx.field(static=True)
     # Where a combination of the fields leads from a point.
-    move: Callable[[PyTree, PyTree], PyTree] = eqx.field(static=True)
+    apply_flow: Callable[[PyTree, PyTree], PyTree] = eqx.field(static=True)
 
     @classmethod
     def of(
@@ -64,13 +64,13 @@ class Path(eqx.Module):
         continuous_extension: ContinuousExtension,
         start: PyTree,
         fields: list[PyTree],
-        move: Callable[[PyTree, PyTree], PyTree] = carried,
+        apply_flow: Callable[[PyTree, PyTree], PyTree] = carried,
     ) -> "Path":
         leaves, structure = jtu.tree_flatten((start, fields))
         arrays = {id(leaf): leaf for leaf in leaves}
         index = {key: i for i, key in enumerate(arrays)}
         places = tuple(index[id(leaf)] for leaf in leaves)
-        return cls(tuple(arrays.values()), places, structure, continuous_extension, move)
+        return cls(tuple(arrays.values()), places, structure, continuous_extension, apply_flow)
 
     def parts(self, arrays: tuple[Array | np.ndarray, ...]) -> tuple[PyTree, list[PyTree]]:
         """The start and the fields that are made of these arrays."""
@@ -83,7 +83,7 @@ class Path(eqx.Module):
         point, fields = self.parts(self.arrays)
         # Of small states too: an event's root finder differentiates it, and a loop of flows on
         # short vectors is as fast in batches.
-        if self.move is carried and len(weights) > 1 and can_roll(None, fields[0], point):
+        if self.apply_flow is carried and len(weights) > 1 and can_roll(None, fields[0], point):
             # There may be no field at the end of the step, where it has no weight.
             return rolled_flows(weights[:, : len(fields)], fields, point, carried)
 
@@ -92,7 +92,7 @@ class Path(eqx.Module):
             for j in range(len(weights)):
                 used = np.flatnonzero(powers[:, j].any(axis=0))
                 row = [(weights[j, k], fields[k]) for k in used]
-                point = self.move(combine(*zip(*row, strict=True)), point)
+                point = self.apply_flow(combine(*zip(*row, strict=True)), point)
             return from_chart(fields[0], point)
 
         return scalarised(end, self.arrays)

@@ -15,7 +15,7 @@ from .._field import combine
 from .._methods.continuous_extension import continuous_extension
 from .._methods.proved import proved
 from .._methods.tableau import Product, Row, Tableau
-from .base import Move
+from .base import Step
 from .commutator_free import AbstractCommutatorFree, trimmed
 from .dense import Path
 from .stages import is_uniform
@@ -47,15 +47,15 @@ class AbstractLowStorage(AbstractCommutatorFree):
             kept[i] = combine(both, (kept[i - 1], chart.fields[i])) if i else chart.fields[0]
         return combine((float(self.b[i]),), (kept[i],))
 
-    def move(self, chart):
+    def step_in(self, chart):
         embedded = None if self.estimate is None else self.tableau.embedded
         penultimate = embedded is not None and trimmed(embedded) == trimmed(self.tableau.beta[:-1])
         other = embedded is not None and not (penultimate and self.estimate == "group")
         if other or self._is_unrolled(chart.start):
-            return super().move(chart)
+            return super().step_in(chart)
         first = chart.frozen(0.0, chart.start)
         if not is_uniform(chart):
-            return super().move(chart)
+            return super().step_in(chart)
 
         def stage(carry, coefficients):
             a, b, c = coefficients
@@ -74,7 +74,7 @@ class AbstractLowStorage(AbstractCommutatorFree):
         fields = [first, *(jtu.tree_map(itemgetter(i), later) for i in range(len(self.b) - 1))]
         path = Path.of(continuous_extension(self.tableau), chart.without_sums(start), fields)
         error = chart.difference(end, before) if penultimate else None
-        return Move(chart.from_start(end), path, error)
+        return Step(chart.from_start(end), path, error)
 
     def _is_unrolled(self, point: PyTree) -> bool:
         if self.unroll is not None:

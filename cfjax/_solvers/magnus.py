@@ -15,7 +15,7 @@ from .._methods import magnus as _magnus
 from .._methods.magnus import MagnusTableau
 from .._methods.tableau import Product
 from .._term import product
-from .base import AbstractLieSolver, Move, State, check_choice
+from .base import AbstractLieSolver, State, Step, check_choice
 from .chart import Chart
 from .dense import Path
 from .stages import can_roll, rolled_flows
@@ -82,7 +82,7 @@ class AbstractMagnus(AbstractLieSolver):
             raise TypeError(_depends_on_state(name, *found[0]))
         return super().init(terms, t0, t1, y0, args)
 
-    def move(self, chart):
+    def step_in(self, chart):
         tableau = self.tableau
         for c in tableau.nodes:
             # Any point will do.
@@ -96,7 +96,7 @@ class AbstractMagnus(AbstractLieSolver):
             error = chart.difference(end, self._flows(embedded[num_shared:], chart, middle))
         start = chart.without_sums(chart.start)
         path = Path.of(tableau.continuous_extension, start, chart.fields)
-        return Move(chart.from_start(end), path, error)
+        return Step(chart.from_start(end), path, error)
 
     def _flows(self, rows: Product, chart: Chart, point: PyTree) -> PyTree:
         weights = [list(map(float, row)) for row in rows]

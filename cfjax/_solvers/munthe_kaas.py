@@ -23,20 +23,10 @@ from .._field import (
 from .._methods.continuous_extension import RungeKuttaExtension, runge_kutta_extension
 from .._methods.order_conditions import runge_kutta_order
 from .._methods.tableau import ContinuousExtension, Row
-from .._xla import are_long, is_rewritten, materialised_together
-from .base import AbstractLieSolver, Move, check_choice
+from .base import AbstractLieSolver, Step, check_choice
 from .chart import Chart
 from .dense import Path
-from .stages import (
-    can_roll,
-    can_roll_in_room,
-    is_uniform,
-    rolled_elements,
-    rolled_elements_in_room,
-)
-
-# Fewer stages are mostly short enough to be rewritten for XLA; to look costs a trace of one more.
-_MANY = 8
+from .stages import rolled_elements
 
 # The rows of the stages after the first, and the weights.
 _RungeKutta = tuple[tuple[tuple[float, ...], ...], tuple[float, ...]]
@@ -86,7 +76,7 @@ class AbstractMuntheKaas(AbstractLieSolver):
         """The element v, where `field(c, y)` is `h f(t + c h, y)`."""
         return _combine_nonzero(self.b, self.elements(Chart(field, y0)))
 
-    def move(self, chart):
+    def step_in(self, chart):
         elements = self.elements(chart)
         v = _combine_nonzero(self.b, elements)
         end = chart.flow(v, chart.start)
@@ -102,9 +92,9 @@ class AbstractMuntheKaas(AbstractLieSolver):
                 embedded = chart.flow(combine((1.0, -1.0), (v, off)), chart.start)
                 error = chart.difference(end, embedded)
         # All of them are results then, and XLA would compute the step anew for each.
-        elements = materialised_together(elements, alone=True)
+        elements = chart.shared(elements)
         path = Path.of(self.continuous_extension, chart.without_sums(chart.start), elements)
-        return Move(chart.from_start(end), path, error)
+        return Step(chart.from_start(end), path, error)
 
 
 def _frozen(chart: Chart, c: float, u: PyTree) -> PyTree:
@@ -297,29 +287,16 @@ class RKMK(AbstractMuntheKaas, diffrax.AbstractAdaptiveSolver):
     ) -> list[PyTree]:
         """These, and a stage for each row and time."""
 
-        def element(c: Any, u: PyTree) -> PyTree:
-            field = chart.frozen_after(known, c, chart.flow(u, chart.start))
-            return dexpinv(u, field, self._degree)
-
-        if len(rows) > 1 and all(map(any, rows)):
-            # Before all of them are traced, only to find that they are too long together.
-            one = functools.partial(element, times[0])
-            is_long = len(rows) > _MANY and is_rewritten() and are_long(one, known[0], len(rows))
-            if can_roll(self.unroll, known[0], known[0], is_long) and is_uniform(chart):
-                return rolled_elements(known, rows, times, element)
-            if can_roll_in_room(self.unroll, chart, known, len(known) + len(rows)):
-                made = functools.partial(dexpinv, degree=self._degree)
-                # A bracket takes time as the third power of the room: less for the first ones.
-                half = len(rows) // 2 if len(rows) > _MANY else 0
-                for few in (slice(half), slice(half, None)):
-                    known = rolled_elements_in_room(known, rows[few], times[few], chart, made)
-                return known
+        inverse = functools.partial(dexpinv, degree=self._degree)
+        made = rolled_elements(self.unroll, chart, known, rows, times, inverse)
+        if made is not None:
+            return made
         stages = list(known)
         for c, row in zip(times, rows, strict=True):
             # Rows may be shorter than what is known.
             u = _combine_nonzero(row, stages) if any(row) else None
             field = _frozen(chart, c, u)
-            stages.append(field if u is None else dexpinv(u, field, self._degree))
+            stages.append(field if u is None else inverse(u, field))
         return stages
 
 

@@ -12,7 +12,7 @@ from .._fields.low_rank import BorderedSkew, LowRankSkew
 from .._fields.sphere import SphereRotation
 from .._methods.continuous_extension import runge_kutta_extension
 from .._numerics.matmul import matmul
-from .base import AbstractLieSolver, Move
+from .base import AbstractLieSolver, Step
 from .dense import Path
 
 _EXTENSION = runge_kutta_extension(
@@ -41,7 +41,7 @@ class CayleyRK4(AbstractLieSolver):
     def order(self, terms) -> int:
         return 4
 
-    def move(self, chart):
+    def step_in(self, chart):
         # It has coordinates of its own, and takes states.
         field, y0 = chart.field, chart.start
         first = field(0.0, y0)
@@ -65,7 +65,7 @@ class CayleyRK4(AbstractLieSolver):
         k4 = rate(1.0, k3)
         rates = [k1, k2, k3, k4]
         y1 = end(combine((1 / 6, 1 / 3, 1 / 3, 1 / 6), rates), y0)
-        return Move(y1, Path.of(_EXTENSION, y0, rates, end))
+        return Step(y1, Path.of(_EXTENSION, y0, rates, end))
 
 
 class _End(NamedTuple):

@@ -1,8 +1,10 @@
 """The stages of a step rolled into one loop, so that a program has the field and its flow once."""
 
+import functools
 from collections.abc import Callable, Sequence
 from typing import Any, NamedTuple
 
+import equinox as eqx
 import jax
 import jax.numpy as jnp
 import jax.tree_util as jtu
@@ -12,7 +14,8 @@ from jaxtyping import Array, PyTree, Real
 from .._field import AbstractFrozenField, describe, is_field
 from .._fields.elementwise import Elementwise
 from .._methods.tableau import Product, Row
-from .._xla import is_rewritten, pack, table
+from .._numerics.vectors import pack
+from .._xla import are_long, is_rewritten, table
 from .chart import Chart
 
 # A loop copies the fields of all stages in each of its turns. For a dense matrix of more entries
@@ -22,6 +25,9 @@ _SMALL = 100
 # Of a point in the chart of a field, with its columns. Where a loop is differentiated, it keeps
 # those of all stages for each of its turns.
 _SMALL_STEP = 2048
+
+# Fewer stages are mostly short enough to be rewritten for XLA; to look costs a trace of one more.
+_MANY = 8
 
 
 def can_roll(unroll: bool | None, field: PyTree, point: PyTree, is_long: bool = False) -> bool:
@@ -33,25 +39,14 @@ def can_roll(unroll: bool | None, field: PyTree, point: PyTree, is_long: bool = 
     numbers than the point has.
     """
     parts = jtu.tree_leaves(field, is_leaf=is_field)
-    is_possible = any(map(is_field, parts)) and is_plain(field)
+    is_possible = any(map(is_field, parts)) and _is_plain(field)
     if unroll is not None:
         return is_possible and not unroll
     pays = is_long or not is_rewritten()
     return is_possible and pays and _size(field) <= max(_SMALL, 4 * _size(point))
 
 
-def can_roll_stages(unroll: bool | None, chart: Chart, num_stages: int) -> bool:
-    """The same of stages that are evaluated at points of the step, of which the first one is known.
-
-    A field with a chart of its own is rolled if it offers room for the coordinates of all stages.
-    """
-    first = chart.fields[0]
-    if is_plain(first):
-        return can_roll(unroll, first, chart.start) and is_uniform(chart)
-    return can_roll_in_room(unroll, chart, [first], num_stages)
-
-
-def can_roll_in_room(
+def _can_roll_in_room(
     unroll: bool | None, chart: Chart, known: Sequence[Any], num_stages: int
 ) -> bool:
     """Whether a field with a chart of its own has room for all stages, after those known.
@@ -91,13 +86,13 @@ def _size(tree: PyTree) -> int:
     return sum(jnp.size(x) for x in jtu.tree_leaves(tree))
 
 
-def is_plain(field: PyTree) -> bool:
+def _is_plain(field: PyTree) -> bool:
     """Whether its parts combine in the usual way and have no chart of their own."""
     parts = jtu.tree_leaves(field, is_leaf=is_field)
-    return all(_is_plain(part) for part in parts if is_field(part))
+    return all(_is_plain_part(part) for part in parts if is_field(part))
 
 
-def _is_plain(field: AbstractFrozenField) -> bool:
+def _is_plain_part(field: AbstractFrozenField) -> bool:
     cls: Any = type(field.field if isinstance(field, Elementwise) else field)
     usual: Any = AbstractFrozenField
     return (
@@ -105,67 +100,6 @@ def _is_plain(field: AbstractFrozenField) -> bool:
         and cls.to_chart is usual.to_chart
         and cls.from_chart is usual.from_chart
     )
-
-
-def rolled_elements(
-    known: Sequence[PyTree],
-    rows: Sequence[Sequence[Any]],
-    times: Sequence[float],
-    element: Callable[[Real[Array, ""], PyTree], PyTree],
-) -> list[PyTree]:
-    """The known stages k, and for each row and time c `element(c, sum_j row[j] k[j])`."""
-    first, n = known[0], len(known) + len(rows)
-    weights = _padded(rows, n)
-    made = table(
-        lambda c, along: _like(first, element(c, along)), known, weights, jnp.asarray(times)
-    )
-    if made is not None:
-        return made
-
-    def body(stages: PyTree, x: Any) -> Any:
-        k, row, c = x
-        along = jtu.tree_map(lambda f: _combination(row, f), stages)
-        return _put(stages, k, _like(first, element(c, along))), None
-
-    xs = jnp.arange(len(known), n), weights, jnp.asarray(times)
-    start = _stack(first, n)
-    for k, stage in enumerate(known[1:], 1):
-        start = _put(start, k, _like(first, stage))
-    stages, _ = lax.scan(body, start, xs)
-    return [*known, *(_at(stages, k) for k in range(len(known), n))]
-
-
-def rolled_elements_in_room(
-    known: Sequence[Any],
-    rows: Sequence[Sequence[Any]],
-    times: Sequence[float],
-    chart: Chart,
-    element: Callable[[Any, Any], Any],
-) -> list[Any]:
-    """The same for a field with a chart of its own, which grows from stage to stage.
-
-    The stage is `element(u, field)` of the combination u that leads to the point of the field.
-    """
-    if not rows:
-        return list(known)
-    first, n = known[-1], len(known) + len(rows)
-    room = first.room(chart.start, n)
-
-    def body(carry: Any, x: Any) -> Any:
-        room, stages = carry
-        k, row, c = x
-        u = _combination(row, stages)
-        along = room.field(u)
-        here = chart.flow(along, chart.start)
-        entered = chart.frozen_after([along], c, here)
-        room, new = room.extended(_like(room.kept(k), room.entered(entered)), here.z, k)
-        return (room, _put(stages, k, element(room.field(u), room.field(new)).k)), None
-
-    ks = [room.coordinates(x, chart.start)[0] for x in known]
-    stages = jnp.zeros((n, *ks[0].shape), ks[0].dtype).at[: len(ks)].set(jnp.stack(ks))
-    xs = jnp.arange(len(known), n), _padded(rows, n), jnp.asarray(times)
-    (room, stages), _ = lax.scan(body, (room, stages), xs)
-    return [room.field(stages[k]) for k in range(n)]
 
 
 def rolled_flows(
@@ -176,10 +110,10 @@ def rolled_flows(
 ) -> PyTree:
     """Where flows of combinations of the first fields lead, that of the first row first."""
     # XLA computes what leads to each of the arrays that `jnp.stack` gets for itself.
-    stages = jtu.tree_map(lambda *leaves: pack(leaves), *fields[: weights.shape[1]])
+    stacked = _Stacked(jtu.tree_map(lambda *leaves: pack(leaves), *fields[: weights.shape[1]]))
 
     def body(point: PyTree, row: Array) -> Any:
-        return flow(jtu.tree_map(lambda f: _combination(row, f), stages), point), None
+        return flow(stacked.combination(row), point), None
 
     # A weak type would be lost on the way.
     start = jtu.tree_map(lambda x: jnp.asarray(x, jnp.result_type(x)), point)
@@ -187,98 +121,231 @@ def rolled_flows(
 
 
 class _Flow(NamedTuple):
-    """One flow of a step: from which point, along which combination of the fields, to which point;
-    and the stage that is evaluated there, if any, with its time.
+    """A flow of a step: from which point, along which combination of the fields, to which point,
+    and the stage that is evaluated there, with its time. What is no stage has the number after the
+    last one.
     """
 
-    source: int
-    row: Row
-    target: int
-    stage: int | None
-    c: float
+    source: Any
+    row: Any
+    target: Any
+    stage: Any
+    c: Any
 
 
 def _flows(products: Sequence[Product], stages: Sequence[Product], times: Row) -> list[_Flow]:
     """The flows of a step, each to a point of its own; the last of `stages` is its end."""
-    found = {product: k for k, product in enumerate(products)}
+    place = {product: k for k, product in enumerate(products)}
     evaluated = {rows: k for k, rows in enumerate(stages[:-1])}
     flows = []
-    for product in products[1:]:
-        stage = evaluated.get(product)
-        c = float(times[stage]) if stage is not None else 0.0
-        flows.append(_Flow(found[product[:-1]], product[-1], found[product], stage, c))
+    for target, product in enumerate(products[1:], 1):
+        stage = evaluated.get(product, len(times))
+        c = float(times[stage]) if product in evaluated else 0.0
+        flows.append(_Flow(place[product[:-1]], product[-1], target, stage, c))
     return flows
 
 
-def rolled(chart: Chart, stages: Sequence[Product], times: Row) -> dict[Product, PyTree]:
+def _turns(flows: Sequence[_Flow], num_stages: int) -> _Flow:
+    """The flows as arrays, one turn of a loop for each."""
+    turns = _Flow(*zip(*flows, strict=True))
+    turns = turns._replace(row=_padded(turns.row, num_stages))
+    return _Flow(*map(jnp.asarray, turns))
+
+
+def rolled(
+    unroll: bool | None, chart: Chart, stages: Sequence[Product], times: Row
+) -> dict[Product, PyTree]:
     """The points of a step, of which the first field is known; `chart` gets all its fields.
 
     `stages` are the products of flows that lead to the stages, each to a point of its own, and to
-    the end; `times` are the times of the stages.
+    the end; `times` are the times of the stages. There are no points where the field allows no
+    loop, and where `unroll` asks for none.
     """
+    first, num_stages = chart.fields[0], len(times)
+    fields: Any = None
+    # One more for the flows that lead to no stage.
+    if can_roll(unroll, first, chart.start) and is_uniform(chart):
+        fields = _Stacked.of([first], num_stages + 1)
+    elif _can_roll_in_room(unroll, chart, [first], num_stages):
+        fields = _InRoom.of([first], chart.start, num_stages, num_stages + 1)
+    if fields is None:
+        return {}
     # Each after those that it begins with. The first has no flows.
     products = list(dict.fromkeys(rows[:n] for rows in stages for n in range(len(rows) + 1)))
     flows = _flows(products, stages, times)
-    run = _rolled if is_plain(chart.fields[0]) else _rolled_in_room
-    return dict(zip(products[1:], run(chart, flows, len(times)), strict=True))
 
-
-def _rolled(chart: Chart, flows: Sequence[_Flow], num_stages: int) -> list[PyTree]:
-    first, start = chart.fields[0], chart.start
-
-    def body(carry: Any, x: Any) -> Any:
+    def body(carry: Any, x: _Flow) -> Any:
         points, fields = carry
-        source, row, target, stage, c = x
-        along = jtu.tree_map(lambda f: _combination(row, f[:num_stages]), fields)
-        point = chart.flow(along, _at(points, source))
-        field = lax.cond(
-            stage < num_stages,
-            lambda: _like(first, chart.frozen_after([first], c, point)),
-            lambda: jtu.tree_map(jnp.zeros_like, first),
+        field = fields.combination(x.row)
+        point = chart.flow(field, fields.point(_at(points, x.source)))
+        new = lax.cond(
+            x.stage < num_stages,
+            lambda: fields.entered(chart.frozen_after([field], x.c, point)),
+            lambda: fields.kept(x.stage),
         )
-        return (_put(points, target, point), _put(fields, stage, field)), None
+        z = fields.coordinates(point)
+        fields, new = fields.extended(new, z, x.stage)
+        return (_put(points, x.target, z), fields.put(x.stage, new)), None
 
-    # One more row for the flows that lead to no stage.
-    carry = _stack(start, len(flows) + 1), _stack(first, num_stages + 1)
-    (points, fields), _ = lax.scan(body, carry, _turns(flows, num_stages))
-    chart.fields[:] = [_at(fields, k) for k in range(num_stages)]
-    return [_at(points, k + 1) for k in range(len(flows))]
-
-
-def _rolled_in_room(chart: Chart, flows: Sequence[_Flow], num_stages: int) -> list[Any]:
-    """The same for a field with a chart of its own, which grows from stage to stage."""
-    first: Any = chart.fields[0]
-    room = first.room(chart.start, num_stages)
-
-    def body(carry: Any, x: Any) -> Any:
-        room, points, fields = carry
-        source, row, target, stage, c = x
-        along = room.field(_combination(row, fields[:num_stages]))
-        here = chart.flow(along, room.point(_at(points, source)))
-
-        def evaluated() -> Any:
-            return _like(room.kept(stage), room.entered(chart.frozen_after([along], c, here)))
-
-        new = lax.cond(stage < num_stages, evaluated, lambda: room.kept(stage))
-        room, entered = room.extended(new, here.z, stage)
-        return (room, _put(points, target, here.z), _put(fields, stage, entered)), None
-
-    k, z = room.coordinates(first, chart.start)
-    carry = room, _stack(z, len(flows) + 1), _stack(k, num_stages + 1)
-    (room, points, fields), _ = lax.scan(body, carry, _turns(flows, num_stages))
-    chart.start = room.point(points[0])
-    chart.fields[:] = [room.field(fields[k]) for k in range(num_stages)]
-    return [room.point(points[k + 1]) for k in range(len(flows))]
-
-
-def _turns(flows: Sequence[_Flow], num_stages: int) -> tuple[Array, ...]:
-    return (
-        jnp.asarray([f.source for f in flows]),
-        _padded([f.row for f in flows], num_stages),
-        jnp.asarray([f.target for f in flows]),
-        jnp.asarray([num_stages if f.stage is None else f.stage for f in flows]),
-        jnp.asarray([f.c for f in flows]),
+    start = fields.coordinates(chart.start)
+    (points, fields), _ = lax.scan(
+        body, (_stack(start, len(flows) + 1), fields), _turns(flows, num_stages)
     )
+    chart.start = fields.point(start)
+    chart.fields[:] = [fields.field(k) for k in range(num_stages)]
+    return {rows: fields.point(_at(points, k)) for k, rows in enumerate(products) if k}
+
+
+def rolled_elements(
+    unroll: bool | None,
+    chart: Chart,
+    known: Sequence[PyTree],
+    rows: Sequence[Sequence[Any]],
+    times: Sequence[float],
+    element: Callable[[PyTree, PyTree], PyTree],
+) -> list[PyTree] | None:
+    """The known stages k, and for each row and time c the stage `element(u, f)`.
+
+    Here `u = sum_j row[j] k[j]`, and f is the field at time c and the point where u leads from the
+    start. None where the field allows no loop, and where `unroll` asks for none.
+    """
+    first, n = known[0], len(known) + len(rows)
+    if len(rows) < 2 or not all(map(any, rows)):
+        return None
+
+    def stage(c: Any, u: PyTree) -> PyTree:
+        return element(u, chart.frozen_after([u], c, chart.flow(u, chart.start)))
+
+    # Before all of them are traced, only to find that they are too long together.
+    one = functools.partial(stage, times[0])
+    is_long = len(rows) > _MANY and is_rewritten() and are_long(one, first, len(rows))
+    if can_roll(unroll, first, first, is_long) and is_uniform(chart):
+        made = table(
+            lambda c, u: _like(first, stage(c, u)), known, _padded(rows, n), jnp.asarray(times)
+        )
+        fields = _Stacked.of(known, n)
+        return made or _rolled_elements(chart, fields, len(known), rows, times, element)
+    if not _can_roll_in_room(unroll, chart, known, n):
+        return None
+    # A bracket takes time as the third power of the room: less for the first ones.
+    half = len(rows) // 2 if len(rows) > _MANY else 0
+    for few in (slice(half), slice(half, None)) if half else (slice(None),):
+        m = len(known) + len(rows[few])
+        fields = _InRoom.of(known, chart.start, m, m)
+        known = _rolled_elements(chart, fields, len(known), rows[few], times[few], element)
+    return list(known)
+
+
+def _rolled_elements(
+    chart: Chart,
+    fields: Any,
+    num_known: int,
+    rows: Sequence[Sequence[Any]],
+    times: Sequence[float],
+    element: Callable[[PyTree, PyTree], PyTree],
+) -> list[PyTree]:
+    n = num_known + len(rows)
+
+    def body(fields: Any, x: Any) -> Any:
+        k, row, c = x
+        u = fields.combination(row)
+        point = chart.flow(u, chart.start)
+        new = fields.entered(chart.frozen_after([u], c, point))
+        fields, new = fields.extended(new, fields.coordinates(point), k)
+        return fields.put(k, element(fields.combination(row), new)), None
+
+    turns = jnp.arange(num_known, n), _padded(rows, n), jnp.asarray(times)
+    fields, _ = lax.scan(body, fields, turns)
+    return [fields.field(k) for k in range(n)]
+
+
+class _Stacked(eqx.Module):
+    """Fields that combine in the usual way, stacked along a new first axis of their arrays.
+
+    Those that are not there yet are zero.
+    """
+
+    stacked: PyTree
+
+    @classmethod
+    def of(cls, known: Sequence[PyTree], n: int) -> "_Stacked":
+        fields = cls(_stack(known[0], n))
+        for k, field in enumerate(known[1:], 1):
+            fields = fields.put(k, field)
+        return fields
+
+    def combination(self, row: Real[Array, " k"]) -> PyTree:
+        """That of the first fields, as many as the row has entries."""
+        return jtu.tree_map(lambda f: _combination(row, f), self.stacked)
+
+    def field(self, k: Any) -> PyTree:
+        return _at(self.stacked, k)
+
+    def put(self, k: Any, field: PyTree) -> "_Stacked":
+        """With field k."""
+        return _Stacked(_put(self.stacked, k, self.entered(field)))
+
+    def point(self, z: PyTree) -> PyTree:
+        return z
+
+    def coordinates(self, point: PyTree) -> PyTree:
+        """Of a point of the step, in arrays that do not grow."""
+        return point
+
+    def kept(self, k: Any) -> PyTree:
+        """What `entered` returns, where no field is evaluated."""
+        return jtu.tree_map(lambda f: jnp.zeros(f.shape[1:], f.dtype), self.stacked)
+
+    def entered(self, field: PyTree) -> PyTree:
+        """What to keep of a field that was evaluated."""
+        return _like(self.kept(0), field)
+
+    def extended(self, new: PyTree, z: PyTree, k: Any) -> tuple["_Stacked", PyTree]:
+        """With room for field k, of which `new` is kept, frozen at the point z; and the field."""
+        return self, new
+
+
+class _InRoom(eqx.Module):
+    """Fields with a chart of their own, which grows from stage to stage, by their coordinates in a
+    room for all of them (`AbstractFrozenField.room`).
+    """
+
+    room: Any
+    ks: Real[Array, "n m m"]
+
+    @classmethod
+    def of(cls, known: Sequence[Any], point: Any, num_fields: int, n: int) -> "_InRoom | None":
+        """With room for some fields and coordinates of n; None where they offer no room."""
+        room = known[-1].room(point, num_fields)
+        if room is None:
+            return None
+        ks = [room.coordinates(field, point)[0] for field in known]
+        return cls(room, jnp.zeros((n, *ks[0].shape), ks[0].dtype).at[: len(ks)].set(jnp.stack(ks)))
+
+    def combination(self, row: Real[Array, " k"]) -> Any:
+        return self.room.field(_combination(row, self.ks))
+
+    def field(self, k: Any) -> Any:
+        return self.room.field(_at(self.ks, k))
+
+    def put(self, k: Any, field: Any) -> "_InRoom":
+        return _InRoom(self.room, _put(self.ks, k, field.k))
+
+    def point(self, z: Array) -> Any:
+        return self.room.point(z)
+
+    def coordinates(self, point: Any) -> Array:
+        return jnp.pad(point.z, ((0, self.ks.shape[1] - len(point.z)), (0, 0)))
+
+    def kept(self, k: Any) -> Any:
+        return self.room.kept(k)
+
+    def entered(self, field: Any) -> Any:
+        return _like(self.room.kept(0), self.room.entered(field))
+
+    def extended(self, new: Any, z: Array, k: Any) -> tuple["_InRoom", Any]:
+        room, new = self.room.extended(new, z, k)
+        return _InRoom(room, self.ks), room.field(new)
 
 
 def _padded(rows: Sequence[Sequence[Any]], n: int) -> Array:
@@ -309,6 +376,7 @@ def _stack(tree: PyTree, n: int) -> PyTree:
 
 
 def _combination(row: Array, fields: Array) -> Array:
+    fields = fields[: len(row)]
     weights = row.astype(fields.dtype).reshape(-1, *[1] * (fields.ndim - 1))
     return jnp.sum(weights * fields, axis=0)
 

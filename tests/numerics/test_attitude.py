@@ -227,6 +227,30 @@ def test_an_attitude_that_a_solver_of_linear_spaces_lets_drift(rewrite):
         jax.block_until_ready(spiral(rewrite, 0.1))
 
 
+@pytest.mark.parametrize("rewrite", [True, False])
+def test_a_wrong_matrix_within_a_field(rewrite):
+    """Where single numbers leave no room for the check itself, it makes NaN, which ends a solve."""
+
+    def vector_field(t, y, matrix):
+        return cfjax.Rotation(quaternion_from_matrix(matrix, order="wxyz")[1:] + y)
+
+    def end(matrix):
+        with cfjax.rewriting(rewrite):
+            return cfjax.integrate(
+                cfjax.LieTerm(vector_field),
+                cfjax.CF4(),
+                0.0,
+                1.0,
+                jnp.array([0.0, 0.6, 0.8]),
+                matrix,
+                num_steps=20,
+            ).ys
+
+    assert np.isfinite(end(jnp.asarray(MATRICES[0]))).all()
+    with pytest.raises(RuntimeError, match="Nonfinite" if rewrite else "matrix must be orthogonal"):
+        jax.block_until_ready(end(2 * jnp.asarray(MATRICES[0])))
+
+
 # What is refused
 
 
