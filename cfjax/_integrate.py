@@ -1,7 +1,7 @@
 """Integration with a fixed number of steps, as one compiled loop."""
 
 import typing
-from typing import Any
+from typing import Any, cast
 
 import diffrax
 import equinox as eqx
@@ -11,15 +11,17 @@ import jax.tree_util as jtu
 import numpy as np
 from jax import lax
 from jax.core import Tracer
-from jaxtyping import Array, Int, PyTree, Real
+from jaxtyping import Array, Bool, Int, PyTree, Real
 
-from ._numerics.checks import checked, error_if, needing
+from ._numerics.checks import Fault, checked, error_if, needing
 from ._numerics.squaring import max_over_batch
-from ._solvers.base import AbstractLieSolver, State, is_finite, result_of
+from ._solvers.base import AbstractLieSolver, is_finite, result_of
 from ._xla import repeat
 
 # Steps whose derivative is not rewritten.
 _FEW = 10
+
+_NOT_FINITE = "y0 must be finite, got an entry that is not."
 
 
 def integrate(
@@ -59,7 +61,10 @@ def integrate(
       steps and computes the steps between again, a second time. About `sqrt(num_steps)` is best,
       and makes the memory proportional to `sqrt(num_steps)` states.
     - `throw`: whether a failure is an error, as in diffrax. If not, `result` of the solution says
-      what happened. In a batch made by `jax.vmap` one failure is an error for all.
+      what happened, and what is wrong with a value of the arguments makes NaN. In a batch made by
+      `jax.vmap` one failure is an error for all. An error within a function that you compile is a
+      call of the host, so JAX does not keep such a program on disk. It keeps the others: with
+      `throw=False`, and all that are called from Python, where the host looks at the result.
 
     **Returns:** a `diffrax.Solution`. Its `ts` has shape `(num_saves,)`, and each leaf of `ys` has
     one more axis of that length in front; the last entry is the state at `t1`. The initial state
@@ -90,9 +95,24 @@ def integrate(
         )
     t0, t1 = time_scalar("t0", t0, dtype), time_scalar("t1", t1, dtype)
     args = jtu.tree_map(lambda x: jnp.asarray(x) if isinstance(x, float | complex) else x, args)
-    return equal_steps(
-        term, solver, t0, t1, y0, args, num_steps, save_every, save_initial, checkpoint_every, throw
+    # In a program that somebody else compiles, an error is part of that.
+    is_traced = any(isinstance(x, Tracer) for x in (jnp.zeros(()), *jtu.tree_leaves((t0, y0))))
+    solution, fault = equal_steps(
+        term,
+        solver,
+        t0,
+        t1,
+        y0,
+        args,
+        num_steps,
+        save_every,
+        save_initial,
+        checkpoint_every,
+        throw=throw and is_traced,
     )
+    if throw and not is_traced:
+        solution = _raised(solution, fault)
+    return solution
 
 
 @eqx.filter_jit
@@ -108,23 +128,23 @@ def equal_steps(
     save_initial: bool,
     checkpoint_every: int | None,
     throw: bool,
-) -> diffrax.Solution:
-    """`integrate` of checked arguments.
+) -> tuple[diffrax.Solution, Fault]:
+    """`integrate` of checked arguments, and what is wrong with them, which is an error if `throw`.
 
-    `num_steps` may be traced where only the final state is saved. Then one program serves all
+    If not, the program calls nothing on the host, so JAX can keep it on disk, and the states are
+    NaN. `num_steps` may be traced where only the final state is saved. Then one program serves all
     numbers of steps, forward only.
     """
     # A state may have no arrays, and then nothing can go wrong.
     throw = throw and bool(jtu.tree_leaves(y0))
     if throw:
-        message = "y0 must be finite, got an entry that is not."
-        y0 = error_if(y0, lambda y0: ~is_finite(y0), message)
+        y0 = error_if(y0, lambda y0: ~is_finite(y0), _NOT_FINITE)
 
     if isinstance(num_steps, int):
         n, intervals = jnp.asarray(0, jnp.int32 if num_steps < 2**31 else int), num_steps
     else:
         n, intervals = jnp.zeros_like(num_steps), num_steps.astype(t0.dtype)
-    t1 = _with_room_for_steps(t0, t1, intervals)
+    is_short = _is_short(t0, t1, intervals)
 
     def time(n):
         # From the step's number, so that rounding does not add up, and t1 is met exactly.
@@ -143,10 +163,19 @@ def equal_steps(
         return (n + 1, y, solver_state, result)
 
     is_ours = isinstance(solver, AbstractLieSolver)
-    solver_state = solver.init(term, t0, time(n + 1), y0, args)
-    if isinstance(solver_state, State):
-        y0, solver_state = solver_state.started(y0)
-    carry = (n, y0, solver_state, diffrax.RESULTS.successful)
+    if hasattr(solver, "start"):
+        solver_state, fault = cast(Any, solver).start(term, t0, time(n + 1), y0, args)
+    else:
+        solver_state, fault = solver.init(term, t0, time(n + 1), y0, args), Fault.none()
+    fault = fault.with_case(
+        is_short,
+        "num_steps must leave each step longer than the rounding of t0 and t1, and of so many "
+        f"steps the times do not differ in {t0.dtype}. Take fewer steps, shift the times towards "
+        "zero, or make y0 float64.",
+    )
+    zero = (fault.error if throw else fault.nan)(jnp.zeros((), t0.dtype))
+    start, t1 = needing(zero, (y0, t1))
+    carry = (n, start, solver_state, diffrax.RESULTS.successful)
 
     # Of a few steps the derivative takes longer to compile than it will ever save.
     order = 0 if isinstance(num_steps, int) and num_steps < _FEW else 1
@@ -178,7 +207,7 @@ def equal_steps(
     )
     if save_initial:
         prepend = lambda first, rest: jnp.concatenate([first[None], rest])  # noqa: E731
-        ts, ys = jtu.tree_map(prepend, (t0, y0), (ts, ys))
+        ts, ys = jtu.tree_map(prepend, (t0, start), (ts, ys))
     # Of the saved states alone, outside the loop: sums and products keep infinity and NaN, so a
     # blow-up shows in what is saved after it.
     result = result_of(ys)
@@ -188,7 +217,7 @@ def equal_steps(
         is_known = carry[3] != diffrax.RESULTS.successful
         result = diffrax.RESULTS.where(is_known, carry[3], result)
         ys = needing(_error_of(result), ys) if throw else ys
-    return diffrax.Solution(
+    solution = diffrax.Solution(
         t0=t0,
         t1=t1,
         ts=ts,
@@ -201,6 +230,21 @@ def equal_steps(
         made_jump=None,
         event_mask=None,
     )
+    return solution, fault.with_case(~is_finite(y0), _NOT_FINITE)
+
+
+def _raised(solution: diffrax.Solution, fault: Fault) -> diffrax.Solution:
+    """The solution, or the error that it is."""
+    if any(isinstance(x, Tracer) for x in jtu.tree_leaves((fault, solution.result))):
+        # The field closes over values of `jax.vmap`.
+        zero = fault.error(jnp.zeros(())) + _error_of(solution.result)
+        return eqx.tree_at(lambda s: s.ys, solution, needing(zero, solution.ys))
+    if jtu.tree_leaves(solution.ys):
+        if number := int(fault.number):
+            raise eqx.EquinoxRuntimeError(fault.messages[number - 1])
+        if solution.result != diffrax.RESULTS.successful:
+            raise eqx.EquinoxRuntimeError(diffrax.RESULTS[solution.result])
+    return solution
 
 
 def _most_steps(dtype: Any) -> int:
@@ -208,10 +252,10 @@ def _most_steps(dtype: Any) -> int:
     return 2 ** (jnp.finfo(dtype).nmant + 1)
 
 
-def _with_room_for_steps(
+def _is_short(
     t0: Real[Array, ""], t1: Real[Array, ""], num_steps: int | Real[Array, ""]
-) -> Real[Array, ""]:
-    """`t1`, or an error if a step is shorter than a unit of rounding of the times.
+) -> Bool[Array, ""]:
+    """Whether a step is shorter than a unit of rounding of the times.
 
     Of such steps some would have length zero and others twice the length or more.
     """
@@ -219,13 +263,7 @@ def _with_room_for_steps(
     largest = jnp.maximum(jnp.abs(start), jnp.abs(end))
     unit = largest - jnp.nextafter(largest, jnp.zeros_like(largest))
     is_short = (start != end) & (jnp.abs(end - start) / num_steps < unit)
-    return eqx.error_if(
-        t1,
-        is_short | (num_steps > _most_steps(t0.dtype)),
-        "num_steps must leave each step longer than the rounding of t0 and t1, and of so many "
-        f"steps the times do not differ in {t0.dtype}. Take fewer steps, shift the times towards "
-        "zero, or make y0 float64.",
-    )
+    return is_short | (num_steps > _most_steps(t0.dtype))
 
 
 def _error_of(result: diffrax.RESULTS) -> Real[Array, ""]:

@@ -535,8 +535,8 @@ DEFECTS = [
     ),
     Defect(
         "_integrate.py",
-        "        is_short | (num_steps > _most_steps(t0.dtype)),",
-        "        is_short & False,",
+        "    return is_short | (num_steps > _most_steps(t0.dtype))",
+        "    return is_short & False",
         "steps shorter than the rounding of their times",
         "test_integrate.py -k shorter",
     ),

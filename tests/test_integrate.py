@@ -525,10 +525,11 @@ def test_more_traced_steps_than_can_be_counted():
     @eqx.filter_jit
     def end(num_steps):
         time = jnp.zeros((), np.float32)
-        return _integrate.equal_steps(
+        solution, _ = _integrate.equal_steps(
             TERM, cfjax.LieEuler(), time - 1, time + 1, Y0_SINGLE, ARGS_SINGLE, num_steps,
-            None, False, None, throw=False,
-        ).ys  # fmt: skip
+            None, False, None, throw=True,
+        )  # fmt: skip
+        return solution.ys
 
     assert np.isfinite(end(jnp.asarray(3))).all()
     with pytest.raises(eqx.EquinoxRuntimeError, match="num_steps must leave each step longer"):
@@ -830,6 +831,57 @@ def test_the_transpose_of_a_small_solve_that_is_rewritten(rewritten):
     # The matrix of the solve, column by column; a hundred products of numbers below 10.
     matrix = jnp.stack([end(e) for e in jnp.eye(3)], axis=1)
     np.testing.assert_allclose(back, jnp.arange(3.0) @ matrix, rtol=0, atol=1e-13)
+
+
+def turning(y0, rate=1.0, **options):
+    term = cfjax.LieTerm(
+        lambda t, y, args: cfjax.QuaternionRotation(rate * jnp.ones(3), frame="body", order="wxyz")
+    )
+    return cfjax.integrate(term, cfjax.CF4(), 0.0, 1.0, y0, num_steps=12, **options)
+
+
+FAR, NEAR = jnp.array([1.1, 0.0, 0.0, 0.0]), jnp.array([1.0, 0.0, 0.0, 0.0])
+OFF = r"y must start on the manifold that QuaternionRotation acts on: y0 must have length 1 "
+
+
+@pytest.mark.parametrize(
+    "y0, options, message",
+    [
+        (FAR, {}, OFF + r"\(in y0 @ y0\), and is off by more than 0.1\.$"),
+        (NEAR.at[1].set(np.nan), {}, "y0 must be finite, got an entry that is not.$"),
+        (NEAR, {"rate": np.inf}, "Nonfinite"),
+    ],
+    ids=["off the manifold", "not finite", "blow-up"],
+)
+def test_an_error_of_a_call_from_python_is_its_message_alone(y0, options, message):
+    with pytest.raises(eqx.EquinoxRuntimeError) as caught:
+        turning(y0, **options)
+    assert re.match(message, str(caught.value))
+    # Nothing raised it but this package, and no error led to it.
+    assert caught.value.__cause__ is None and caught.value.__context__ is None
+    assert str(caught.traceback[-1].path).endswith("_integrate.py")
+
+
+@pytest.mark.parametrize("transform", ["grad", "jit", "vmap", "closure"])
+def test_a_start_off_the_manifold_is_an_error_within_every_transformation(transform):
+    run = {
+        "grad": jax.grad(lambda y0: turning(y0).ys.sum()),
+        "jit": eqx.filter_jit(lambda y0: turning(y0).ys),
+        "vmap": lambda y0: jax.vmap(lambda y0: turning(y0).ys)(jnp.stack([NEAR, y0])),
+        # No argument of the solve is traced.
+        "closure": lambda y0: jax.vmap(lambda rate: turning(y0, rate).ys)(jnp.ones(2)),
+    }[transform]
+    assert np.isfinite(run(NEAR)).all()
+    with pytest.raises(RuntimeError, match=OFF):
+        jax.block_until_ready(run(FAR))
+
+
+def test_a_start_off_the_manifold_is_in_the_result():
+    sol = turning(FAR, throw=False, save_initial=True)
+    assert sol.result == diffrax.RESULTS.nonfinite
+    assert np.isnan(sol.ys).all()
+    sol = cfjax.integrate(TERM, cfjax.CF4(), 0.0, np.nan, Y0, ARGS, num_steps=4, throw=False)
+    assert sol.result == diffrax.RESULTS.nonfinite
 
 
 def test_a_start_that_is_not_finite_is_in_the_result():

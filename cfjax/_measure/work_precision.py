@@ -27,6 +27,7 @@ from .._integrate import (
     time_scalar,
     without_estimate,
 )
+from .._numerics.checks import needing
 from .cost import Problem, cost_of_steps
 from .extra import paper_extra
 
@@ -349,10 +350,11 @@ def take_turns(
 
 def _equal_steps(problem: Problem, num_steps: Int[Array, ""]) -> tuple:
     term, solver, t0, t1, _, y0, args = problem
-    solution = equal_steps(
+    solution, fault = equal_steps(
         term, solver, t0, t1, y0, args, num_steps, None, False, None, throw=False
     )
-    return _end(solution, num_steps, 0)
+    y, *rest = _end(solution, num_steps, 0)
+    return needing(fault.error(jnp.zeros(())), y), *rest
 
 
 def _adaptive_steps(controller: Callable, max_steps: int) -> Callable[..., tuple]:

@@ -4,6 +4,7 @@ from collections.abc import Callable
 from typing import Any
 
 import equinox as eqx
+import equinox.internal as eqxi
 import jax
 import jax.numpy as jnp
 import jax.tree_util as jtu
@@ -11,7 +12,36 @@ from jax import lax
 from jax.extend.core import Primitive
 from jax.interpreters import ad, batching, mlir
 from jax.sharding import use_abstract_mesh
-from jaxtyping import Array, Bool, PyTree, Real
+from jaxtyping import Array, Bool, Int, PyTree, Real
+
+from .squaring import max_over_batch
+
+
+class Fault(eqx.Module):
+    """What is wrong, if anything: a number from 1 on is that of a message, 0 is nothing."""
+
+    number: Int[Array, ""]
+    messages: tuple[str, ...] = eqx.field(static=True)
+
+    @classmethod
+    def none(cls) -> "Fault":
+        return cls(jnp.zeros((), jnp.int32), ())
+
+    def with_case(self, holds: Bool[Array, ""], message: str) -> "Fault":
+        """This, or where the case holds that. So what is worse comes later."""
+        messages = *self.messages, message
+        return Fault(jnp.where(holds, jnp.int32(len(messages)), self.number), messages)
+
+    def error(self, zero: Real[Array, ""]) -> Real[Array, ""]:
+        """The zero, or an error where something is wrong: in a batch the last case of all."""
+        if not self.messages:
+            return zero
+        index = max_over_batch(jnp.maximum(self.number - 1, 0))
+        return eqxi.branched_error_if(zero, self.number > 0, index, self.messages)
+
+    def nan(self, zero: Real[Array, ""]) -> Real[Array, ""]:
+        """The zero, or NaN where something is wrong."""
+        return jnp.where(self.number == 0, zero, jnp.nan)
 
 
 def error_if(tree: PyTree, is_wrong: Callable[[PyTree], Bool[Array, ""]], message: str) -> PyTree:

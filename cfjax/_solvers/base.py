@@ -7,7 +7,6 @@ from typing import Any, ClassVar
 
 import diffrax
 import equinox as eqx
-import equinox.internal as eqxi
 import jax.numpy as jnp
 import jax.tree_util as jtu
 import numpy as np
@@ -16,8 +15,7 @@ from jax.core import Tracer
 from jaxtyping import Array, Bool, PyTree, Real
 
 from .._field import is_field
-from .._numerics.checks import needing
-from .._numerics.squaring import max_over_batch
+from .._numerics.checks import Fault
 from .._term import product, velocity
 from .._xla import is_rewritten, materialised_in_rows, materialised_together, scalarised
 from .chart import Chart
@@ -79,6 +77,15 @@ class AbstractLieSolver(diffrax.AbstractSolver):
         **Raises** a runtime error for a time that is NaN, or a start off the manifold that a field
         acts on.
         """
+        state, fault = self.start(terms, t0, t1, y0, args)
+        zero = fault.error(jnp.zeros((), jnp.result_type(t0)))
+        return State(state.compensation, state.first, zero)
+
+    def start(self, terms, t0, t1, y0, args) -> tuple["State", Fault]:
+        """The state of the solver, whose steps carry no checks, and what is wrong with the start.
+
+        That is for a loop which reports it itself, with no call of the host.
+        """
 
         def at_start(y0):
             field = product(terms, terms.vf(t0, y0, args), terms.contr(t0, t1))
@@ -90,7 +97,7 @@ class AbstractLieSolver(diffrax.AbstractSolver):
             lambda c, y: None if c is None else jnp.zeros_like(y), compensation, y0
         )
         first = terms.vf(t0, y0, args) if self.first_same_as_last else None
-        return State(compensation, first, _admitted(jnp.asarray(t0), t1, field, y0))
+        return State(compensation, first, None), _fault_of_start(t0, t1, field, y0)
 
     def without_estimate(self) -> "AbstractLieSolver":
         """The same method for steps that nobody controls: it keeps nothing for an estimate."""
@@ -216,42 +223,31 @@ class State(eqx.Module):
     first: PyTree
     zero: Real[Array, ""] | None
 
-    def started(self, y0: PyTree) -> tuple[PyTree, "State"]:
-        """The start, with the checks in it, and a state for steps that do not carry them."""
-        if self.zero is None:
-            return y0, self
-        return needing(self.zero, y0), State(self.compensation, self.first, None)
-
 
 # By how much a start is off, in the message. The error itself may be in a compiled program.
 _LEVELS = (1e-7, 1e-6, 1e-5, 1e-4, 1e-3, 1e-2, 0.1, 1.0, 10.0)
 
 
-def _admitted(t0: Array, t1: Any, field: PyTree, y0: PyTree) -> Real[Array, ""]:
-    """Zero, or an error if a time is NaN or `y0` off the manifold of `field`, given by shape."""
-    zero = jnp.zeros((), t0.dtype)
+def _fault_of_start(t0: Any, t1: Any, field: PyTree, y0: PyTree) -> Fault:
+    """Whether a time is NaN or `y0` off the manifold of `field`, which is given by shape."""
     is_nan = jnp.isnan(t0) | jnp.isnan(t1)
-    zero = eqx.error_if(zero, is_nan, "t0, t1 and dt0 must be numbers, got NaN.")
+    fault = Fault.none().with_case(is_nan, "t0, t1 and dt0 must be numbers, got NaN.")
     parts, treedef = jtu.tree_flatten_with_path(field, is_leaf=is_field)
     for (path, part), point in zip(parts, treedef.flatten_up_to(y0), strict=True):
         defect = part.defect(point) if is_field(part) else None
         if defect is None:
             continue
         off, expected = lax.stop_gradient(defect[0]), defect[1]
-        # Within it one step of Newton's method, which the fields take, leads to the manifold.
+        # Within it one step of Newton's method, which the fields take, leads to the manifold. NaN
+        # has an error of its own.
         least = float(np.sqrt(jnp.finfo(off.dtype).eps))
-        levels = [least, *(level for level in _LEVELS if level > least)]
-        level = sum((off > x).astype(jnp.int32) for x in levels)
-        messages = [
-            f"y{jtu.keystr(path)} must start on the manifold that {type(part).__name__} acts on: "
-            f"y0{jtu.keystr(path)} must have {expected}, and is off by more than {x:.1g}."
-            for x in levels
-        ]
-        # NaN has an error of its own.
-        # Of the worst in a batch, which may be empty.
-        level = max_over_batch(jnp.maximum(level - 1, 0))
-        zero = eqxi.branched_error_if(zero, off > least, level, messages)
-    return zero
+        for x in (least, *(level for level in _LEVELS if level > least)):
+            fault = fault.with_case(
+                off > x,
+                f"y{jtu.keystr(path)} must start on the manifold that {type(part).__name__} acts "
+                f"on: y0{jtu.keystr(path)} must have {expected}, and is off by more than {x:.1g}.",
+            )
+    return fault
 
 
 def _shared(

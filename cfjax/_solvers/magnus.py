@@ -14,6 +14,7 @@ from .._field import combine, is_field, to_chart
 from .._methods import magnus as _magnus
 from .._methods.magnus import MagnusTableau
 from .._methods.tableau import Product
+from .._numerics.checks import Fault
 from .._term import product
 from .base import AbstractLieSolver, State, Step, check_choice
 from .chart import Chart
@@ -61,7 +62,7 @@ class AbstractMagnus(AbstractLieSolver):
         order = self.tableau.embedded_order
         return None if order is None else order + 1
 
-    def init(self, terms, t0, t1, y0, args) -> State:
+    def start(self, terms, t0, t1, y0, args) -> tuple[State, Fault]:
         def field(y):
             return product(terms, terms.vf(t0, y, args), terms.contr(t0, t1))
 
@@ -80,7 +81,7 @@ class AbstractMagnus(AbstractLieSolver):
             ) from error
         if found:
             raise TypeError(_depends_on_state(name, *found[0]))
-        return super().init(terms, t0, t1, y0, args)
+        return super().start(terms, t0, t1, y0, args)
 
     def step_in(self, chart):
         tableau = self.tableau

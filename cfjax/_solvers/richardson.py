@@ -110,6 +110,11 @@ class Richardson(diffrax.AbstractAdaptiveSolver, diffrax.AbstractWrappedSolver):
         # diffrax takes the power of h that the estimate behaves like.
         return self.order(terms) + (1 if self.as_in_paper else 0)
 
+    @property
+    def start(self) -> Any:
+        """That of a solver of this package: see `AbstractLieSolver`."""
+        return cast(Any, self.solver).start
+
     def init(self, terms, t0, t1, y0, args) -> PyTree:
         return self.solver.init(terms, t0, t1, y0, args)
 

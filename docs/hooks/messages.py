@@ -14,7 +14,7 @@ FOLDERS = {
     "_measure/*.py": "Measuring",
     "_numerics/*.py": "Numerics",
 }
-CHECKS = {"eqx.error_if", "eqxi.branched_error_if"}
+CHECKS = {"eqx.error_if", "with_case"}
 
 
 def on_page_markdown(markdown, *, page, **_):
@@ -53,13 +53,17 @@ def _raised(tree):
         if isinstance(node, ast.Raise) and isinstance(node.exc, ast.Call) and node.exc.args:
             kind, text = ast.unparse(node.exc.func), node.exc.args[0]
             kind = kind if kind.endswith("Error") else "as its cause"
-        elif isinstance(node, ast.Call) and ast.unparse(node.func) in CHECKS:
+        elif isinstance(node, ast.Call) and _is_check(node.func):
             kind, text = "at run time", node.args[-1]
         else:
             continue
         name = ast.unparse(text.func if isinstance(text, ast.Call) else text)
         for source in sources.get(name, [text]):
             yield template(source), kind
+
+
+def _is_check(function):
+    return ast.unparse(function) in CHECKS or getattr(function, "attr", None) in CHECKS
 
 
 def template(node):
