@@ -176,7 +176,7 @@ def rolled(
 
     def body(carry: Any, x: _Flow) -> Any:
         points, fields = carry
-        field = fields.combination(x.row)
+        field = fields.field(fields.combination(x.row))
         point = chart.flow(field, fields.point(_at(points, x.source)))
         new = lax.cond(
             x.stage < num_stages,
@@ -192,7 +192,7 @@ def rolled(
         body, (_stack(start, len(flows) + 1), fields), _turns(flows, num_stages)
     )
     chart.start = fields.point(start)
-    chart.fields[:] = [fields.field(k) for k in range(num_stages)]
+    chart.fields[:] = [fields.at(k) for k in range(num_stages)]
     return {rows: fields.point(_at(points, k)) for k, rows in enumerate(products) if k}
 
 
@@ -223,8 +223,11 @@ def rolled_elements(
         made = table(
             lambda c, u: _like(first, stage(c, u)), known, _padded(rows, n), jnp.asarray(times)
         )
+        if made is not None:
+            return made
         fields = _Stacked.of(known, n)
-        return made or _rolled_elements(chart, fields, len(known), rows, times, element)
+        made = _rolled_elements(chart, fields, len(known), rows, times, element)
+        return [*known, *made[len(known) :]]
     if not _can_roll_in_room(unroll, chart, known, n):
         return None
     # A bracket takes time as the third power of the room: less for the first ones.
@@ -248,15 +251,16 @@ def _rolled_elements(
 
     def body(fields: Any, x: Any) -> Any:
         k, row, c = x
-        u = fields.combination(row)
+        combination = fields.combination(row)
+        u = fields.field(combination)
         point = chart.flow(u, chart.start)
         new = fields.entered(chart.frozen_after([u], c, point))
         fields, new = fields.extended(new, fields.coordinates(point), k)
-        return fields.put(k, element(fields.combination(row), new)), None
+        return fields.put(k, element(fields.field(combination), new)), None
 
     turns = jnp.arange(num_known, n), _padded(rows, n), jnp.asarray(times)
     fields, _ = lax.scan(body, fields, turns)
-    return [fields.field(k) for k in range(n)]
+    return [fields.at(k) for k in range(n)]
 
 
 class _Stacked(eqx.Module):
@@ -278,7 +282,10 @@ class _Stacked(eqx.Module):
         """That of the first fields, as many as the row has entries."""
         return jtu.tree_map(lambda f: _combination(row, f), self.stacked)
 
-    def field(self, k: Any) -> PyTree:
+    def field(self, combination: PyTree) -> PyTree:
+        return combination
+
+    def at(self, k: Any) -> PyTree:
         return _at(self.stacked, k)
 
     def put(self, k: Any, field: PyTree) -> "_Stacked":
@@ -322,10 +329,13 @@ class _InRoom(eqx.Module):
         ks = [room.coordinates(field, point)[0] for field in known]
         return cls(room, jnp.zeros((n, *ks[0].shape), ks[0].dtype).at[: len(ks)].set(jnp.stack(ks)))
 
-    def combination(self, row: Real[Array, " k"]) -> Any:
-        return self.room.field(_combination(row, self.ks))
+    def combination(self, row: Real[Array, " k"]) -> Array:
+        return _combination(row, self.ks)
 
-    def field(self, k: Any) -> Any:
+    def field(self, combination: Array) -> Any:
+        return self.room.field(combination)
+
+    def at(self, k: Any) -> Any:
         return self.room.field(_at(self.ks, k))
 
     def put(self, k: Any, field: Any) -> "_InRoom":
