@@ -527,15 +527,15 @@ DEFECTS = [
         "test_integrate.py -k checkpoint",
     ),
     Defect(
-        "_batch/batch.py",
+        "_batch/program.py",
         "index = np.minimum(np.arange(start, start + self.chunk_size), stop - 1)",
         "index = np.minimum(np.arange(self.chunk_size), stop - 1)",
         "the first chunk of a batch in place of every other",
         "batch/test_batch.py -k chunks",
     ),
     Defect(
-        "_batch/batch.py",
-        "if belongs != _digest(self.fingerprint, *inputs):",
+        "_batch/store.py",
+        "if belongs != digest(self.fingerprint, *inputs):",
         "if False:",
         "kept results that do not know their members",
         "batch/test_batch.py -k values_of_members",
