@@ -14,7 +14,6 @@ from jax import lax
 from jaxtyping import Array, Inexact, Real
 
 from .._field import AbstractFrozenField, Weight, combine, describe, struct
-from .._numerics.checks import needing
 from .._numerics.expm_multiply import expm_minus_one_multiply, row_norm
 from .._numerics.matmul import by_columns, promoted
 from .._numerics.operators import (
@@ -31,6 +30,7 @@ from .._numerics.operators import (
     two_norm,
 )
 from .._numerics.transforms import DTYPES
+from .affine import if_equal
 from .matrix import LeftMatrix, exp_minus_one_times, exp_times
 
 # What a declared norm may be too small by, and a linear function off by: half of the digits.
@@ -115,9 +115,7 @@ class OperatorSum(AbstractFrozenField):
         dtypes = [self.coefficients.dtype, *map(dtype_of, self.operators)]
         is_complex = any(jnp.issubdtype(x, jnp.complexfloating) for x in dtypes if x is not None)
         for n in sizes:
-            self._check_values(
-                n, np.result_type(precision, np.complex64) if is_complex else precision
-            )
+            self._check_values(n, _dtype(precision, is_complex))
 
     def flow(self, point: Inexact[Array, "n *k"]) -> Inexact[Array, "n *k"]:
         return self._moved(point, exp_times, lambda change: point + change)
@@ -290,27 +288,22 @@ def _precision(operators: Sequence[Any]) -> Any:
 
 
 def _coefficients(given: Any, number: int, precision: Any) -> Array:
-    array = isinstance(given, jax.Array | np.ndarray)
-    values = given if array else [c if isinstance(c, jax.Array) else np.asarray(c) for c in given]
-    if not array:
-        if any(np.shape(c) != () for c in values):
+    if not isinstance(given, jax.Array | np.ndarray):
+        scalars = [c if isinstance(c, jax.Array) else np.asarray(c) for c in given]
+        if any(np.shape(c) != () for c in scalars):
             raise ValueError(
                 "coefficients must be an array of shape (K,) or a sequence of scalars, got shapes "
-                f"{[np.shape(c) for c in values]}."
+                f"{[np.shape(c) for c in scalars]}."
             )
         # Python's numbers take the precision of the others.
-        precision = precision or next(
-            (jnp.finfo(c.dtype).dtype for c in given if eqx.is_inexact_array(c)),
-            jnp.result_type(float),
-        )
-        is_complex = any(jnp.iscomplexobj(c) for c in values)
-        dtype = np.result_type(precision, np.complex64) if is_complex else precision
-        own = [c for c in given if hasattr(c, "dtype") and jnp.issubdtype(c.dtype, jnp.inexact)]
-        wrong = [c.dtype for c in own if jnp.finfo(c.dtype).dtype != precision]
-        if wrong:
-            raise TypeError(f"coefficients must have the precision {precision}, got {wrong[0]}.")
-        values = jnp.stack([jnp.asarray(c).astype(dtype) for c in values]) if values else []
-    values = jnp.asarray(values)
+        dtypes = [c.dtype for c in given if hasattr(c, "dtype")]
+        own = {jnp.finfo(x).dtype: x for x in dtypes if jnp.issubdtype(x, jnp.inexact)}
+        precision = precision or next(iter(own), jnp.result_type(float))
+        for wrong in own.keys() - {precision}:
+            raise TypeError(f"coefficients must have the precision {precision}, got {own[wrong]}.")
+        dtype = _dtype(precision, any(map(jnp.iscomplexobj, scalars)))
+        given = jnp.stack([jnp.asarray(c).astype(dtype) for c in scalars]) if scalars else []
+    values = jnp.asarray(given)
     if values.shape != (number,):
         raise ValueError(
             f"coefficients must be one for each of the {number} operators, shape ({number},), got "
@@ -324,6 +317,10 @@ def _coefficients(given: Any, number: int, precision: Any) -> Array:
             f"{precision or 'float32 or float64'}, got {values.dtype}."
         )
     return values
+
+
+def _dtype(precision: Any, is_complex: bool) -> Any:
+    return np.result_type(precision, np.complex64) if is_complex else precision
 
 
 def _norm(k: int, operator: Any, norm: Any, precision: Any) -> Any:
@@ -373,17 +370,9 @@ def _of_the_same_operators(fields: Sequence[OperatorSum]) -> list[Array]:
                 f"{describe(operators[0])} and {describe(operators[1])}. Functions are the same if "
                 "they are made once, outside of the field."
             )
-        c = other.coefficients
-        pairs = zip(*map(jtu.tree_leaves, operators), strict=True)
-        # Most fields close over the same arrays, and need no check of their values.
-        different = [jnp.any(a != b) for a, b in pairs if a is not b]
-        if different:
-            zero = eqx.error_if(
-                jnp.zeros(()),
-                jnp.any(jnp.stack(different)),
-                "OperatorSum fields that are added must have the same operators: these may not "
-                "depend on time or state.",
-            )
-            c = needing(zero, c)
-        checked.append(c)
+        message = (
+            "OperatorSum fields that are added must have the same operators: these may not depend "
+            "on time or state."
+        )
+        checked.append(if_equal(*operators, other.coefficients, message))
     return checked
