@@ -1,7 +1,7 @@
 """Output within the steps of any method: coefficients that the order conditions decide.
 
-Those of the named methods are stored, so that they are the same numbers on every machine and cost
-no time. `python tests/methods/derive.py` writes them.
+Those of the named methods are stored, as the last digits of what is derived depend on the machine
+and its number of threads. `python tests/methods/derive.py` writes them.
 """
 
 import json
@@ -81,10 +81,10 @@ def derived_runge_kutta_extension(
 ) -> RungeKuttaExtension:
     """What the order conditions give.
 
-    The method's own stages suffice up to order 5 with as few
-    as diffrax has. `diffrax.Dopri8` takes 4 more, which evaluate the field at the end of the step
-    and at three points within. These points are where the stages so far reach one order more than
-    elsewhere. Where there are no such points the order is what the stages reach.
+    The method's own stages suffice up to order 5 with as few as diffrax has. `diffrax.Dopri8` takes
+    4 more, which evaluate the field at the end of the step and at three points within. These points
+    are where the stages so far reach one order more than elsewhere. Where there are no such points
+    the order is what the stages reach.
     """
     more = []
     found, reached = _solve((b,), _tree_conditions(a, len(b)), _MAX_POWER)
