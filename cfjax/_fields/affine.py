@@ -1,15 +1,13 @@
 """Affine fields with a linear part that a fast transform makes diagonal."""
 
-import functools
 from collections.abc import Sequence
 from typing import Any
 
 import equinox as eqx
 import jax
 import jax.numpy as jnp
-import jax.tree_util as jtu
 import numpy as np
-from jaxtyping import Array, Inexact, PyTree
+from jaxtyping import Array, Inexact
 
 from .._field import AbstractAlgebraElement, Weight, combine, describe, struct
 from .._numerics.checks import needing
@@ -158,23 +156,18 @@ def _of_one_operator(fields: Sequence[Affine]) -> list[Array]:
                 "Affine fields that are added must have one operator, got the spectra and "
                 f"transforms {describe(operators[0])} and {describe(operators[1])}."
             )
-        message = (
-            "Affine fields that are added must have one spectrum: it may not depend on time or "
-            "state, and the terms of a diffrax.MultiTerm must share it."
-        )
-        checked.append(if_equal(first.spectrum, other.spectrum, other.b, message))
+        b = other.b
+        # Most fields close over one array, and need no check of its values.
+        if other.spectrum is not first.spectrum:
+            zero = eqx.error_if(
+                jnp.zeros(()),
+                jnp.any(other.spectrum != first.spectrum),
+                "Affine fields that are added must have one spectrum: it may not depend on time or "
+                "state, and the terms of a diffrax.MultiTerm must share it.",
+            )
+            b = needing(zero, b)
+        checked.append(b)
     return checked
-
-
-def if_equal(first: PyTree, other: PyTree, x: Array, message: str) -> Array:
-    """x, or an error at run time where two trees of arrays differ in their values."""
-    pairs = zip(jtu.tree_leaves(first), jtu.tree_leaves(other), strict=True)
-    # Most fields close over the same arrays, and need no check.
-    different = [jnp.any(a != b) for a, b in pairs if a is not b]
-    if not different:
-        return x
-    is_wrong = functools.reduce(jnp.logical_or, different)
-    return needing(eqx.error_if(jnp.zeros(()), is_wrong, message), x)
 
 
 def _times(diagonal: Array, coefficients: Array) -> Array:
