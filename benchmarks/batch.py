@@ -73,13 +73,13 @@ def _in_chunks(members: Member, chunk_size: int) -> Program:
     """`cfjax.map_batch`, over all devices."""
     mesh = jax.make_mesh((jax.device_count(),), ("batch",)) if jax.device_count() > 1 else None
     start = time.perf_counter()
-    program = _batch._Program(_solve, members, chunk_size, mesh)
+    program = _batch.Program(_solve, members, chunk_size, mesh)
     executable = program.run
     compile_seconds = time.perf_counter() - start
 
     def run():
         # Compiled already: it takes as long as the first ten thousand trajectories or more.
-        with mock.patch.object(_batch, "_Program", lambda *_: program):
+        with mock.patch.object(_batch, "Program", lambda *_: program):
             return cfjax.map_batch(_solve, members, chunk_size=chunk_size, mesh=mesh).values
 
     return Program(run, _memory(executable), compile_seconds)

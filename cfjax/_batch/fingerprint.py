@@ -69,12 +69,13 @@ def fingerprint(traced: Traced, lowered: Lowered, environment: dict[str, Any]) -
         return hashlib.sha256(_SYMBOL.sub(inner, bodies[name]).encode()).hexdigest()
 
     text = "\n".join([repr(environment), rest, content("main")])
-    return digest([np.frombuffer(text.encode(), np.uint8), *_arrays(traced.jaxpr)])
+    return digest(text.encode(), *_arrays(traced.jaxpr))
 
 
-def digest(arrays: Iterable[Shaped[Array | np.ndarray, "..."]]) -> bytes:
+def digest(*parts: bytes | Shaped[Array | np.ndarray, "..."]) -> bytes:
     result = hashlib.sha256()
-    for array in map(np.asarray, arrays):
+    for part in parts:
+        array = np.frombuffer(part, np.uint8) if isinstance(part, bytes) else np.asarray(part)
         result.update(f"{array.shape} {array.dtype};".encode())
         result.update(np.ascontiguousarray(array).tobytes())
     return result.digest()

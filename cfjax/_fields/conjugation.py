@@ -14,7 +14,7 @@ from .._numerics.expm import expm_parts
 from .._numerics.expm_both import expm_both_parts
 from .._numerics.expm_source import expm_parts_with_source
 from .._numerics.matmul import promoted, small_product
-from .elementwise import check_point, each
+from .elementwise import check_other, check_point, each
 from .matrix import AbstractMatrix, check_companion
 
 
@@ -39,7 +39,7 @@ class AbstractTwoSided(AbstractMatrix):
         return self._each(lambda field, x: field.velocity(x), point)
 
     def bracket(self, other: Any) -> "AbstractTwoSided":
-        self._check_other(other)
+        check_other(self, other)
         return each(lambda x, y: x.commutator(y), self._num_axes)(self, other)
 
     @abc.abstractmethod

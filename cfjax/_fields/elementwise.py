@@ -89,6 +89,15 @@ def check_point(
     )
 
 
+def check_other(field: AbstractFrozenField, other: Any) -> None:
+    """Raises `TypeError` unless the other is of the field's class, as its bracket needs."""
+    if not isinstance(other, type(field)):
+        name = type(field).__name__
+        raise TypeError(
+            f"{name} has a bracket with another {name} only, got {type(other).__name__}."
+        )
+
+
 def _broadcasts(a: int, b: int) -> bool:
     return a in (1, b)
 

@@ -8,7 +8,7 @@ from jaxtyping import Array, Inexact
 
 from .._numerics.matmul import matmul, promoted
 from .._numerics.phi_1_times import phi_1_times
-from .elementwise import check_point, each
+from .elementwise import check_other, check_point, each
 from .matrix import AbstractMatrix, check_companion
 
 
@@ -56,7 +56,7 @@ class LinearAffine(AbstractMatrix):
         return jnp.add(*promoted(self._times(self.a, point), self.b))
 
     def bracket(self, other: Any) -> "LinearAffine":
-        self._check_other(other)
+        check_other(self, other)
         # The commutator of the matrices [[a, b], [0, 0]].
         a = self._times(self.a, other.a) - self._times(other.a, self.a)
         return LinearAffine(a, self._times(self.a, other.b) - self._times(other.a, self.b))

@@ -1,6 +1,5 @@
 """Skew fields of low rank, for points with orthonormal columns: the Stiefel manifold."""
 
-import math
 from collections.abc import Sequence
 from typing import Any
 
@@ -13,6 +12,17 @@ from jaxtyping import Array, Float
 from .._field import AbstractAlgebraElement, AbstractFrozenField, Weight, combine
 from .._numerics.expm_action import phi_1_action
 from .._numerics.matmul import matmul
+from .._numerics.span import (
+    Blocks,
+    Corner,
+    Span,
+    correction,
+    inner,
+    joined,
+    orthonormal_defect,
+    plus_product,
+    square,
+)
 from .elementwise import check_point, each, elementwise
 
 
@@ -20,7 +30,7 @@ class AbstractSkew(AbstractFrozenField):
     """A skew field, which acts on orthonormal columns."""
 
     def defect(self, point: Float[Array, "*batch n p"]) -> tuple[Array, str]:
-        off = each(_defect, point.ndim - 2)(point)
+        off = each(lambda y: orthonormal_defect(square(y)), point.ndim - 2)(point)
         return jnp.max(jnp.abs(off), initial=0), "orthonormal columns (in entries of y0.T @ y0)"
 
 
@@ -36,8 +46,7 @@ class LowRankSkew(AbstractSkew):
     `2 n p^2 (s + 1)(s + 2)` flops and `n p (s + 1)` numbers. Of points of up to some 2000 numbers
     the stages are one loop, which compiles sooner and takes up to twice as many flops. There a
     field is an algebra element, whose brackets stay in the span, so Munthe-Kaas methods accept it.
-    Outside of a step it has no
-    bracket, as that depends on the point y. Every step starts from
+    Outside of a step it has no bracket, as that depends on the point y. Every step starts from
     `y (3 I - y^T y) / 2`, so that rounding does not add up.
 
     With leading axes, shape `(*batch, n, p)`, each element moves on its own.
@@ -63,14 +72,14 @@ class LowRankSkew(AbstractSkew):
         return field.from_chart(field.flow(start))
 
     def tangent(self, point: Float[Array, "*batch n p"]) -> Float[Array, "*batch n p"]:
-        _check_point(self, "g", point)
+        check_like(self, "g", 2, point)
         if self.g.ndim > 2:
             return elementwise(self, self.g.ndim - 2).tangent(point)
         return matmul(self.g, matmul(point.T, point)) - matmul(point, matmul(self.g.T, point))
 
     def to_chart(self, point: Any, earlier: Sequence[Any]) -> tuple[Any, Any]:
         if not earlier:
-            _check_point(self, "g", point)
+            check_like(self, "g", 2, point)
         if self.g.ndim > 2:
             return elementwise(self, self.g.ndim - 2).to_chart(point, earlier)
         return SpanSkew.entered(self.g, point, earlier)
@@ -117,24 +126,24 @@ class BorderedSkew(AbstractSkewElement):
         _check_factor("gamma", self.gamma)
 
     def flow(self, point: Float[Array, "*batch n p"]) -> Float[Array, "*batch n p"]:
-        _check_point(self, "gamma", point)
+        check_like(self, "gamma", 2, point)
         if self.gamma.ndim > 2:
             return elementwise(self, self.gamma.ndim - 2).flow(point)
         p = point.shape[1]
         corner, border = self.gamma[:p], self.gamma[p:]
         corner = corner - corner.T
-        square = matmul(border.T, border)
+        gram = matmul(border.T, border)
         top, rest = point[:p], point[p:]
         # The rest moves in the span of the border: rest + border w, with top' = corner top -
-        # square w - border^T rest and w' = top.
-        row = jnp.concatenate([corner, -square], axis=1)
+        # gram w - border^T rest and w' = top.
+        row = jnp.concatenate([corner, -gram], axis=1)
 
         def product(x: Array) -> Array:
             return jnp.concatenate([matmul(row, x), x[:p]])
 
         # Norms that bound the 2-norm. A skew matrix has its singular values in pairs.
         half = jnp.sqrt(lax.stop_gradient(jnp.sum(corner * corner)) / 2) / 2
-        size = jnp.max(jnp.sum(jnp.abs(lax.stop_gradient(square)), axis=1))
+        size = jnp.max(jnp.sum(jnp.abs(lax.stop_gradient(gram)), axis=1))
 
         def dense() -> tuple[Array, Array]:
             a = jnp.concatenate([row, jnp.eye(p, 2 * p, dtype=row.dtype)])
@@ -151,7 +160,7 @@ class BorderedSkew(AbstractSkewElement):
         return jnp.concatenate([top + change[:p], rest + matmul(border, change[p:])])
 
     def tangent(self, point: Float[Array, "*batch n p"]) -> Float[Array, "*batch n p"]:
-        _check_point(self, "gamma", point)
+        check_like(self, "gamma", 2, point)
         if self.gamma.ndim > 2:
             return elementwise(self, self.gamma.ndim - 2).tangent(point)
         p = point.shape[1]
@@ -174,50 +183,16 @@ class BorderedSkew(AbstractSkewElement):
         if self.gamma.ndim > 2:
             return elementwise(self, self.gamma.ndim - 2).to_chart(point, earlier)
         if not earlier:
-            _check_point(self, "gamma", point)
-            point = point + matmul(point, _correction(_square(point)))
+            check_like(self, "gamma", 2, point)
+            point = point + matmul(point, correction(square(point)))
         return self, point
-
-
-class _Corner(eqx.Module):
-    """The first p columns of the identity, as a block of columns that takes no memory."""
-
-    p: int = eqx.field(static=True)
-
-
-_Blocks = tuple[_Corner | Array, ...]
-
-
-class _Span(eqx.Module):
-    """Blocks of p columns W, which need not be independent, and their products `W^T W`."""
-
-    blocks: _Blocks
-    gram: Float[Array, "m m"]
-
-    def extended(self, block: Float[Array, "n p"]) -> "_Span":
-        blocks = (*self.blocks, block)
-        new = _inner(blocks, block)
-        p = block.shape[1]
-        top = jnp.concatenate([self.gram, new[:-p]], axis=1)
-        return _Span(blocks, jnp.concatenate([top, new.T]))
-
-    def position(self, block: Any) -> int:
-        """Which block is the same array, or -1.
-
-        By identity, as values are not known in a trace. The same object always has the same value.
-        Two with equal values make the span longer than it need be, and the field is the same.
-        """
-        for i, own in enumerate(self.blocks):
-            if own is block or (isinstance(own, _Corner) and isinstance(block, _Corner)):
-                return i
-        return -1
 
 
 class SpanPoint(eqx.Module):
     """A point of a step, as its coefficients in the first blocks of a span."""
 
     z: Float[Array, "k p"]
-    blocks: _Blocks
+    blocks: Blocks
 
 
 class SpanSkew(AbstractSkewElement):
@@ -230,7 +205,7 @@ class SpanSkew(AbstractSkewElement):
     k: Float[Array, "m m"]
     # What the field does to coefficients: `W k W^T W = W a`. A bracket is a commutator of these.
     a: Float[Array, "m m"]
-    span: _Span
+    span: Span
 
     @classmethod
     def entered(
@@ -240,13 +215,13 @@ class SpanSkew(AbstractSkewElement):
         if earlier:
             span, frozen_at = earlier[-1].span, point.z
         else:
-            span = _Span((point,), _square(point))
+            span = Span((point,), square(point))
             frozen_at = jnp.eye(point.shape[1], dtype=point.dtype)
-            point = SpanPoint(frozen_at + _correction(span.gram), span.blocks)
+            point = SpanPoint(frozen_at + correction(span.gram), span.blocks)
         return cls.of(g, frozen_at, span), point
 
     @classmethod
-    def of(cls, g: Float[Array, "n p"], z: Float[Array, "k p"], span: _Span) -> "SpanSkew":
+    def of(cls, g: Float[Array, "n p"], z: Float[Array, "k p"], span: Span) -> "SpanSkew":
         """The field `g y^T - y g^T` with `y = W z`, on the span of W and g."""
         p, length = g.shape[1], len(z)
         span = span.extended(g)
@@ -269,18 +244,18 @@ class SpanSkew(AbstractSkewElement):
             z = jnp.pad(point.z, ((0, m - length), (0, 0)))
             z = z + change(matmul(self.a[:, :length], point.z))
             return SpanPoint(z, self.span.blocks)
-        velocity = matmul(self.k, _inner(self.span.blocks, point))
-        return _plus_product(point, self.span.blocks, change(velocity))
+        velocity = matmul(self.k, inner(self.span.blocks, point))
+        return plus_product(point, self.span.blocks, change(velocity))
 
     def _dense(self) -> tuple[Array, Array]:
         # In units of the columns' lengths.
-        square = jnp.diagonal(self.span.gram)
-        return self.a, jnp.where(square > 0, lax.rsqrt(jnp.where(square > 0, square, 1)), 1)
+        squares = jnp.diagonal(self.span.gram)
+        return self.a, jnp.where(squares > 0, lax.rsqrt(jnp.where(squares > 0, squares, 1)), 1)
 
     def tangent(self, point: Float[Array, "n p"]) -> Float[Array, "n p"]:
         blocks = self.span.blocks
-        velocity = matmul(self.k, _inner(blocks, point))
-        return _plus_product(jnp.zeros_like(point), blocks, velocity)
+        velocity = matmul(self.k, inner(blocks, point))
+        return plus_product(jnp.zeros_like(point), blocks, velocity)
 
     def bracket(self, other: Any) -> "SpanSkew":
         x, y = _on_one_span((self, other))
@@ -291,39 +266,32 @@ class SpanSkew(AbstractSkewElement):
     def from_chart(self, point: Any) -> Any:
         if isinstance(point, SpanPoint):
             p = point.z.shape[1]
-            return matmul(_columns(point.blocks[: len(point.z) // p]), point.z)
+            return matmul(joined(point.blocks[: len(point.z) // p]), point.z)
         return point
 
-    def on(self, span: _Span) -> "SpanSkew":
+    def on(self, span: Span) -> "SpanSkew":
         """The same field on a span that has all its blocks."""
         if span is self.span:
             return self
-        m = len(span.gram)
-        places = [span.position(block) for block in self.span.blocks]
-        rest = m - len(self.k)
-        if places == list(range(len(places))):
+        m, rest = len(self.k), len(span.gram) - len(self.k)
+        places = span.places(self.span)
+        if np.array_equal(places, np.arange(m)):
             k = jnp.pad(self.k, (0, rest))
-            new = matmul(self.k, span.gram[: m - rest, m - rest :])
-            return type(self)(
-                k, jnp.pad(jnp.concatenate([self.a, new], 1), ((0, rest), (0, 0))), span
-            )
-        widths = [
-            block.p if isinstance(block, _Corner) else block.shape[1] for block in span.blocks
-        ]
-        columns = np.split(np.arange(m), np.cumsum(widths)[:-1])
-        index = np.concatenate([columns[place] for place in places])
-        k = jnp.zeros((m, m), self.k.dtype).at[np.ix_(index, index)].set(self.k)
+            new = matmul(self.k, span.gram[:m, m:])
+            a = jnp.pad(jnp.concatenate([self.a, new], 1), ((0, rest), (0, 0)))
+            return type(self)(k, a, span)
+        k = jnp.zeros(span.gram.shape, self.k.dtype).at[np.ix_(places, places)].set(self.k)
         return type(self)(k, matmul(k, span.gram), span)
 
     def room(self, point: Any, num_fields: int) -> "Room | None":
         blocks: tuple[Any, ...] = self.span.blocks
-        if any(isinstance(block, _Corner) for block in blocks):
+        if any(isinstance(block, Corner) for block in blocks):
             return None
         p = point.z.shape[1]
         m = (num_fields + 1) * p
         rest = ((0, 0), (0, m - len(self.span.gram)))
         columns = jnp.pad(jnp.concatenate(blocks, axis=1), rest)
-        return Room(_Span((columns,), _padded(self.span.gram, m)), p, type(self))
+        return Room(Span((columns,), _padded(self.span.gram, m)), p, type(self))
 
 
 class Room(eqx.Module):
@@ -332,7 +300,7 @@ class Room(eqx.Module):
     The columns that are not there yet are zero, and so are the coefficients of these.
     """
 
-    span: _Span
+    span: Span
     p: int = eqx.field(static=True)
     cls: type[SpanSkew] = eqx.field(static=True)
 
@@ -371,7 +339,7 @@ class Room(eqx.Module):
         gram = self._with(gram, products.T, i, 0)
         columns = self._with(self._columns, g, i, 1)
         half = self._with(jnp.zeros_like(gram), z, i, 1)
-        return Room(_Span((columns,), gram), self.p, self.cls), half.T - half
+        return Room(Span((columns,), gram), self.p, self.cls), half.T - half
 
     @property
     def _columns(self) -> Any:
@@ -394,67 +362,13 @@ def _spanned(field: Any) -> SpanSkew:
     # gamma E^T - E gamma^T, where E is the corner.
     p = field.gamma.shape[1]
     one = jnp.eye(p, dtype=field.gamma.dtype)
-    return SpanSkew.of(field.gamma, one, _Span((_Corner(p),), one))
+    return SpanSkew.of(field.gamma, one, Span((Corner(p),), one))
 
 
 def _on_one_span(fields: Sequence[Any]) -> list[SpanSkew]:
     spanned = [_spanned(f) for f in fields]
-    # With the corner in front, if there is one, and then the fewest new products.
-    spans = [f.span for f in spanned]
-    span = max(spans, key=lambda s: (isinstance(s.blocks[0], _Corner), len(s.blocks)))
-    for field in spanned:
-        for block in field.span.blocks:
-            if span.position(block) < 0 and not isinstance(block, _Corner):
-                span = span.extended(block)
+    span = Span.joint([f.span for f in spanned])
     return [f.on(span) for f in spanned]
-
-
-def _columns(blocks: _Blocks) -> Float[Array, "n m"]:
-    columns = [x for x in blocks if not isinstance(x, _Corner)]
-    if columns[0].shape[1] == 1:
-        # As rows they are copied as they lie in memory: twice as fast where they are long.
-        return jnp.concatenate([x.T for x in columns]).T
-    return jnp.concatenate(columns, axis=1)
-
-
-def _inner(blocks: _Blocks, x: Float[Array, "n p"]) -> Float[Array, "m p"]:
-    """`W^T x`. A corner can only be the first block."""
-    if not isinstance(blocks[0], _Corner):
-        return matmul(_columns(blocks).T, x)
-    top = x[: blocks[0].p]
-    return jnp.concatenate([top, matmul(_columns(blocks[1:]).T, x)])
-
-
-def _plus_product(
-    x: Float[Array, "n p"], blocks: _Blocks, z: Float[Array, "m p"]
-) -> Float[Array, "n p"]:
-    """`x + W z`."""
-    if isinstance(blocks[0], _Corner):
-        p = blocks[0].p
-        x = jnp.concatenate([x[:p] + z[:p], x[p:]])
-        blocks, z = blocks[1:], z[p:]
-    return x + matmul(_columns(blocks), z)
-
-
-def _correction(square: Float[Array, "p p"]) -> Float[Array, "p p"]:
-    """`(I - y^T y) / 2`, the first term of Newton's method for the nearest orthonormal columns."""
-    defect = jnp.eye(len(square), dtype=square.dtype) - square
-    # Far from the manifold there is no nearest point that the caller can have meant.
-    near = jnp.max(jnp.abs(lax.stop_gradient(defect))) < 0.1
-    return jnp.where(near, defect / 2, jnp.nan)
-
-
-def _defect(y: Float[Array, "n p"]) -> Float[Array, "p p"]:
-    return jnp.eye(y.shape[1], dtype=y.dtype) - _square(y)
-
-
-def _square(y: Float[Array, "n p"]) -> Float[Array, "p p"]:
-    """`y^T y`, in blocks of rows: the rounding of long sums is what would limit orthonormality."""
-    n, p = y.shape
-    count = math.isqrt(n)
-    rows = -(-n // count)
-    blocks = jnp.pad(y, ((0, rows * count - n), (0, 0))).reshape(count, rows, p)
-    return jnp.sum(matmul(jnp.swapaxes(blocks, 1, 2), blocks), axis=0)
 
 
 def _check_factor(name: str, factor: Array) -> None:
@@ -464,10 +378,6 @@ def _check_factor(name: str, factor: Array) -> None:
         )
     if factor.dtype not in (jnp.float32, jnp.float64):
         raise TypeError(f"{name} must be float32 or float64, got {factor.dtype}.")
-
-
-def _check_point(field: AbstractFrozenField, name: str, point: Array) -> None:
-    check_like(field, name, 2, point)
 
 
 def check_like(field: AbstractFrozenField, name: str, num_axes: int, point: Array) -> None:

@@ -14,7 +14,7 @@ from .._numerics.expm import expm_parts
 from .._numerics.expm_multiply import Dense, expm_minus_one_multiply, row_norm
 from .._numerics.matmul import by_columns, promoted, small_product
 from .._numerics.squaring import max_over_batch
-from .elementwise import check_point, each
+from .elementwise import check_other, check_point, each
 
 
 class AbstractMatrix(AbstractAlgebraElement):
@@ -33,13 +33,6 @@ class AbstractMatrix(AbstractAlgebraElement):
     @property
     def _num_axes(self) -> int:
         return self.a.ndim - 2
-
-    def _check_other(self, other: Any) -> None:
-        if not isinstance(other, type(self)):
-            name = type(self).__name__
-            raise TypeError(
-                f"{name} has a bracket with another {name} only, got {type(other).__name__}."
-            )
 
 
 def check_companion(
@@ -88,7 +81,7 @@ class AbstractOneSided(AbstractMatrix):
         return each(self.act, self._num_axes)(self.a, point)
 
     def bracket(self, other: Any) -> "AbstractOneSided":
-        self._check_other(other)
+        check_other(self, other)
         # Flows from the right compose the other way round, and so do these products.
         act = each(self.act, self._num_axes)
         return type(self)(act(self.a, other.a) - act(other.a, self.a))

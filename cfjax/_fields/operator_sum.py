@@ -2,7 +2,6 @@
 
 from collections.abc import Callable, Sequence
 from functools import partial
-from hashlib import sha256
 from typing import Any
 
 import equinox as eqx
@@ -12,13 +11,25 @@ import jax.tree_util as jtu
 import lineax as lx
 import numpy as np
 from jax import lax
-from jax.core import Tracer
-from jaxtyping import Array, Inexact, PyTree, Real
+from jaxtyping import Array, Inexact, Real
 
 from .._field import AbstractFrozenField, Weight, combine, describe, struct
 from .._numerics.checks import needing
 from .._numerics.expm_multiply import expm_minus_one_multiply, row_norm
-from .._numerics.matmul import by_columns, matmul, promoted
+from .._numerics.matmul import by_columns, promoted
+from .._numerics.operators import (
+    added,
+    applied,
+    bound_of_sparse,
+    dtype_of,
+    entries_of,
+    is_known,
+    is_sparse,
+    scaled,
+    shape_of,
+    size_of,
+    two_norm,
+)
 from .._numerics.transforms import DTYPES
 from .matrix import LeftMatrix, exp_minus_one_times, exp_times
 
@@ -97,22 +108,20 @@ class OperatorSum(AbstractFrozenField):
         self.coefficients = _coefficients(coefficients, len(operators), precision)
         precision = jnp.finfo(self.coefficients.dtype).dtype
         self.norms = tuple(_norm(k, *pair, precision) for k, pair in enumerate(pairs))
-        sizes = {n: k for k, a in reversed([*enumerate(self.operators)]) if (n := _size(a))}
+        sizes = {n: k for k, a in reversed([*enumerate(self.operators)]) if (n := size_of(a))}
         if len(sizes) > 1:
             found = " and ".join(f"{n} for operators[{k}]" for n, k in reversed(sizes.items()))
             raise ValueError(f"operators must act on vectors of one size, got {found}.")
-        dtypes = [self.coefficients.dtype, *map(_dtype, self.operators)]
+        dtypes = [self.coefficients.dtype, *map(dtype_of, self.operators)]
         is_complex = any(jnp.issubdtype(x, jnp.complexfloating) for x in dtypes if x is not None)
         for n in sizes:
-            self._check_values(
-                n, np.result_type(precision, np.complex64) if is_complex else precision
-            )
+            self._check_values(n, _dtype(precision, is_complex))
 
     def flow(self, point: Inexact[Array, "n *k"]) -> Inexact[Array, "n *k"]:
-        return self._moved(point, exp_times, lambda added: point + added)
+        return self._moved(point, exp_times, lambda change: point + change)
 
     def increment(self, point: Inexact[Array, "n *k"]) -> Inexact[Array, "n *k"]:
-        return self._moved(point, exp_minus_one_times, lambda added: added)
+        return self._moved(point, exp_minus_one_times, lambda change: change)
 
     def _moved(
         self, point: Array, of_matrix: Callable[..., Array], of_added: Callable[[Array], Array]
@@ -123,21 +132,21 @@ class OperatorSum(AbstractFrozenField):
             a = matrix if diagonal is None else jnp.add(*promoted(matrix, jnp.diag(diagonal)))
             return of_matrix(LeftMatrix, a, point, bound, self.is_skew or None)
         products = [] if matrix is None else [by_columns(matrix)]
-        products += [] if diagonal is None else [partial(_apply, diagonal)]
+        products += [] if diagonal is None else [partial(applied, diagonal)]
 
         def product(x: Array) -> Array:
             terms = [times(x) for times in products]
-            return _sum(terms + [_times(c, _apply(a, x)) for c, a in others])
+            return added(terms + [scaled(c, applied(a, x)) for c, a in others])
 
         return of_added(expm_minus_one_multiply(product, point, bound, is_skew=self.is_skew))
 
     def tangent(self, point: Inexact[Array, "n *k"]) -> Inexact[Array, "n *k"]:
         self._check(point)
         terms = (
-            _times(c, _apply(a, point))
+            scaled(c, applied(a, point))
             for c, a in zip(self.coefficients, self.operators, strict=True)
         )
-        return _sum(terms)
+        return added(terms)
 
     @classmethod
     def combine(cls, weights: Sequence[Weight], fields: Sequence[Any]) -> "OperatorSum":
@@ -152,26 +161,26 @@ class OperatorSum(AbstractFrozenField):
         others, bounds = [], []
         for c, a, norm in zip(self.coefficients, self.operators, self.norms, strict=True):
             size = None if norm is None else jnp.abs(lax.stop_gradient(c)) * norm
-            entries = _entries(a)
+            entries = entries_of(a)
             if entries is None:
                 others.append((c, a))
                 bounds.append(size)
             else:
-                arrays[entries.ndim].append((_times(c, jnp.asarray(entries)), size))
+                arrays[entries.ndim].append((scaled(c, jnp.asarray(entries)), size))
         diagonal, matrix = (
-            _sum(a for a, _ in found) if found else None for found in arrays.values()
+            added(a for a, _ in found) if found else None for found in arrays.values()
         )
         found = [pair for pairs in arrays.values() for pair in pairs]
         if found:
             # The norm of the sum of arrays may be far below the sum of the norms, and that of the
             # rows may be far above the 2-norm.
-            of_sum = _sum(_row_norm(a) for a in (diagonal, matrix) if a is not None)
-            of_each = _sum(_row_norm(a) if size is None else size for a, size in found)
+            of_sum = added(_row_norm(a) for a in (diagonal, matrix) if a is not None)
+            of_each = added(_row_norm(a) if size is None else size for a, size in found)
             bounds.append(jnp.minimum(of_sum, of_each))
-        return matrix, diagonal, others, _sum(bounds)
+        return matrix, diagonal, others, added(bounds)
 
     def _check(self, point: Array) -> None:
-        sizes = {_size(a) for a in self.operators} - {None}
+        sizes = {size_of(a) for a in self.operators} - {None}
         if point.ndim not in (1, 2) or any(n != point.shape[0] for n in sizes):
             n = next(iter(sizes), "n")
             raise ValueError(
@@ -188,12 +197,12 @@ class OperatorSum(AbstractFrozenField):
         length = np.linalg.norm(x)
         says_skew = self.is_skew and not jnp.iscomplexobj(self.coefficients)
         for k, (a, norm) in enumerate(zip(self.operators, self.norms, strict=True)):
-            is_free = _entries(a) is None and not _is_bcoo(a)
-            if not (is_free or says_skew) or not _is_known(a):
+            is_free = entries_of(a) is None and not is_sparse(a)
+            if not (is_free or says_skew) or not is_known(a):
                 continue
             with jax.ensure_compile_time_eval():
-                ax, ay, both = (_apply(a, jnp.asarray(z)) for z in (x, y, x - 2 * y))
-            if not _is_known((ax, ay, both)):
+                ax, ay, both = (applied(a, jnp.asarray(z)) for z in (x, y, x - 2 * y))
+            if not is_known((ax, ay, both)):
                 continue
             ax, ay, both = map(np.asarray, (ax, ay, both))
             if ax.shape != (n,):
@@ -206,7 +215,7 @@ class OperatorSum(AbstractFrozenField):
                     f"operators[{k}] must be linear, but A(x - 2 y) is not A x - 2 A y for random "
                     "vectors x and y."
                 )
-            bound = float(norm) if norm is not None and _is_known(norm) else np.inf
+            bound = float(norm) if norm is not None and is_known(norm) else np.inf
             if np.linalg.norm(ax) > (1 + _SLACK) * bound * length:
                 raise ValueError(
                     f"operators[{k}] must have a norm of at least {np.linalg.norm(ax) / length:.4g}"
@@ -233,68 +242,25 @@ def _with_norm(k: int, operator: Any) -> tuple[Any, Any]:
     norm = None
     if isinstance(operator, tuple) and len(operator) == 2:
         operator, norm = operator
-    if isinstance(operator, lx.AbstractLinearOperator) or _is_bcoo(operator):
-        return operator, norm
-    if isinstance(operator, jax.Array | np.ndarray):
+    if shape_of(operator) is not None:
         return operator, norm
     if callable(operator):
-        is_tree = not jtu.all_leaves([operator])
         function: Any = operator
-        return function if is_tree else _Function(function), norm
+        return _Function(function) if jtu.all_leaves([operator]) else function, norm
     raise TypeError(
         f"operators[{k}] must be an array, a jax.experimental.sparse.BCOO, a lineax operator, a "
         f"function, or a pair of one and its norm, got {describe(operator)}."
     )
 
 
-def _is_bcoo(operator: Any) -> bool:
-    # Without an import that nobody else may need.
-    cls = type(operator)
-    return cls.__name__ == "BCOO" and cls.__module__.startswith("jax.experimental.sparse")
-
-
-def _entries(operator: Any) -> Any:
-    """The matrix or diagonal of an operator that is kept as one."""
-    if isinstance(operator, jax.Array | np.ndarray):
-        return operator
-    if isinstance(operator, lx.MatrixLinearOperator):
-        return operator.as_matrix()
-    if isinstance(operator, lx.DiagonalLinearOperator):
-        return lx.diagonal(operator)
-    return None
-
-
-def _shape(operator: Any) -> tuple[int, ...] | None:
-    if isinstance(operator, jax.Array | np.ndarray) or _is_bcoo(operator):
-        return operator.shape
-    if isinstance(operator, lx.AbstractLinearOperator):
-        return operator.out_size(), operator.in_size()
-    return None
-
-
-def _dtype(operator: Any) -> Any:
-    if _shape(operator) is None:
-        return None
-    is_lineax = isinstance(operator, lx.AbstractLinearOperator)
-    if isinstance(operator, np.ndarray):
-        # Its doubles are single where JAX has no doubles.
-        return jnp.result_type(operator)
-    return operator.in_structure().dtype if is_lineax else operator.dtype
-
-
-def _size(operator: Any) -> int | None:
-    shape = _shape(operator)
-    return None if shape is None else shape[-1]
-
-
 def _precision(operators: Sequence[Any]) -> Any:
     """That of the operators; None if only functions."""
     found: dict[Any, int] = {}
     for k, operator in enumerate(operators):
-        shape = _shape(operator)
+        shape = shape_of(operator)
         if shape is None:
             continue
-        if _is_bcoo(operator) and (operator.n_batch or operator.n_dense):
+        if is_sparse(operator) and (operator.n_batch or operator.n_dense):
             raise ValueError(
                 f"operators[{k}] must be a BCOO without batch and dense dimensions, got "
                 f"n_batch={operator.n_batch} and n_dense={operator.n_dense}. Write "
@@ -311,7 +277,7 @@ def _precision(operators: Sequence[Any]) -> Any:
                     f"operators[{k}] must act on vectors, shape (n,), got the structure "
                     f"{describe(operator.in_structure())}."
                 )
-        dtype = _dtype(operator)
+        dtype = dtype_of(operator)
         if jnp.dtype(dtype).name not in DTYPES:
             raise TypeError(f"operators[{k}] must be one of {', '.join(DTYPES)}, got {dtype}.")
         found.setdefault(jnp.finfo(dtype).dtype, k)
@@ -322,27 +288,22 @@ def _precision(operators: Sequence[Any]) -> Any:
 
 
 def _coefficients(given: Any, number: int, precision: Any) -> Array:
-    array = isinstance(given, jax.Array | np.ndarray)
-    values = given if array else [c if isinstance(c, jax.Array) else np.asarray(c) for c in given]
-    if not array:
-        if any(np.shape(c) != () for c in values):
+    if not isinstance(given, jax.Array | np.ndarray):
+        scalars = [c if isinstance(c, jax.Array) else np.asarray(c) for c in given]
+        if any(np.shape(c) != () for c in scalars):
             raise ValueError(
                 "coefficients must be an array of shape (K,) or a sequence of scalars, got shapes "
-                f"{[np.shape(c) for c in values]}."
+                f"{[np.shape(c) for c in scalars]}."
             )
         # Python's numbers take the precision of the others.
-        precision = precision or next(
-            (jnp.finfo(c.dtype).dtype for c in given if eqx.is_inexact_array(c)),
-            jnp.result_type(float),
-        )
-        is_complex = any(jnp.iscomplexobj(c) for c in values)
-        dtype = np.result_type(precision, np.complex64) if is_complex else precision
-        own = [c for c in given if hasattr(c, "dtype") and jnp.issubdtype(c.dtype, jnp.inexact)]
-        wrong = [c.dtype for c in own if jnp.finfo(c.dtype).dtype != precision]
-        if wrong:
-            raise TypeError(f"coefficients must have the precision {precision}, got {wrong[0]}.")
-        values = jnp.stack([jnp.asarray(c).astype(dtype) for c in values]) if values else []
-    values = jnp.asarray(values)
+        dtypes = [c.dtype for c in given if hasattr(c, "dtype")]
+        own = {jnp.finfo(x).dtype: x for x in dtypes if jnp.issubdtype(x, jnp.inexact)}
+        precision = precision or next(iter(own), jnp.result_type(float))
+        for wrong in own.keys() - {precision}:
+            raise TypeError(f"coefficients must have the precision {precision}, got {own[wrong]}.")
+        dtype = _dtype(precision, any(map(jnp.iscomplexobj, scalars)))
+        given = jnp.stack([jnp.asarray(c).astype(dtype) for c in scalars]) if scalars else []
+    values = jnp.asarray(given)
     if values.shape != (number,):
         raise ValueError(
             f"coefficients must be one for each of the {number} operators, shape ({number},), got "
@@ -358,6 +319,10 @@ def _coefficients(given: Any, number: int, precision: Any) -> Array:
     return values
 
 
+def _dtype(precision: Any, is_complex: bool) -> Any:
+    return np.result_type(precision, np.complex64) if is_complex else precision
+
+
 def _norm(k: int, operator: Any, norm: Any, precision: Any) -> Any:
     """The norm as an array; None for an array that is not known yet."""
     if norm is not None:
@@ -366,104 +331,20 @@ def _norm(k: int, operator: Any, norm: Any, precision: Any) -> Any:
             raise TypeError(
                 f"The norm of operators[{k}] must be a real number, got {describe(norm)}."
             )
-        if not _is_known(norm):
+        if not is_known(norm):
             return lax.stop_gradient(jnp.asarray(norm)).astype(precision)
         # In NumPy, so that it is known within a program, too.
         if not 0 <= float(norm) < np.inf:
             raise ValueError(f"The norm of operators[{k}] must be finite and >= 0, got {norm}.")
         return np.asarray(norm, precision)
-    if (entries := _entries(operator)) is not None:
-        return _two_norm(entries, precision)
-    if _is_bcoo(operator):
-        return _bound_of_sparse(operator).astype(precision)
-    kind = "A function" if _shape(operator) is None else type(operator).__name__
+    if (entries := entries_of(operator)) is not None:
+        return two_norm(entries, precision)
+    if is_sparse(operator):
+        return bound_of_sparse(operator).astype(precision)
+    kind = "A function" if shape_of(operator) is None else type(operator).__name__
     raise ValueError(
         f"{kind} needs a bound on its norm: give the pair (operator, norm) for operators[{k}]."
     )
-
-
-# Those of arrays that were seen before, by their contents: a program is traced several times.
-_seen: dict[bytes, float] = {}
-
-
-def _two_norm(a: Any, precision: Any) -> Any:
-    """That of a matrix or diagonal whose entries are known, to a little more than rounding."""
-    if not _is_known(a):
-        return None
-    a = np.asarray(a)
-    key = sha256(np.ascontiguousarray(a).tobytes() + repr((a.shape, a.dtype)).encode()).digest()
-    if key not in _seen:
-        if len(_seen) >= 1000:
-            _seen.clear()
-        wide = a.astype(np.result_type(a, np.float64))
-        norm = np.max(np.abs(wide), initial=0) if a.ndim == 1 else _largest_singular_value(wide)
-        # NaN where an entry is.
-        _seen[key] = float(norm) * (1 + 1e-6)
-    return np.asarray(_seen[key], precision)
-
-
-def _largest_singular_value(a: np.ndarray) -> float:
-    if not np.isfinite(a).all():
-        return np.nan
-    for phase in (1.0, 1j):
-        if np.array_equal(phase * a, (phase * a).conj().T):
-            return float(np.abs(np.linalg.eigvalsh(phase * a)).max(initial=0))
-    return float(np.linalg.norm(a, 2))
-
-
-def _bound_of_sparse(a: Any) -> Any:
-    is_known = _is_known((a.data, a.indices))
-    xp: Any = np if is_known else jnp
-    size = xp.abs(xp.asarray(a.data if is_known else lax.stop_gradient(a.data)))
-    sums = []
-    for axis in range(2):
-        if is_known:
-            places = np.asarray(a.indices)[:, axis]
-            # What is padding points beyond the end.
-            total = np.bincount(places, size, minlength=a.shape[axis])[: a.shape[axis]]
-        else:
-            total = (
-                jnp.zeros(a.shape[axis], size.dtype).at[a.indices[:, axis]].add(size, mode="drop")
-            )
-        sums.append(xp.max(total, initial=0))
-    return xp.sqrt(sums[0] * sums[1])
-
-
-def _apply(operator: Any, x: Array) -> Array:
-    if isinstance(operator, jax.Array | np.ndarray):
-        a = jnp.asarray(operator)
-        if a.ndim == 1:
-            return _times(a.reshape(-1, *[1] * (x.ndim - 1)), x)
-        return matmul(*promoted(a, x))
-    entries = _entries(operator)
-    if entries is not None:
-        return _apply(entries, x)
-    if _is_bcoo(operator):
-        data = promoted(operator.data, x)[0]
-        return type(operator)((data, operator.indices), shape=operator.shape) @ x
-    if not isinstance(operator, lx.AbstractLinearOperator):
-        return _columnwise(operator, x)
-    # A real one takes real vectors.
-    if jnp.iscomplexobj(x) and not jnp.issubdtype(
-        operator.in_structure().dtype, jnp.complexfloating
-    ):
-        return lax.complex(*(_columnwise(operator.mv, part) for part in (x.real, x.imag)))
-    return _columnwise(operator.mv, x)
-
-
-def _columnwise(function: Callable[[Array], Array], x: Array) -> Array:
-    return (jax.vmap(function, 1, 1) if x.ndim == 2 else function)(x)
-
-
-def _times(c: Array, x: Array) -> Array:
-    return jnp.multiply(*promoted(c, x))
-
-
-def _sum(terms: Any) -> Array:
-    first, *others = terms
-    for term in others:
-        first = jnp.add(*promoted(first, term))
-    return first
 
 
 def _row_norm(a: Array) -> Array:
@@ -472,10 +353,6 @@ def _row_norm(a: Array) -> Array:
 
 def _cast(x: np.ndarray, dtype: Any) -> np.ndarray:
     return (x if jnp.issubdtype(dtype, jnp.complexfloating) else np.real(x)).astype(dtype)
-
-
-def _is_known(x: PyTree) -> bool:
-    return not any(isinstance(leaf, Tracer) for leaf in jtu.tree_leaves(x))
 
 
 def _of_the_same_operators(fields: Sequence[OperatorSum]) -> list[Array]:

@@ -11,7 +11,7 @@ from jaxtyping import Array, Float, Real
 from .._field import AbstractAlgebraElement
 from .._numerics import planar_motion, rigid_motion
 from .._numerics.matmul import matmul
-from .elementwise import check_point, each
+from .elementwise import check_other, check_point, each
 
 Frame = Literal["body", "fixed"]
 
@@ -67,14 +67,10 @@ class AbstractMotion(AbstractAlgebraElement):
         return self._with(self.numerics.dexpinv, other)
 
     def _with(self, fun: Any, other: Any) -> "AbstractMotion":
-        name = type(self).__name__
-        if type(other) is not type(self):
-            raise TypeError(
-                f"{name} has a bracket with another {name} only, got {type(other).__name__}."
-            )
+        check_other(self, other)
         if other.frame != self.frame:
             raise ValueError(
-                f"{name} has a bracket with a motion in the same frame only, got "
+                f"{type(self).__name__} has a bracket with a motion in the same frame only, got "
                 f"frame={self.frame!r} and frame={other.frame!r}."
             )
         # In the frame of the body flows compose the other way round, as if all moved backwards.

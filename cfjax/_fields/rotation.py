@@ -8,7 +8,7 @@ from jaxtyping import Array, Float
 
 from .._field import AbstractAlgebraElement
 from .._numerics.rotate import cross_product, dexpinv, increment, rotate
-from .elementwise import check_point, each
+from .elementwise import check_other, check_point, each
 
 
 class Rotation(AbstractAlgebraElement):
@@ -59,10 +59,7 @@ class Rotation(AbstractAlgebraElement):
         return self._with(dexpinv, other)
 
     def _with(self, fun: Any, other: Any) -> "Rotation":
-        if not isinstance(other, Rotation):
-            raise TypeError(
-                f"Rotation has a bracket with another Rotation only, got {type(other).__name__}."
-            )
+        check_other(self, other)
         return type(self)(each(fun, self._num_axes)(self.omega, other.omega))
 
     @property

@@ -1,22 +1,24 @@
-"""Output within the steps of any method: coefficients that the order conditions decide."""
+"""Output within the steps of any method: coefficients that the order conditions decide.
 
+Those of the named methods are stored, as the last digits of what is derived depend on the machine
+and its number of threads. `python tests/methods/derive.py` writes them.
+"""
+
+import json
 from collections.abc import Iterator
-from functools import lru_cache
+from functools import cache, lru_cache
+from hashlib import sha256
 from itertools import islice
 from math import factorial
-from typing import NamedTuple, TypeAlias
+from pathlib import Path
+from typing import Any, NamedTuple, TypeAlias
 
 import numpy as np
 
-from .order_conditions import (
-    exact_tree_weight,
-    exact_weight,
-    trees,
-    word_weights,
-    words,
-)
+from .coefficients import ContinuousExtension
+from .order_conditions import exact_tree_weight, exact_weight, trees, word_weights, words
 from .proved import order_of
-from .tableau import ContinuousExtension, Tableau
+from .tableau import Tableau
 
 # The conditions of one order: what they multiply the coefficients of one power of theta with, and
 # what the results must be, one column for each power.
@@ -28,11 +30,17 @@ _MAX_ORDER = 4
 _MAX_POWER = 8
 # What is zero but for rounding: for the methods here singular values are above 7e-6 or below 1e-14.
 _ROUNDING = 1e-9
+STORED = Path(__file__).with_name("extensions.json")
 
 
 @lru_cache
 def continuous_extension(tableau: Tableau) -> ContinuousExtension:
-    """The tableau's own, or one of uniform order p - 1 for a method of order p, but at most 4.
+    """The tableau's own, or one of uniform order p - 1 for a method of order p, but at most 4."""
+    return tableau.continuous_extension or _stored(tableau) or derived_extension(tableau)
+
+
+def derived_extension(tableau: Tableau) -> ContinuousExtension:
+    """What the order conditions give.
 
     It uses the field at the end of the step only where the stages do not suffice.
 
@@ -41,8 +49,6 @@ def continuous_extension(tableau: Tableau) -> ContinuousExtension:
     stages' fields occur in that letter only, and up to order 4 one word has two such letters, whose
     weight is half the square of a letter's. Nor do the powers of theta mix.
     """
-    if tableau.continuous_extension is not None:
-        return tableau.continuous_extension
     found, reached = _solve(tableau.beta, _flow_conditions(tableau), _MAX_ORDER)
     if reached < _MAX_ORDER and reached < order_of(tableau) - 1:
         with_end = Tableau((*tableau.alpha, tableau.beta), tableau.beta)
@@ -64,10 +70,21 @@ def runge_kutta_extension(
 ) -> RungeKuttaExtension:
     """One of uniform order p - 1 in a linear space, for a Runge-Kutta method of order p, `order`.
 
-    `a[i]` and `b[i]` belong to stage i. The method's own stages suffice up to order 5 with as few
-    as diffrax has. `diffrax.Dopri8` takes 4 more, which evaluate the field at the end of the step
-    and at three points within. These points are where the stages so far reach one order more than
-    elsewhere. Where there are no such points the order is what the stages reach.
+    `a[i]` and `b[i]` belong to stage i.
+    """
+    found = _stored(a, b, order)
+    return RungeKuttaExtension(*found) if found else derived_runge_kutta_extension(a, b, order)
+
+
+def derived_runge_kutta_extension(
+    a: tuple[tuple[float, ...], ...], b: tuple[float, ...], order: int
+) -> RungeKuttaExtension:
+    """What the order conditions give.
+
+    The method's own stages suffice up to order 5 with as few as diffrax has. `diffrax.Dopri8` takes
+    4 more, which evaluate the field at the end of the step and at three points within. These points
+    are where the stages so far reach one order more than elsewhere. Where there are no such points
+    the order is what the stages reach.
     """
     more = []
     found, reached = _solve((b,), _tree_conditions(a, len(b)), _MAX_POWER)
@@ -87,6 +104,25 @@ def runge_kutta_extension(
                 row = np.linalg.lstsq(matrix, right, rcond=_ROUNDING)[0]
                 more.append((tuple(row.tolist()), c))
     return RungeKuttaExtension(found, tuple(row for row, _ in more), tuple(c for _, c in more))
+
+
+def identity(*method: Any) -> str:
+    """A short text that says which coefficients these are."""
+    return sha256(repr(method).encode()).hexdigest()[:16]
+
+
+def _stored(*method: Any) -> Any:
+    """What is stored for these coefficients; None for those of a user."""
+    return _as_tuples(_by_identity().get(identity(*method)))
+
+
+@cache
+def _by_identity() -> dict[str, Any]:
+    return {each["of"]: each["extension"] for each in json.loads(STORED.read_text()).values()}
+
+
+def _as_tuples(tree: Any) -> Any:
+    return tuple(map(_as_tuples, tree)) if isinstance(tree, list) else tree
 
 
 def _points_of_order(conditions: list[Conditions]) -> tuple[list[float], np.ndarray, np.ndarray]:

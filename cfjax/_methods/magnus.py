@@ -21,7 +21,7 @@ from dataclasses import dataclass
 from decimal import Decimal, localcontext
 from typing import TypeAlias
 
-from .tableau import ContinuousExtension, Product
+from .coefficients import ContinuousExtension, Product
 
 # Values on Legendre polynomials, by flow and degree.
 Letters: TypeAlias = Sequence[Sequence[Decimal]]

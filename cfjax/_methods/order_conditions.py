@@ -24,7 +24,8 @@ from typing import Any, TypeAlias
 
 import numpy as np
 
-from .tableau import Product, Row, Tableau, uncertainty
+from .coefficients import Product, Row, uncertainty
+from .tableau import Tableau
 
 
 class _Rounded:

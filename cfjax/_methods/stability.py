@@ -5,7 +5,8 @@ from typing import Any
 import numpy as np
 from jaxtyping import Complex, Inexact
 
-from .tableau import Product, Tableau
+from .coefficients import Product
+from .tableau import Tableau
 
 Number = int | float | complex | Inexact[np.ndarray, "..."]
 

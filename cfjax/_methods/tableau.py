@@ -1,31 +1,22 @@
 """Tableaus of commutator-free Lie group methods: plain data, checked in full when made."""
 
-import math
-import sys
-from collections.abc import Iterable, Mapping, Set
+from collections.abc import Iterable
 from dataclasses import dataclass
 from fractions import Fraction
-from functools import cached_property
-from numbers import Integral, Real
-from typing import Any, TypeAlias
+from functools import cached_property, partial
+from typing import Any
 
-Coefficient: TypeAlias = Fraction | float
-Row: TypeAlias = tuple[Coefficient, ...]
-Product: TypeAlias = tuple[Row, ...]
-# A product whose coefficients are polynomials without a constant term: by flow, power and stage.
-ContinuousExtension: TypeAlias = tuple[Product, ...]
-
-
-def uncertainty(coefficient: Coefficient) -> Fraction:
-    """How far a coefficient may be from the number its author meant. A fraction is exact.
-
-    A float is allowed four units of rounding, relative above 1 and absolute below: published
-    decimals end at a fixed place (5e-17 for 16 digits), and sums or products of a few floats lose
-    a unit or two. Zero stays exact, as it says that a stage is not used.
-    """
-    if isinstance(coefficient, Fraction) or coefficient == 0:
-        return Fraction(0)
-    return 4 * Fraction(sys.float_info.epsilon) * max(1, abs(Fraction(coefficient)))
+from .coefficients import (
+    ContinuousExtension,
+    Product,
+    Row,
+    checked_coefficient,
+    checked_end,
+    checked_entries,
+    checked_extension,
+    checked_product,
+    rounded_sum,
+)
 
 
 @dataclass(frozen=True, init=False, repr=False)
@@ -74,24 +65,20 @@ class Tableau:
         embedded: Iterable[Iterable[Any]] | None = None,
         continuous_extension: Iterable[Iterable[Iterable[Any]]] | None = None,
     ) -> None:
-        stages = _entries("alpha", alpha, "a sequence with one list of flows for each stage")
+        stages = checked_entries("alpha", alpha, "a sequence with one list of flows for each stage")
         if not stages:
             raise ValueError("alpha must have at least one stage, got none.")
         s = len(stages)
         # The only way to set a field of a frozen dataclass; it is never changed after this.
-        object.__setattr__(
-            self, "alpha", tuple(_product(f"alpha[{r}]", p, s, r) for r, p in enumerate(stages))
-        )
-        object.__setattr__(self, "beta", _product("beta", beta, s, s))
-        _check_consistent("beta", self.beta)
+        put = partial(object.__setattr__, self)
+        put("alpha", tuple(checked_product(f"alpha[{r}]", p, s, r) for r, p in enumerate(stages)))
+        put("beta", checked_end("beta", beta, s))
         if embedded is not None:
-            embedded = _product("embedded", embedded, s + 1, s + 1)
-            _check_consistent("embedded", embedded)
-        object.__setattr__(self, "embedded", embedded)
+            embedded = checked_end("embedded", embedded, s + 1)
+        put("embedded", embedded)
         if continuous_extension is not None:
-            continuous_extension = _continuous_extension(continuous_extension, s + 1)
-            _check_end("continuous_extension", continuous_extension, self.beta)
-        object.__setattr__(self, "continuous_extension", continuous_extension)
+            continuous_extension = checked_extension(continuous_extension, s + 1, self.beta)
+        put("continuous_extension", continuous_extension)
 
     def __repr__(self) -> str:
         stages = ", ".join(map(_show_product, self.alpha))
@@ -136,7 +123,7 @@ class Tableau:
     @cached_property
     def c(self) -> Row:
         """Stage times, the sum of all rows of the stage. With floats: rounded once."""
-        return tuple(_rounded_sum([a for row in rows for a in row]) for rows in self.alpha)
+        return tuple(rounded_sum([a for row in rows for a in row]) for rows in self.alpha)
 
     @cached_property
     def prefixes(self) -> tuple[Product, ...]:
@@ -165,109 +152,6 @@ class Tableau:
         """Whether all coefficients are fractions."""
         rows = (row for rows in (*self.alpha, self.beta) for row in rows)
         return all(isinstance(a, Fraction) for row in rows for a in row)
-
-
-def _entries(where: str, value: Any, expected: str) -> list[Any]:
-    unordered_or_text = isinstance(value, str | bytes | Mapping | Set)
-    # An array without dimensions only looks iterable.
-    is_scalar = not isinstance(value, Iterable) or getattr(value, "ndim", 1) == 0
-    if unordered_or_text or is_scalar:
-        raise TypeError(f"{where} must be {expected}, got {value!r} of type {_type_name(value)}.")
-    return list(value)
-
-
-def _product(where: str, value: Any, num_stages: int, num_known: int) -> Product:
-    """The rows of one point, of which only the first `num_known` stages may be used."""
-    rows = []
-    for j, row in enumerate(_entries(where, value, "a sequence of rows, one for each flow")):
-        checked = _row(f"{where}[{j}]", row, num_stages)
-        for k in range(num_known, num_stages):
-            if checked[k] != 0:
-                allowed = f"only stages before {num_known}" if num_known else "no stage"
-                raise ValueError(
-                    f"{where}[{j}][{k}] is {checked[k]}, but the method must be explicit: "
-                    f"{where} may use {allowed}, so this entry must be 0."
-                )
-        if any(checked):
-            rows.append(checked)
-    return tuple(rows)
-
-
-def _row(where: str, value: Any, num_stages: int) -> Row:
-    entries = _entries(where, value, "a row with one coefficient for each stage")
-    if len(entries) > num_stages:
-        raise ValueError(
-            f"{where} must have at most {num_stages} entries, one for each stage of alpha, "
-            f"got {len(entries)}."
-        )
-    zeros = [Fraction(0)] * (num_stages - len(entries))
-    return (*(_coefficient(f"{where}[{k}]", entry) for k, entry in enumerate(entries)), *zeros)
-
-
-def _check_consistent(where: str, rows: Product) -> None:
-    entries = [b for row in rows for b in row]
-    if abs(_sum(entries) - 1) > _sum(map(uncertainty, entries)):
-        raise ValueError(
-            f"{where} must sum to 1 over all its rows (consistency), got a sum of "
-            f"{_rounded_sum(entries)}."
-        )
-
-
-def _continuous_extension(value: Any, num_stages: int) -> ContinuousExtension:
-    return tuple(
-        tuple(
-            _row(f"continuous_extension[{j}][{i}]", row, num_stages)
-            for i, row in enumerate(
-                _entries(
-                    f"continuous_extension[{j}]", powers, "a sequence of rows, one for each power"
-                )
-            )
-        )
-        for j, powers in enumerate(
-            _entries("continuous_extension", value, "a sequence with one entry for each flow")
-        )
-    )
-
-
-def _check_end(where: str, continuous_extension: ContinuousExtension, beta: Product) -> None:
-    for k in range(len(beta[0])):
-        entries = [row[k] for powers in continuous_extension for row in powers]
-        end = [row[k] for row in beta]
-        if abs(_sum(entries) - _sum(end)) > _sum(map(uncertainty, entries + end)):
-            raise ValueError(
-                f"{where} must lead to the end of the step: its coefficients of stage {k} sum to "
-                f"{_rounded_sum(entries)}, and those of beta to {_rounded_sum(end)}."
-            )
-
-
-def _coefficient(where: str, value: Any) -> Coefficient:
-    if isinstance(value, Fraction):
-        return value
-    if isinstance(value, Integral) and not isinstance(value, bool):
-        return Fraction(int(value))
-    if isinstance(value, Real) and not isinstance(value, bool):
-        number = float(value)
-        if not math.isfinite(number):
-            raise ValueError(f"{where} must be finite, got {value}.")
-        if number == value:
-            # Arrays of floats write "not used" as 0.0, which is exact.
-            return number if number else Fraction(0)
-    raise TypeError(
-        f"{where} must be an int, a Fraction or a float, got {value!r} of type "
-        f"{_type_name(value)}. Coefficients are static numbers, never traced arrays."
-    )
-
-
-def _type_name(value: Any) -> str:
-    return type(value).__name__
-
-
-def _sum(terms: Iterable[Coefficient]) -> Fraction:
-    return sum((Fraction(a) for a in terms), Fraction(0))
-
-
-def _rounded_sum(terms: list[Coefficient]) -> Coefficient:
-    return _sum(terms) if all(isinstance(a, Fraction) for a in terms) else float(_sum(terms))
 
 
 def _show_product(rows: Product) -> str:
@@ -348,7 +232,7 @@ def third_order_b(alpha: int | Fraction | float) -> Tableau:
 
 
 def _parameter(value: Any, excluded: dict[Fraction, str]) -> Fraction:
-    number = _coefficient("alpha", value)
+    number = checked_coefficient("alpha", value)
     for singular, denominator in excluded.items():
         # The float nearest to 1/3 stands for 1/3.
         if number == (singular if isinstance(number, Fraction) else float(singular)):
@@ -361,7 +245,7 @@ def _parameter(value: Any, excluded: dict[Fraction, str]) -> Fraction:
 
 def _family(parameter: Any, alpha: list[Any], beta: list[Any]) -> Tableau:
     """Rounds, where the parameter is a float, once and at the end."""
-    if isinstance(_coefficient("alpha", parameter), Fraction):
+    if isinstance(checked_coefficient("alpha", parameter), Fraction):
         return Tableau(alpha, beta)
 
     def rounded(rows: list[list[Fraction]]) -> list[list[float]]:

@@ -21,8 +21,9 @@ import pytest
 from jax.experimental import io_callback
 
 import cfjax
-from cfjax._batch import batch as _batch
 from cfjax._batch import fingerprint as _fingerprint
+from cfjax._batch.program import Program
+from cfjax._batch.store import Store
 
 TERM = cfjax.LieTerm(problems.rigid_body)
 SIZE, CHUNK = 23, 5  # A last chunk of three.
@@ -42,13 +43,13 @@ def members(size=SIZE):
 def computed(monkeypatch):
     """The chunks that are computed, by the first entry of their members."""
     calls = []
-    call = _batch._Program.__call__
+    call = Program.__call__
 
     def counted(self, inputs):
         calls.append(float(inputs[0].flat[0]))
         return call(self, inputs)
 
-    monkeypatch.setattr(_batch._Program, "__call__", counted)
+    monkeypatch.setattr(Program, "__call__", counted)
     return calls
 
 
@@ -210,7 +211,7 @@ def test_what_is_finished_is_read_and_not_computed_again(tmp_path, computed):
 
 
 def test_an_interrupted_batch_goes_on_where_it_stopped(tmp_path, computed, monkeypatch):
-    write = _batch._Store.write
+    write = Store.write
 
     def interrupted(self, number, inputs, outputs):
         if number == 2:
@@ -218,7 +219,7 @@ def test_an_interrupted_batch_goes_on_where_it_stopped(tmp_path, computed, monke
         write(self, number, inputs, outputs)
 
     with monkeypatch.context() as patch, pytest.raises(KeyboardInterrupt):
-        patch.setattr(_batch._Store, "write", interrupted)
+        patch.setattr(Store, "write", interrupted)
         cfjax.map_batch(solve, members(), chunk_size=CHUNK, folder=tmp_path)
     chunks = ["chunk_000000.bin", "chunk_000001.bin"]
     assert sorted(os.listdir(tmp_path)) == ["batch.json", *chunks]
@@ -255,8 +256,8 @@ def test_a_damaged_file_is_computed_again(tmp_path, computed):
 
 def test_no_damage_is_taken_for_results(tmp_path):
     x = np.arange(3.0)
-    program = _batch._Program(lambda x: (x, x > 1), x, 3, None)
-    store = _batch._Store(tmp_path, program, 3)
+    program = Program(lambda x: (x, x > 1), x, 3, None)
+    store = Store(tmp_path, program, 3)
     outputs = program([x])
     store.write(0, [x], outputs)
     path = tmp_path / "chunk_000000.bin"
@@ -297,7 +298,7 @@ def test_what_is_read_needs_no_compilation(tmp_path, monkeypatch):
         return cfjax.map_batch(lambda x: 2 * x, np.arange(3), folder=tmp_path).values
 
     first = read_or_compute()
-    monkeypatch.setattr(_batch._Program, "run", None)
+    monkeypatch.setattr(Program, "run", None)
     np.testing.assert_array_equal(read_or_compute(), first)
 
 
@@ -336,8 +337,8 @@ cfjax.map_batch(lambda x: x, np.ones(3, np.float32), folder=sys.argv[1])
 
 def test_another_process_writes_the_same_chunk_at_the_same_time(tmp_path, monkeypatch):
     x = np.arange(3.0)
-    program = _batch._Program(lambda x: 2 * x, x, 3, None)
-    store = _batch._Store(tmp_path, program, 3)
+    program = Program(lambda x: 2 * x, x, 3, None)
+    store = Store(tmp_path, program, 3)
     sync, others = os.fsync, [store]
 
     def other_comes_between(descriptor):
@@ -559,7 +560,7 @@ SOLVES = {
 
 
 def key(solve):
-    return _batch._Program(solve, np.ones((4, 3)), 4, None).fingerprint()
+    return Program(solve, np.ones((4, 3)), 4, None).fingerprint()
 
 
 @pytest.mark.representatives(3)
@@ -641,7 +642,7 @@ def test_a_key_knows_versions_precision_device_and_mesh(monkeypatch, no_shape_ho
     keys = [key(solve)]
     with jax.default_matmul_precision("highest"):
         keys.append(key(solve))
-    program = _batch._Program(solve, np.ones((4, 3)), 4, jax.make_mesh((1,), ("i",)))
+    program = Program(solve, np.ones((4, 3)), 4, jax.make_mesh((1,), ("i",)))
     keys.append(program.fingerprint())
     for module in (cfjax, jax, _fingerprint.jaxlib.version):
         with monkeypatch.context() as patch:

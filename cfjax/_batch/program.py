@@ -1,0 +1,113 @@
+"""The solve of one chunk of a batch, compiled."""
+
+import functools
+from collections.abc import Callable, Sequence
+from typing import Any, NamedTuple
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import jax.tree_util as jtu
+import numpy as np
+from jax.experimental import multihost_utils
+from jax.sharding import Mesh, NamedSharding, PartitionSpec
+from jaxtyping import Array, PyTree
+
+from .fingerprint import environment, fingerprint
+
+
+class Structure(NamedTuple):
+    """That of a pytree of arrays, whose leaves are kept apart, and PRNG keys as their numbers."""
+
+    treedef: Any
+    kinds: list[Any]  # For each leaf, what kind of PRNG key it is, or None.
+
+    @classmethod
+    def of(cls, tree: PyTree) -> tuple["Structure", list[Any]]:
+        leaves, treedef = jtu.tree_flatten(tree)
+        kinds = [jax.random.key_impl(a) if _is_key(a) else None for a in leaves]
+        return cls(treedef, kinds), [jax.random.key_data(a) if _is_key(a) else a for a in leaves]
+
+    def tree(self, leaves: Sequence[Any]) -> PyTree:
+        return self.treedef.unflatten(
+            a if kind is None else jax.random.wrap_key_data(a, impl=kind)
+            for a, kind in zip(leaves, self.kinds, strict=True)
+        )
+
+
+def _is_key(leaf: Any) -> bool:
+    return isinstance(leaf, jax.Array) and jnp.issubdtype(leaf.dtype, jax.dtypes.prng_key)
+
+
+class Program:
+    """The compiled solve of one chunk."""
+
+    def __init__(
+        self,
+        solve: Callable[[PyTree], PyTree],
+        members: PyTree,
+        chunk_size: int,
+        mesh: Mesh | None,
+    ):
+        structure, leaves = Structure.of(members)
+        self.chunk_size = chunk_size
+        # An array on a device is small enough for the host; a memory map stays where it is.
+        self.members = [np.asarray(a) if isinstance(a, jax.Array) else a for a in leaves]
+        # In the order of bytes of this machine, whatever that of a file is.
+        native = [a.dtype.newbyteorder("=") for a in leaves]
+        self.dtypes = [jax.dtypes.canonicalize_dtype(dtype) for dtype in native]
+        self.mesh, self.sharding = mesh, None
+        if mesh is not None:
+            self.sharding = NamedSharding(mesh, PartitionSpec(mesh.axis_names))
+        found: dict[str, Any] = {}
+
+        def one(member: list[Array]) -> list[Array]:
+            value = solve(structure.tree(member))
+            arrays, found["static"] = eqx.partition(value, eqx.is_array_like)
+            found["structure"], leaves = Structure.of(arrays)
+            return [jnp.asarray(a) for a in leaves]
+
+        shapes = [
+            jax.ShapeDtypeStruct((chunk_size, *a.shape[1:]), dtype)
+            for a, dtype in zip(leaves, self.dtypes, strict=True)
+        ]
+        run = jax.jit(jax.vmap(one), in_shardings=self.sharding, out_shardings=self.sharding)
+        self.traced = run.trace(shapes)
+        self.lowered = self.traced.lower()
+        self.outputs = jtu.tree_leaves(self.traced.out_info)
+        self.static, self.structure = found["static"], found["structure"]
+
+    @functools.cached_property
+    def run(self) -> jax.stages.Compiled:
+        # Where all chunks are read, nothing is compiled.
+        return self.lowered.compile()
+
+    @property
+    def environment(self) -> dict[str, Any]:
+        devices = jnp.zeros(()).devices() if self.mesh is None else self.mesh.devices.flat
+        return environment(devices)
+
+    def fingerprint(self) -> bytes:
+        return fingerprint(self.traced, self.lowered, self.environment)
+
+    def inputs(self, start: int, stop: int) -> list[np.ndarray]:
+        """The members of one chunk. The last chunk repeats its last member until it is full."""
+        index = np.minimum(np.arange(start, start + self.chunk_size), stop - 1)
+        return [
+            np.asarray(a[index], dtype) for a, dtype in zip(self.members, self.dtypes, strict=True)
+        ]
+
+    def __call__(self, inputs: Sequence[np.ndarray]) -> list[np.ndarray]:
+        if self.sharding is None:
+            return [np.asarray(a) for a in self.run(list(inputs))]
+        placed = [
+            jax.make_array_from_callback(a.shape, self.sharding, lambda index, a=a: a[index])
+            for a in inputs
+        ]
+        outputs = self.run(placed)
+        if jax.process_count() > 1:
+            outputs = multihost_utils.process_allgather(outputs, tiled=True)
+        return [np.asarray(a) for a in outputs]
+
+    def combine(self, arrays: list[np.ndarray]) -> PyTree:
+        return eqx.combine(self.structure.tree(arrays), self.static)

@@ -1,0 +1,153 @@
+"""What `work_precision` returns: the table and the chart."""
+
+import csv
+import os
+from typing import TYPE_CHECKING, NamedTuple
+
+import numpy as np
+from jaxtyping import Float
+
+from .extra import paper_extra
+
+if TYPE_CHECKING:
+    import matplotlib.figure
+    import rich.table
+
+
+class WorkPrecision(NamedTuple):
+    """What each method costs and how far it is off: one row for each method and setting.
+
+    NaN stands for what is not known. Rows of runs that failed have NaN as `error` and `seconds`.
+
+    **Fields:**
+
+    - `method`: the method's name.
+    - `tolerance`: of an adaptive run, otherwise NaN.
+    - `error`: the distance of the final state from the reference.
+    - `num_steps`, `num_rejected`: attempted steps, and those among them that were rejected.
+    - `num_evaluations`: evaluations of the field, in all attempted steps. NaN for implicit
+      methods, where steps differ.
+    - `num_flows`: flows of frozen fields in all attempted steps. A state of several parts moves in
+      one flow; a translation does not count.
+    - `flops`: floating-point operations of all attempted steps, as traced. NaN where a step has an
+      operation without a rule. The step size controller's own are not in it.
+    - `compile_seconds`: time to trace and compile the solve. One program serves all settings of a
+      method.
+    - `seconds`: the time of every repeated run, without the first. Its minimum is the figure to
+      compare.
+    - `note`: why a run failed, otherwise empty.
+    """
+
+    method: tuple[str, ...]
+    tolerance: Float[np.ndarray, " rows"]
+    error: Float[np.ndarray, " rows"]
+    num_steps: Float[np.ndarray, " rows"]
+    num_rejected: Float[np.ndarray, " rows"]
+    num_evaluations: Float[np.ndarray, " rows"]
+    num_flows: Float[np.ndarray, " rows"]
+    flops: Float[np.ndarray, " rows"]
+    compile_seconds: Float[np.ndarray, " rows"]
+    seconds: Float[np.ndarray, "rows repeats"]
+    note: tuple[str, ...]
+
+    def select(self, method: str) -> "WorkPrecision":
+        """The rows of one method.
+
+        **Raises** `KeyError` if there are none.
+        """
+        if method not in self.method:
+            raise KeyError(f"method must be one of {list(dict.fromkeys(self.method))}: {method!r}")
+        rows = [i for i, name in enumerate(self.method) if name == method]
+        columns = self._asdict()
+        for name, column in columns.items():
+            is_array = isinstance(column, np.ndarray)
+            columns[name] = column[rows] if is_array else tuple(column[i] for i in rows)
+        return WorkPrecision(**columns)
+
+    def plot(self, figure: "matplotlib.figure.Figure | None" = None) -> "matplotlib.figure.Figure":
+        """The chart: error against time, and beside it against flops. Needs `cfjax[paper]`.
+
+        A mark is the fastest run; its bar reaches to the upper quartile. Where no flops are known
+        of any method, the second panel shows evaluations of the field. Draws into `figure` if there
+        is one.
+
+        **Raises** `ModuleNotFoundError` without matplotlib and rich, and `TypeError` if `figure` is
+        none.
+        """
+        with paper_extra():
+            from matplotlib.figure import FigureBase
+
+            from . import style as _style
+        if figure is not None and not isinstance(figure, FigureBase):
+            raise TypeError(f"figure must be a matplotlib figure, got {figure!r}.")
+        figure = _style.new_figure((7.0, 4.2)) if figure is None else figure
+        left, right = figure.subplots(1, 2, sharey=True)
+        counts_flops = bool(np.any(np.isfinite(self.flops)))
+        work = self.flops if counts_flops else self.num_evaluations
+        names = dict.fromkeys(self.method)
+        unknown = []
+        for name, style in _style.styles(names).items():
+            rows = np.array(self.method) == name
+            best, upper = np.percentile(self.seconds[rows], (0, 75), axis=-1)
+            # Lists: matplotlib before 3.11 takes an array of one entry for a number.
+            spread = np.zeros_like(best).tolist(), (upper - best).tolist()
+            left.errorbar(best, self.error[rows], xerr=spread, capsize=3, label=name, **style)
+            right.plot(work[rows], self.error[rows], **style)
+            if not np.any(np.isfinite(work[rows])):
+                unknown.append(name)
+        left.set(yscale="log", ylabel="error of the final state")
+        _style.logarithmic(left, "time", unit="s")
+        label = "flops" if counts_flops else "evaluations of the field"
+        _style.logarithmic(right, label + (f" (not known: {', '.join(unknown)})" * bool(unknown)))
+        figure.align_xlabels()
+        _style.finish(figure, 4)
+        return figure
+
+    def table(self) -> "rich.table.Table":
+        """The table for a terminal, with the notes below. Needs `cfjax[paper]`.
+
+        Beside the fastest run stands how much longer the upper quartile took.
+
+        **Raises** `ModuleNotFoundError` without rich.
+        """
+        with paper_extra():
+            from rich import box
+            from rich.table import Table
+
+        is_adaptive = bool(np.any(np.isfinite(self.tolerance)))
+        headings = ["error", "steps", "evals", "flows", "flops", "compile\n(s)", "time\n(ms)"]
+        if is_adaptive:
+            headings = ["tol", *headings[:2], "rejected", *headings[2:]]
+        failed = [i for i, note in enumerate(self.note) if note]
+        settings = self.tolerance if is_adaptive else self.num_steps
+        notes = [f"{self.method[i]}, {settings[i]:g}: {self.note[i]}" for i in failed]
+        table = Table(box=box.SIMPLE_HEAD, padding=0, caption="\n".join(notes) or None)
+        table.add_column("method", no_wrap=True)
+        for heading in headings:
+            table.add_column(heading, justify="right", no_wrap=True)
+        best, upper = np.percentile(self.seconds, (0, 75), axis=-1)
+        for i, name in enumerate(self.method):
+            cells = [f"{self.error[i]:.1e}", f"{self.num_steps[i]:.0f}"]
+            if is_adaptive:
+                cells = [f"{self.tolerance[i]:.0e}", *cells, f"{self.num_rejected[i]:.0f}"]
+            cells += [f"{count:.6g}" for count in (self.num_evaluations[i], self.num_flows[i])]
+            cells.append(f"{self.flops[i]:.2e}")
+            cells += [f"{self.compile_seconds[i]:.2f}", f"{1e3 * best[i]:.3g}"]
+            if not self.note[i]:
+                cells[-1] += f" +{upper[i] / best[i] - 1:.0%}"
+            last = i + 1 == len(self.method) or self.method[i + 1] != name
+            table.add_row(name, *cells, end_section=last)
+        return table
+
+    def to_csv(self, path: str | os.PathLike[str]) -> None:
+        """Writes the table as CSV. The times are the minimum and the three quartiles."""
+        names = [name for name in self._fields if name not in ("seconds", "note")]
+        times = np.percentile(self.seconds, (0, 25, 50, 75), axis=-1).T
+        quartiles = [f"seconds_{name}" for name in ("min", "quartile_1", "median", "quartile_3")]
+        with open(path, "w", newline="", encoding="utf-8") as file:
+            writer = csv.writer(file)
+            writer.writerow([*names, *quartiles, "note"])
+            for i, note in enumerate(self.note):
+                values = [getattr(self, name)[i] for name in names[1:]]
+                cells = [f"{value:.17g}" for value in (*values, *times[i])]
+                writer.writerow([self.method[i], *cells, note])
