@@ -187,7 +187,7 @@ OF_BOTH = [
 
 @pytest.mark.representatives(1)
 @pytest.mark.parametrize("dtype", DTYPES)
-@pytest.mark.parametrize("n", [3, 5, 1, 8])
+@pytest.mark.parametrize("n", [5, 3, 1, 8])
 def test_accuracy_of_both(n, dtype):
     batch = np.stack([of_norm(kind, n, norm, k, dtype) for k, (kind, norm) in enumerate(OF_BOTH)])
     found = mapped(batch)
