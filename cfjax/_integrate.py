@@ -173,6 +173,8 @@ def equal_steps(
         f"steps the times do not differ in {t0.dtype}. Take fewer steps, shift the times towards "
         "zero, or make y0 float64.",
     )
+    is_static = isinstance(num_steps, int)
+    length = num_steps if is_static else jnp.where(fault.number == 0, num_steps, 0)
     zero = (fault.error if throw else fault.nan)(jnp.zeros((), t0.dtype))
     start, t1 = needing(zero, (y0, t1))
     carry = (n, start, solver_state, diffrax.RESULTS.successful)
@@ -192,7 +194,7 @@ def equal_steps(
         return repeat(step, carry, rest, order=order)[0]
 
     def steps_and_save(carry, _):
-        carry = advance(carry, num_steps if save_every is None else save_every)
+        carry = advance(carry, length if save_every is None else save_every)
         return carry, carry[1]
 
     num_saves: Any = 1 if save_every is None else num_steps // save_every

@@ -7,6 +7,10 @@ import mpmath
 import numpy as np
 
 DTYPES = [np.float32, np.float64, np.complex64, np.complex128]
+# The largest norms of which `expm` has a polynomial: beyond the last one it squares.
+THETA = {"float32": (2.346,), "float64": (0.6764, 1.687)}
+# A small rotation, and a million metres in the fixed frame.
+POSE = np.array([[0.0, -0.3, 1e6], [0.3, 0.0, -2e6], [0.0, 0.0, 0.0]])
 
 
 def random(shape, seed=0, dtype: type = np.float64):
@@ -30,6 +34,25 @@ def of_norm(kind, n, norm, seed=0, dtype: type = np.float64):
         a = np.kron(np.eye((n + 1) // 2), [[1.0, 1.0], [0.0, 1.0]])[:n, :n].astype(dtype)
     size = np.linalg.norm(a, 2)
     return (a / size * norm if size > 0 else a).astype(dtype)
+
+
+def small(kind, n, norm, seed=0, dtype: type = complex):
+    """A matrix of size 2 or 3 with the given 2-norm, of some kinds more."""
+    if kind == "meet":  # Two eigenvalues are equal.
+        q = np.linalg.qr(random((n, n), seed, dtype))[0]
+        unit = 1j if np.issubdtype(dtype, np.complexfloating) else 1
+        a = q @ np.diag(unit * np.array([1, 1, -2][:n])) @ q.conj().T
+        return (a * (norm / np.linalg.norm(a, 2))).astype(dtype)
+    if kind == "phase":  # Nearly a multiple of the identity.
+        return (of_norm("meet", n, 1e-3 * norm, seed, dtype) + norm * np.eye(n)).astype(dtype)
+    if kind == "negative":  # An eigenvalue zero, or exp underflows for a large norm.
+        half = random((n, n), seed, dtype)[:, 1:]
+        a = -half @ half.conj().T
+        return (a * (norm / np.linalg.norm(a, 2))).astype(dtype)
+    if kind == "cycle":  # The largest entries are not opposite to each other.
+        a = np.roll(np.eye(n), 1, axis=0) + 0.1 * random((n, n), seed, dtype)
+        return (a * (norm / np.linalg.norm(a, 2))).astype(dtype)
+    return of_norm(kind, n, norm, seed, dtype)
 
 
 def exact_expm(a):

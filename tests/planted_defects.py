@@ -171,7 +171,7 @@ DEFECTS = [
         "(*spec[:axis], None, *spec[axis:])",
         "(None, *spec)",
         "entries of a batch spread along another axis than the batch",
-        "test_sharding.py",
+        "xla/test_pack.py -k mesh",
     ),
     Defect(
         "_solvers/base.py",
@@ -418,14 +418,14 @@ DEFECTS = [
         "return (s == 0).astype(a.dtype), p, m",
         "return (s == 0).astype(a.dtype), p, p",
         "exp(-a) with the even and odd part of exp(a)",
-        "numerics/test_expm_both.py -k accuracy",
+        "numerics/test_exponentials.py -k accuracy_of_both",
     ),
     Defect(
         "_numerics/expm_source.py",
         "g + small_product(small_product(e, g), _adjoint(e))",
         "g + small_product(small_product(e, g), e)",
         "a source doubled without the conjugate transpose",
-        "numerics/test_expm_source.py -k accuracy",
+        "numerics/test_exponentials.py -k with_a_source",
     ),
     Defect(
         "_numerics/expm.py",
@@ -446,7 +446,7 @@ DEFECTS = [
         "x if (len(c) - j) % 2 == 0 else -x",
         "-x",
         "the characteristic polynomial of -a",
-        "numerics/test_cayley_hamilton.py -k both",
+        "numerics/test_exponentials.py -k both_of_sizes",
     ),
     Defect(
         "_numerics/phi_1_times.py",
@@ -460,7 +460,7 @@ DEFECTS = [
         "new + _by_real(before, lambda x: of_before * x), last",
         "new - _by_real(before, lambda x: of_before * x), last",
         "Chebyshev's recurrence for a real interval instead of an imaginary one",
-        "numerics/test_expm_multiply.py",
+        "numerics/test_kernels.py -k exponentials",
     ),
     Defect(
         "_fields/operator_sum.py",
@@ -481,7 +481,7 @@ DEFECTS = [
         "lax.cond(k < length, saved,",
         "lax.cond(k <= length, saved,",
         "a loop that is too long where it is differentiated",
-        "numerics/test_loop.py",
+        "numerics/test_kernels.py -k powers",
     ),
     Defect(
         "_numerics/phi.py",

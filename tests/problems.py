@@ -230,3 +230,23 @@ def random_like(tree: Any, seed: int) -> Any:
     """A fixed random direction, shaped like `tree`."""
     rng = np.random.default_rng(seed)
     return jtu.tree_map(lambda x: jnp.asarray(rng.standard_normal(jnp.shape(x))), tree)
+
+
+# Squares of angles, on both sides of what formulas of sines and cosines decide by: half turns,
+# and 16.
+SQUARES_OF_ANGLES = [
+    0.0,
+    1e-300,
+    1e-160,
+    1e-30,
+    1e-8,
+    1e-3,
+    1.0,
+    *(k**2 * np.pi**2 * (1 + d) for k in (1, 2, 3, 4) for d in (-1e-9, 0.0, 1e-9)),
+    np.nextafter(16.0, 0.0),
+    16.0,
+    np.nextafter(16.0, 20.0),
+    40.0,
+    110.0,
+    1e4,
+]

@@ -14,7 +14,6 @@ import problems
 import pytest
 
 import cfjax
-from cfjax import _integrate
 
 Y0 = jnp.asarray(problems.MOMENTUM)
 ARGS = jnp.asarray(problems.INERTIA)
@@ -520,21 +519,21 @@ def test_more_steps_than_can_be_counted_in_the_dtype_of_the_times(num_steps):
 
 
 def test_more_traced_steps_than_can_be_counted():
-    """`work_precision` traces the number of steps."""
-
-    @eqx.filter_jit
-    def end(num_steps):
-        time = jnp.zeros((), np.float32)
-        solution, _ = _integrate.equal_steps(
-            TERM, cfjax.LieEuler(), time - 1, time + 1, Y0_SINGLE, ARGS_SINGLE, num_steps,
-            None, False, None, throw=True,
-        )  # fmt: skip
-        return solution.ys
-
-    assert np.isfinite(end(jnp.asarray(3))).all()
-    with pytest.raises(eqx.EquinoxRuntimeError, match="num_steps must leave each step longer"):
-        # Not run: the error comes before the first step.
-        jax.block_until_ready(end(jnp.asarray(2**24 + 2)))
+    """`work_precision` traces the number of steps. It does not run those that are too many."""
+    work = cfjax.work_precision(
+        TERM,
+        -1.0,
+        1.0,
+        Y0_SINGLE,
+        ARGS_SINGLE,
+        methods={"LieEuler": cfjax.LieEuler()},
+        reference=Y0_SINGLE,
+        num_steps=[3, 2**24 + 2],
+        repeats=1,
+    )
+    assert np.isfinite(work.error[0]) and not work.note[0]
+    assert work.note[1].startswith("num_steps must leave each step longer")
+    assert np.isnan(work.error[1])
 
 
 @pytest.mark.parametrize("dtype", [np.float32, np.float64])

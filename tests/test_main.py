@@ -5,19 +5,26 @@ import os
 import signal
 import subprocess
 import sys
-from typing import Any
+from pathlib import Path
 
 import jax
 import jax.tree_util as jtu
 import numpy as np
 import pytest
 from matplotlib.figure import Figure
-from rich.progress import Progress
 
 import cfjax
-from cfjax import __main__, scenes
+from cfjax import scenes
 from cfjax.__main__ import main
-from cfjax._measure import report as _report
+
+SCENES = {name: module for name, module in vars(scenes).items() if hasattr(module, "problem")}
+# A scene may have several charts: `scenes.stiefel.chart_first` is that of stiefel_first.
+CHARTS = {
+    scene + name.removeprefix("chart"): function
+    for scene, module in SCENES.items()
+    for name, function in vars(module).items()
+    if name == "chart" or name.startswith("chart_")
+}
 
 
 @pytest.fixture
@@ -36,6 +43,20 @@ def short(monkeypatch):
 def blank(monkeypatch):
     """A picture that takes no time; those of the scenes have their own tests."""
     monkeypatch.setattr(scenes.rigid_body, "picture", Figure)
+
+
+@pytest.fixture
+def figures(monkeypatch):
+    """By file, the figures that are written."""
+    found = {}
+    savefig = Figure.savefig
+
+    def seen(self, path, **options):
+        found[Path(path).name] = self
+        savefig(self, path, **options)
+
+    monkeypatch.setattr(Figure, "savefig", seen)
+    return found
 
 
 def test_files_and_table(short, blank, tmp_path, capsys):
@@ -68,16 +89,20 @@ def test_files_and_table(short, blank, tmp_path, capsys):
     assert (output / "rigid_body.csv").read_text() != "old"
 
 
-def test_every_chart_says_what_it_shows():
-    assert "rigid_body" in __main__._CHARTS
-    for name, chart in __main__._CHARTS.items():
+def test_every_chart_says_what_it_shows(capsys):
+    assert "rigid_body" in CHARTS
+    with pytest.raises(SystemExit):
+        main(["chart", "no such chart"])
+    listed = capsys.readouterr().err.partition("choose from ")[2].rstrip(")\n")
+    assert listed.replace("'", "").split(", ") == list(CHARTS)
+    for name, chart in CHARTS.items():
         assert chart.__doc__ and len(chart.__doc__.splitlines()[0]) > 10, name
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("name", [name for name in __main__._CHARTS if name != "rigid_body"])
+@pytest.mark.parametrize("name", [name for name in CHARTS if name != "rigid_body"])
 def test_charts_of_the_other_scenes(name, monkeypatch):
-    module = sys.modules[__main__._CHARTS[name].__module__]
+    module = sys.modules[CHARTS[name].__module__]
     original = module.work_precision
 
     def work_precision(*args, methods, num_steps=None, tolerances=None, **options):
@@ -88,7 +113,7 @@ def test_charts_of_the_other_scenes(name, monkeypatch):
         return original(*args, methods=some, **(options | settings))
 
     monkeypatch.setattr(module, "work_precision", work_precision)
-    work = __main__._CHARTS[name](budget=0.1)
+    work = CHARTS[name](budget=0.1)
     # One halving of the step divides the error by 16 at order 4. With tolerances the estimate is of
     # order 3, so the step goes with their third root and the error with their power 4/3: divided by
     # 464 for two powers of ten, and by less where the order is not reached.
@@ -96,13 +121,13 @@ def test_charts_of_the_other_scenes(name, monkeypatch):
     assert work.error[1] < 1e-3
 
 
-def test_the_chart_says_what_is_not_known(short):
-    with Progress(disable=True) as progress:
-        report = _report.chart("rigid_body", scenes.rigid_body.chart, 0.1, progress)
-    (caption,) = (text.get_text() for text in report.figures["rigid_body"].texts)
+def test_the_chart_says_what_is_not_known(short, blank, figures, tmp_path):
+    assert main(["chart", "rigid_body", "--output", str(tmp_path), "--budget", "0.1"]) == 0
+    chart = figures["rigid_body.png"]
+    (caption,) = (text.get_text() for text in chart.texts)
     assert "rigid body" in caption
     # Without flops of any method, evaluations take their place, and they are known.
-    _, right = report.figures["rigid_body"].axes
+    _, right = chart.axes
     assert right.get_xlabel() == "evaluations of the field"
 
 
@@ -121,8 +146,8 @@ main(["chart", "rigid_body"])
 def test_the_list_of_scenes(capsys):
     assert main([]) == 0
     listed = capsys.readouterr().out.partition("scenes:\n")[2].splitlines()
-    assert [line.split()[0] for line in listed] == list(__main__._SCENES)
-    for line, module in zip(listed, __main__._SCENES.values(), strict=True):
+    assert [line.split()[0] for line in listed] == list(SCENES)
+    for line, module in zip(listed, SCENES.values(), strict=True):
         assert module.__doc__.startswith(" ".join(line.split()[1:]) + "\n")
 
 
@@ -152,9 +177,9 @@ TO_ITS_ORDER = {
 
 
 @pytest.mark.representatives(1)
-@pytest.mark.parametrize("name", __main__._SCENES)
+@pytest.mark.parametrize("name", SCENES)
 def test_every_scene_keeps_its_invariants(name):
-    module = __main__._SCENES[name]
+    module = SCENES[name]
     problem = module.problem()
     args = problem.get("args")
     n = 1600 if name == "heavy_top" else 800 if name == "rigid_body" else 200
@@ -183,21 +208,18 @@ def test_every_scene_keeps_its_invariants(name):
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("name", __main__._SCENES)
-def test_every_scene_can_be_run(name, monkeypatch):
-    """With its own numbers, but few steps and no picture."""
-    module = __main__._SCENES[name]
+@pytest.mark.parametrize("name", SCENES)
+def test_every_scene_can_be_run(name, monkeypatch, tmp_path, capsys):
+    """With its own numbers, but no picture."""
+    module = SCENES[name]
     assert callable(module.picture)
     monkeypatch.setattr(module, "picture", Figure)
-    with Progress(disable=True) as progress:
-        # Enough for the steps to be stable.
-        num_steps = 10 if name == "wilson_flow" else 200
-        report = _report.scene(
-            name, module, progress, num_steps=num_steps, num_saves=2, budget=0.01
-        )
-    assert list(report.figures) == [f"{name}_picture"]
-    table: Any = report.printed[1]
-    assert table.row_count > 0
+    # Wide enough for every label.
+    monkeypatch.setenv("COLUMNS", "200")
+    assert main(["scene", name, "--output", str(tmp_path)]) == 0
+    assert sorted(os.listdir(tmp_path)) == [f"{name}_picture.pdf", f"{name}_picture.png"]
+    table = capsys.readouterr().out.partition("largest change")[2].partition("Compiled in")[0]
+    assert any(line.strip(" ─") for line in table.splitlines())
 
 
 @pytest.mark.parametrize(
@@ -319,8 +341,6 @@ def test_files_are_written_whole_or_not_at_all(start, tmp_path):
     code = """
 import sys, time
 from pathlib import Path
-from cfjax import _signals
-from cfjax._measure import report as _report
 
 class Figure:
     def savefig(self, path, dpi):
@@ -328,13 +348,30 @@ class Figure:
         print("writing", flush=True)
         time.sleep(0.5)
 
-_signals.end_the_command()
-_report.run(Path(sys.argv[1]), [lambda progress: _report.Report([], {"slow": Figure()})], "Wait.")
+sys.argv[0] = "cfjax"
+from cfjax import scenes
+from cfjax.__main__ import main
+scenes.rigid_body.picture = Figure
+main(["scene", "rigid_body", "--output", sys.argv[1]])
 time.sleep(60)
 """
     process = start("-c", code, str(tmp_path))
     read_until(process.stdout, "writing")
     process.send_signal(signal.SIGTERM)
     assert process.wait() == 143
-    assert process.stderr.read() == "Wait.\ncfjax: terminated\n"
-    assert sorted(os.listdir(tmp_path)) == ["slow.pdf", "slow.png"]
+    waits, end = process.stderr.read().splitlines()
+    assert waits.startswith("Takes") and end == "cfjax: terminated"
+    assert sorted(os.listdir(tmp_path)) == ["rigid_body_picture.pdf", "rigid_body_picture.png"]
+
+
+def test_a_failure_keeps_the_old_files(tmp_path, monkeypatch):
+    (tmp_path / "rigid_body_picture.png").write_bytes(b"old")
+
+    def fail():
+        raise RuntimeError("no picture today")
+
+    monkeypatch.setattr(scenes.rigid_body, "picture", fail)
+    with pytest.raises(RuntimeError, match="no picture today"):
+        main(["scene", "rigid_body", "--output", str(tmp_path)])
+    assert os.listdir(tmp_path) == ["rigid_body_picture.png"]
+    assert (tmp_path / "rigid_body_picture.png").read_bytes() == b"old"

@@ -7,12 +7,14 @@ import socket
 import stat
 import subprocess
 import sys
+import tempfile
 from pathlib import Path
 
 import diffrax
 import equinox as eqx
 import jax
 import jax.numpy as jnp
+import jaxlib.version
 import lineax
 import ml_dtypes
 import numpy as np
@@ -21,9 +23,6 @@ import pytest
 from jax.experimental import io_callback
 
 import cfjax
-from cfjax._batch import fingerprint as _fingerprint
-from cfjax._batch.program import Program
-from cfjax._batch.store import Store
 
 TERM = cfjax.LieTerm(problems.rigid_body)
 SIZE, CHUNK = 23, 5  # A last chunk of three.
@@ -43,13 +42,13 @@ def members(size=SIZE):
 def computed(monkeypatch):
     """The chunks that are computed, by the first entry of their members."""
     calls = []
-    call = Program.__call__
+    call = jax.stages.Compiled.__call__
 
     def counted(self, inputs):
-        calls.append(float(inputs[0].flat[0]))
+        calls.append(float(np.asarray(inputs[0]).flat[0]))
         return call(self, inputs)
 
-    monkeypatch.setattr(Program, "__call__", counted)
+    monkeypatch.setattr(jax.stages.Compiled, "__call__", counted)
     return calls
 
 
@@ -211,15 +210,15 @@ def test_what_is_finished_is_read_and_not_computed_again(tmp_path, computed):
 
 
 def test_an_interrupted_batch_goes_on_where_it_stopped(tmp_path, computed, monkeypatch):
-    write = Store.write
+    replace = os.replace
 
-    def interrupted(self, number, inputs, outputs):
-        if number == 2:
+    def interrupted(old, new):
+        if Path(new).name == "chunk_000002.bin":
             raise KeyboardInterrupt
-        write(self, number, inputs, outputs)
+        replace(old, new)
 
     with monkeypatch.context() as patch, pytest.raises(KeyboardInterrupt):
-        patch.setattr(Store, "write", interrupted)
+        patch.setattr(os, "replace", interrupted)
         cfjax.map_batch(solve, members(), chunk_size=CHUNK, folder=tmp_path)
     chunks = ["chunk_000000.bin", "chunk_000001.bin"]
     assert sorted(os.listdir(tmp_path)) == ["batch.json", *chunks]
@@ -254,35 +253,56 @@ def test_a_damaged_file_is_computed_again(tmp_path, computed):
     assert len(computed) == 1
 
 
-def test_no_damage_is_taken_for_results(tmp_path):
-    x = np.arange(3.0)
-    program = Program(lambda x: (x, x > 1), x, 3, None)
-    store = Store(tmp_path, program, 3)
-    outputs = program([x])
-    store.write(0, [x], outputs)
-    path = tmp_path / "chunk_000000.bin"
-    content = path.read_bytes()
-    damaged = [content[:length] for length in range(len(content))]
-    damaged += [content + b"\0", b"something else"]
-    for bit in range(8 * len(content)):
-        changed = bytearray(content)
-        changed[bit // 8] ^= 1 << bit % 8
-        damaged.append(bytes(changed))
-    for wrong in damaged:
-        path.write_bytes(wrong)
-        with pytest.warns(UserWarning, match="is damaged"):
-            assert store.read(0, [x]) is None
-    path.unlink()
-    assert store.read(0, [x]) is None
-    path.mkdir()
-    with pytest.warns(UserWarning, match="is damaged"):
-        assert store.read(0, [x]) is None
-    path.rmdir()
-    path.write_bytes(content)
+def test_no_damage_is_taken_for_results(tmp_path, computed):
+    """As many chunks as there are kinds of damage: every length, and every bit that is flipped."""
+
+    def solve(x):
+        return x, x > 1
+
+    cfjax.map_batch(solve, np.arange(3.0), folder=tmp_path / "one")
+    length = (tmp_path / "one" / "chunk_000000.bin").stat().st_size
+    damages = [lambda content, n=n: content[:n] for n in range(length)]
+    damages += [lambda content: content + b"\0", lambda content: b"something else"]
+    for bit in range(8 * length):
+
+        def flipped(content, bit=bit):
+            changed = bytearray(content)
+            changed[bit // 8] ^= 1 << bit % 8
+            return bytes(changed)
+
+        damages.append(flipped)
+    x = np.arange(3.0 * len(damages))
+    run = lambda x=x: cfjax.map_batch(solve, x, chunk_size=3, folder=tmp_path / "many").values  # noqa: E731
+    expected = run()
+    paths = sorted((tmp_path / "many").glob("chunk_*.bin"))
+    before = [path.read_bytes() for path in paths]
+    assert {len(content) for content in before} == {length}
+    for path, damage, content in zip(paths, damages, before, strict=True):
+        path.write_bytes(damage(content))
+        assert path.read_bytes() != content
+    del computed[:]
+    with pytest.warns(UserWarning, match="is damaged") as warned:
+        found = run()
+    assert len(warned) == len(damages)
+    assert computed == list(x[::3])
+    np.testing.assert_array_equal(found, expected)
+    assert [path.read_bytes() for path in paths] == before
+    # What is missing is computed without a warning.
+    paths[0].unlink()
+    np.testing.assert_array_equal(run(), expected)
+    assert computed[-1] == x[0] and paths[0].read_bytes() == before[0]
+    # What is no file is damaged, and is not written over.
+    paths[0].unlink()
+    paths[0].mkdir()
+    with pytest.warns(UserWarning, match="is damaged"), pytest.raises(OSError):
+        run()
+    paths[0].rmdir()
+    paths[0].write_bytes(before[0])
+    del computed[:]
     with pytest.raises(ValueError, match="other members"):
-        store.read(0, [x + 1])
-    for read, output in zip(store.read(0, [x]), outputs, strict=True):
-        np.testing.assert_array_equal(read, output)
+        run(x + 1)
+    np.testing.assert_array_equal(run(), expected)
+    assert computed == []
 
 
 def test_files_of_every_kind(tmp_path, computed):
@@ -298,7 +318,7 @@ def test_what_is_read_needs_no_compilation(tmp_path, monkeypatch):
         return cfjax.map_batch(lambda x: 2 * x, np.arange(3), folder=tmp_path).values
 
     first = read_or_compute()
-    monkeypatch.setattr(Program, "run", None)
+    monkeypatch.setattr(jax.stages.Lowered, "compile", None)
     np.testing.assert_array_equal(read_or_compute(), first)
 
 
@@ -337,19 +357,25 @@ cfjax.map_batch(lambda x: x, np.ones(3, np.float32), folder=sys.argv[1])
 
 def test_another_process_writes_the_same_chunk_at_the_same_time(tmp_path, monkeypatch):
     x = np.arange(3.0)
-    program = Program(lambda x: 2 * x, x, 3, None)
-    store = Store(tmp_path, program, 3)
-    sync, others = os.fsync, [store]
+    run = lambda: cfjax.map_batch(lambda x: 2 * x, x, folder=tmp_path).values  # noqa: E731
+    run()
+    path = tmp_path / "chunk_000000.bin"
+    path.unlink()
+    sync, others = os.fsync, [run]
 
     def other_comes_between(descriptor):
         sync(descriptor)
         while others:
-            others.pop().write(0, [x], [2 * x])
+            np.testing.assert_array_equal(others.pop()(), 2 * x)
+            assert path.exists()
 
     monkeypatch.setattr(os, "fsync", other_comes_between)
-    store.write(0, [x], [2 * x])
+    np.testing.assert_array_equal(run(), 2 * x)
+    assert others == []
     assert sorted(os.listdir(tmp_path)) == ["batch.json", "chunk_000000.bin"]
-    np.testing.assert_array_equal(store.read(0, [x])[0], 2 * x)
+    # What is there is read.
+    monkeypatch.setattr(jax.stages.Lowered, "compile", None)
+    np.testing.assert_array_equal(run(), 2 * x)
 
 
 @pytest.mark.skipif(os.name != "posix", reason="Elsewhere no folder can be opened.")
@@ -559,8 +585,21 @@ SOLVES = {
 }
 
 
-def key(solve):
-    return Program(solve, np.ones((4, 3)), 4, None).fingerprint()
+class NotCompiled(Exception):
+    pass
+
+
+def key(solve, **options):
+    """What tells the computation from others in a folder, which is there before it is compiled."""
+
+    def not_compiled(self):
+        raise NotCompiled
+
+    with tempfile.TemporaryDirectory() as folder, pytest.MonkeyPatch.context() as patch:
+        patch.setattr(jax.stages.Lowered, "compile", not_compiled)
+        with pytest.raises(NotCompiled):
+            cfjax.map_batch(solve, np.ones((4, 3)), folder=folder, **options)
+        return json.loads(Path(folder, "batch.json").read_text())["computation"]
 
 
 @pytest.mark.representatives(3)
@@ -594,17 +633,17 @@ import numpy as np
 import test_batch
 for name in reversed(test_batch.SOLVES):
     solve = test_batch.SOLVES[name](np.asarray([0.1, 0.2, 0.3]))
-    print(name, test_batch.key(solve).hex(), sep=":")
+    print(name, test_batch.key(solve), sep=":")
 """
 
 
 @pytest.mark.slow
 def test_a_key_is_the_same_in_every_process_and_after_other_programs():
     parameter = np.asarray([0.1, 0.2, 0.3])
-    keys = {name: key(make(parameter)).hex() for name, make in SOLVES.items()}
+    keys = {name: key(make(parameter)) for name, make in SOLVES.items()}
     for make in SOLVES.values():  # The same functions of jax and equinox in other programs.
         jax.eval_shape(jax.vmap(make(2 * parameter)), jnp.ones((2, 3)))
-    assert {name: key(SOLVES[name](parameter)).hex() for name in reversed(SOLVES)} == keys
+    assert {name: key(SOLVES[name](parameter)) for name in reversed(SOLVES)} == keys
     # Nor does the order of sets count, which is another one in every process.
     elsewhere = subprocess.run(
         [sys.executable, "-c", KEYS],
@@ -642,18 +681,16 @@ def test_a_key_knows_versions_precision_device_and_mesh(monkeypatch, no_shape_ho
     keys = [key(solve)]
     with jax.default_matmul_precision("highest"):
         keys.append(key(solve))
-    program = Program(solve, np.ones((4, 3)), 4, jax.make_mesh((1,), ("i",)))
-    keys.append(program.fingerprint())
-    for module in (cfjax, jax, _fingerprint.jaxlib.version):
+    keys.append(key(solve, mesh=jax.make_mesh((1,), ("i",))))
+    for module in (cfjax, jax, jaxlib.version):
         with monkeypatch.context() as patch:
             patch.setattr(module, "__version__", "another")
             keys.append(key(solve))
 
-    class Other:
-        platform, device_kind = "gpu", "H100"
-
-    other = _fingerprint.environment([Other()])
-    keys.append(_fingerprint.fingerprint(program.traced, program.lowered, other))
+    (device,) = jnp.zeros(()).devices()
+    with monkeypatch.context() as patch:
+        patch.setattr(type(device), "device_kind", "H100")
+        keys.append(key(solve))
     assert len(set(keys)) == len(keys)
 
 

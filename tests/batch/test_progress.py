@@ -2,15 +2,35 @@
 
 import sys
 
+import diffrax
+import jax.numpy as jnp
+import numpy as np
 import pytest
 from rich.progress import Progress
 
-from cfjax._batch.progress import progress_bar
+import cfjax
 
 
 def work(progress):
-    with progress_bar(progress, "Compiling", 4) as update:
-        update(description="Compiling CF4", advance=1)
+    """Compiles one of four methods, and ends with the next, which cannot be traced."""
+
+    def mistaken(t, y, args):
+        raise ArithmeticError("a mistake")
+
+    fine, wrong = (
+        (diffrax.ODETerm(field), diffrax.Euler()) for field in (lambda t, y, args: -y, mistaken)
+    )
+    with pytest.raises(ArithmeticError, match="a mistake"):
+        cfjax.work_precision(
+            cfjax.LieTerm(lambda t, y, args: -y),
+            0.0,
+            1.0,
+            jnp.ones(2),
+            methods={"Euler": fine, "CF4": wrong, "CF3": fine, "CF2": fine},
+            reference=np.zeros(2),
+            num_steps=[1],
+            progress=progress,
+        )
 
 
 def test_on_a_terminal(monkeypatch, capsys):
@@ -20,6 +40,10 @@ def test_on_a_terminal(monkeypatch, capsys):
     out, error = capsys.readouterr()
     assert out == ""
     assert "Compiling CF4" in error and "25%" in error
+    cfjax.map_batch(lambda x: 2 * x, np.arange(4), chunk_size=1)
+    out, error = capsys.readouterr()
+    assert out == ""
+    assert "Solving" in error and "100%" in error
 
 
 def test_silence_elsewhere(monkeypatch, capsys):

@@ -9,7 +9,6 @@ import pytest
 import scipy.linalg
 
 from cfjax import LeftMatrix, RightMatrix
-from cfjax._fields.matrix import _is_thin
 
 N = 16
 BOTH = pytest.mark.parametrize("cls", [LeftMatrix, RightMatrix])
@@ -51,9 +50,14 @@ def increment(field, point):
 
 
 def test_which_points_are_thin():
-    a = jnp.zeros((N, N))
-    assert _is_thin(a, jnp.zeros(N)) and not _is_thin(a, jnp.zeros((N, 2)))
-    assert not _is_thin(jnp.zeros((15, 15)), jnp.zeros(15))
+    """Those that products with the matrix move: only there the number of products is looked up."""
+
+    def has_a_loop(n, *columns):
+        program = jax.make_jaxpr(lambda a, y: LeftMatrix(a).flow(y))
+        return "while[" in str(program(jnp.zeros((n, n)), jnp.zeros((n, *columns))))
+
+    assert has_a_loop(N) and not has_a_loop(N, 2)
+    assert not has_a_loop(N - 1)
 
 
 @pytest.mark.representatives(2)

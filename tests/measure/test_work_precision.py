@@ -16,7 +16,6 @@ from rich.console import Console
 from rich.progress import Progress
 
 import cfjax
-from cfjax._measure import work_precision as _work_precision
 
 Y0, ARGS = problems.MOMENTUM, problems.INERTIA
 TERM = cfjax.LieTerm(problems.driven_body)
@@ -239,11 +238,35 @@ def test_times(equal, adaptive):
 
 def test_turns_are_taken_in_order_and_within_the_budget():
     runs = []
-    programs = [lambda i=i: runs.append(i) for i in range(3)]
-    assert _work_precision.take_turns(programs, repeats=4, budget=np.inf).shape == (3, 4)
-    assert runs == [0, 1, 2] * 4
+
+    def method(i):
+        def field(t, y, args):
+            jax.debug.callback(lambda: runs.append(i))
+            return -y
+
+        return diffrax.ODETerm(field), diffrax.Euler()
+
+    def measure(budget):
+        work = cfjax.work_precision(
+            TERM,
+            0.0,
+            1.0,
+            jnp.ones(2),
+            methods={str(i): method(i) for i in range(3)},
+            reference=np.zeros(2),
+            num_steps=[1],
+            repeats=4,
+            budget=budget,
+        )
+        jax.effects_barrier()
+        return work.seconds.shape
+
+    assert measure(np.inf) == (3, 4)
+    assert runs[-12:] == [0, 1, 2] * 4
+    # No round more: before them each ran alone, to be counted and to warm up.
+    assert runs[-15:-12] != [0, 1, 2]
     # A budget that is spent at once leaves one round.
-    assert _work_precision.take_turns(programs, repeats=4, budget=1e-9).shape == (3, 1)
+    assert measure(1e-9) == (3, 1)
 
 
 @pytest.mark.slow
@@ -511,15 +534,22 @@ def test_an_error_that_is_no_number():
 @pytest.mark.parametrize("value", [None, "1", 1j, np.ones(1), -1.0])
 def test_what_is_no_error(value):
     with pytest.raises((TypeError, ValueError), match="error must return a"):
-        _work_precision._checked_error(value)
+        cfjax.work_precision(
+            diffrax.ODETerm(lambda t, y, args: -y),
+            0.0,
+            1.0,
+            jnp.ones(2),
+            methods={"m": diffrax.Euler()},
+            reference=np.ones(2),
+            num_steps=[1],
+            error=lambda y, reference: value,
+        )
 
 
 @pytest.mark.parametrize("package, part", [("matplotlib", "plot"), ("rich", "table")])
 def test_a_missing_extra(package, part, equal, monkeypatch):
     for name in [name for name in sys.modules if name.partition(".")[0] == package]:
         monkeypatch.setitem(sys.modules, name, None)
-    monkeypatch.delitem(sys.modules, "cfjax._measure.style", raising=False)
-    monkeypatch.delattr(cfjax._measure, "style", raising=False)
     with pytest.raises(ModuleNotFoundError, match=rf"{package} is missing.*'cfjax\[paper\]'"):
         getattr(equal, part)()
 

@@ -4,14 +4,9 @@ import json
 
 import numpy as np
 from methods import derive
+from methods.derive import STORED, continuous_extension, derived_extension, runge_kutta_extension
 
-from cfjax._methods.continuous_extension import (
-    STORED,
-    continuous_extension,
-    derived_extension,
-    runge_kutta_extension,
-)
-from cfjax._methods.tableau import third_order_a
+import cfjax
 
 WRITE = "Run python tests/methods/derive.py."
 
@@ -47,5 +42,5 @@ def test_what_is_stored_is_what_is_used():
 
 
 def test_that_of_a_users_own_method_is_derived():
-    tableau = third_order_a(0.4)
+    tableau = cfjax.third_order_a(0.4)
     assert continuous_extension(tableau) == derived_extension(tableau)

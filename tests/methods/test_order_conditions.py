@@ -1,39 +1,36 @@
+"""The order conditions, and what they decide: orders, constants, coefficients within a step."""
+
 import math
 import random
 from fractions import Fraction
+from functools import lru_cache
 
 import diffrax
 import hypothesis
 import hypothesis.strategies as st
 import numpy as np
 import pytest
+from extended import FLOWS, SERIES
 
 import cfjax
+from cfjax import Tableau, error_constant, order, third_order_a, third_order_b
+from cfjax._methods.continuous_extension import continuous_extension, runge_kutta_extension
 from cfjax._methods.order_conditions import (
-    error_constant,
     exact_tree_weight,
     exact_weight,
-    order,
     runge_kutta_order,
     trees,
     words,
 )
 from cfjax._methods.proved import PROVED, order_of
-from cfjax._methods.tableau import (
-    CF2,
-    CF3,
-    CF4,
-    CG3,
-    CG4,
-    CG5,
-    LIE_EULER,
-    Tableau,
-    third_order_a,
-    third_order_b,
-)
+from cfjax._methods.tableau import crouch_grossman
 
 HALF = Fraction(1, 2)
 THIRD = Fraction(1, 3)
+LIE_EULER, CF2, CF3, CF4, CG3, CG4, CG5 = (
+    getattr(cfjax, name)().tableau
+    for name in ("LieEuler", "CF2", "CF3", "CF4", "CG3", "CG4", "CG5")
+)
 
 ORDERS = {
     "LIE_EULER": (LIE_EULER, 1),
@@ -388,3 +385,134 @@ def test_order_is_of_a_tableau(no_shape_hook):
     # The method instead of its tableau is an easy mistake.
     with pytest.raises(TypeError, match=r"tableau must be a cfjax.Tableau, got CF4\(\)"):
         order(cfjax.CF4())  # pyright: ignore[reportArgumentType]
+
+
+# Continuous extensions. Their conditions are evaluated on their own: words, weights by recursion.
+
+
+@lru_cache
+def all_words(n):
+    if n == 0:
+        return [()]
+    return [(t, *w) for k in range(1, n + 1) for t in all_words(k - 1) for w in all_words(n - k)]
+
+
+def order_of_word(word):
+    return sum(1 + order_of_word(tree) for tree in word)
+
+
+def weight_of(word):
+    if not word:
+        return Fraction(1)
+    return weight_of(word[:-1]) * weight_of(word[-1]) / order_of_word(word)
+
+
+def weights_at(continuous_extension, theta):
+    return [
+        [sum(a * theta ** (i + 1) for i, a in enumerate(column)) for column in zip(*p, strict=True)]
+        for p in continuous_extension
+    ]
+
+
+@pytest.mark.representatives(8)
+@pytest.mark.parametrize("solver, order", FLOWS.values(), ids=FLOWS)
+def test_the_order_conditions_of_the_continuous_extension(solver, order):
+    """Its weights must be `theta^n` times those of the exact solution, for words of order n."""
+    tableau = solver.tableau
+    within = continuous_extension(tableau)
+    # Exact where the tableau is; Fraction(2) / 3 and 2.0 / 3 are both right below.
+    is_exact = tableau.is_exact and tableau.continuous_extension is not None
+    number = Fraction if is_exact else float
+    products = [[list(map(number, r)) for r in p] for p in (*tableau.alpha, tableau.beta)]
+
+    @lru_cache(None)
+    def stage(k, tree):
+        return weigher(products[k])(tree, len(products[k]))
+
+    def weigher(rows):
+        @lru_cache(None)
+        def weight(word, j):
+            """Over all splits of the word's letters into one group for each of j flows."""
+            if not word or not j:
+                return number(not word)
+            total = number(0)
+            for i in range(len(word) + 1):
+                term = weight(word[:i], j - 1)
+                for m, tree in enumerate(word[i:], 1):
+                    term *= sum(a * stage(k, tree) for k, a in enumerate(rows[j - 1]) if a) / m
+                total += term
+            return total
+
+        return weight
+
+    def defect(n, theta):
+        rows = weights_at(within, theta)
+        weight = weigher(rows)
+        return max(
+            abs(weight(w, len(rows)) - theta**n * number(weight_of(w))) for w in all_words(n)
+        )
+
+    # Coefficients up to 10 that are rounded, in products of up to four that are rarely all large;
+    # or exact. In YRK135, up to 12, they grow and cancel: 12^4 units of rounding are 2e-12.
+    tolerance = 0 if is_exact else 2e-14 if solver != cfjax.YRK135() else 1e-12
+    for theta in (number(1) / 7, number(1) / 2, number(1)):
+        for n in range(1, order + 1):
+            assert defect(n, theta) <= tolerance
+    # And no more than that.
+    assert defect(order + 1, number(1) / 2) > 1e-5
+    # The end of the step is met.
+    for row, end in zip(weights_at(within, number(1)), tableau.beta, strict=True):
+        rest = [*end, *[0] * (len(row) - len(end))]
+        np.testing.assert_allclose(np.array(row, float), np.array(rest, float), rtol=0, atol=1e-14)
+
+
+@pytest.mark.parametrize("solver, order", SERIES.values(), ids=SERIES)
+def test_the_order_conditions_in_the_algebra(solver, order):
+    """Those of continuous Runge-Kutta methods, tree by tree, at every stage by recursion."""
+    a = solver.a[: len(solver.b)]
+    (powers,), more, times = runge_kutta_extension(a, solver.b, solver.order(None))
+    rows = (*a, *more)
+    np.testing.assert_allclose([sum(row) for row in more], times, rtol=0, atol=1e-14)
+
+    @lru_cache
+    def stages(tree):
+        product = np.ones(len(rows))
+        for child in tree:
+            product *= [np.dot(row, stages(child)[: len(row)]) for row in rows]
+        return product
+
+    def density(tree):
+        return (1 + order_of_word(tree)) * np.prod([density(child) for child in tree])
+
+    def defect(n, theta):
+        (weights,) = weights_at((powers,), theta)
+        return max(abs(weights @ stages(t) - theta**n / density(t)) for t in all_words(n - 1))
+
+    for theta in (1 / 7, 1 / 2, 1.0):
+        for n in range(1, order + 1):
+            # Coefficients up to 6, Tsit5's up to 66, Dopri8's up to 707, and sums of products.
+            assert defect(n, theta) < 1e-12
+    assert defect(order + 1, 1 / 3) > 1e-6
+
+
+def test_a_method_that_needs_the_field_at_the_end_of_the_step_evaluates_it():
+    """The methods of order 5 whose stages reach order 3 only."""
+    assert {
+        name
+        for name, (solver, _) in FLOWS.items()
+        if any(map(solver.tableau.uses_last, continuous_extension(solver.tableau)))
+    } == {"CF54", "CG5"}
+
+
+# Coefficients in the form of Crouch and Grossman
+
+
+def test_crouch_grossman():
+    tableau = crouch_grossman([[HALF], [0, HALF]], [0, 0, 1])
+    assert tableau == Tableau([[], [[HALF]], [[0, HALF]]], [[0, 0, 1]])
+    tableau = crouch_grossman([[1]], [HALF, HALF])
+    assert tableau == Tableau([[], [[1]]], [[HALF], [0, HALF]])
+    assert crouch_grossman([], [1]) == Tableau([[]], [[1]])
+    tableau = crouch_grossman([[1]], [HALF, HALF], [1, 0], [[1, -HALF], [0, HALF]])
+    assert tableau.embedded == ((1, 0, 0),)
+    assert tableau.continuous_extension == (((1, 0, 0), (-HALF, 0, 0)), ((0, 0, 0), (0, HALF, 0)))

@@ -6,20 +6,13 @@ import hypothesis.strategies as st
 import numpy as np
 import pytest
 
-from cfjax._methods.tableau import (
-    CF2,
-    CF3,
-    CF4,
-    CG3,
-    CG4,
-    CG5,
-    LIE_EULER,
-    Tableau,
-    crouch_grossman,
-    third_order_a,
-    third_order_b,
-)
+import cfjax
+from cfjax import Tableau, third_order_a, third_order_b
 
+LIE_EULER, CF2, CF3, CF4, CG3, CG4, CG5 = (
+    getattr(cfjax, name)().tableau
+    for name in ("LieEuler", "CF2", "CF3", "CF4", "CG3", "CG4", "CG5")
+)
 HALF = Fraction(1, 2)
 THIRD = Fraction(1, 3)
 
@@ -164,17 +157,6 @@ def test_is_exact():
     assert [t.is_exact for t in NAMED.values()] == [True] * 5 + [False] * 2
     assert not Tableau([[], [[0.25]]], [[0, 1]]).is_exact
     assert Tableau(np.zeros((1, 1, 1)), [[1]]).is_exact
-
-
-def test_crouch_grossman():
-    tableau = crouch_grossman([[HALF], [0, HALF]], [0, 0, 1])
-    assert tableau == Tableau([[], [[HALF]], [[0, HALF]]], [[0, 0, 1]])
-    tableau = crouch_grossman([[1]], [HALF, HALF])
-    assert tableau == Tableau([[], [[1]]], [[HALF], [0, HALF]])
-    assert crouch_grossman([], [1]) == Tableau([[]], [[1]])
-    tableau = crouch_grossman([[1]], [HALF, HALF], [1, 0], [[1, -HALF], [0, HALF]])
-    assert tableau.embedded == ((1, 0, 0),)
-    assert tableau.continuous_extension == (((1, 0, 0), (-HALF, 0, 0)), ((0, 0, 0), (0, HALF, 0)))
 
 
 # Embedded method and continuous extension

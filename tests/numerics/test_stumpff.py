@@ -7,32 +7,11 @@ import jax.numpy as jnp
 import mpmath
 import numpy as np
 import pytest
+from problems import SQUARES_OF_ANGLES
 
-from cfjax._numerics.stumpff import (
-    cotangent_excess,
-    stumpff,
-    stumpff_1_2,
-    stumpff_1_to_3_apart,
-)
+from cfjax import stumpff
 
 ORDERS = 3
-PI2 = math.pi**2
-ARGUMENTS = [
-    0.0,
-    1e-300,
-    1e-160,
-    1e-30,
-    1e-8,
-    1e-3,
-    1.0,
-    *(k**2 * PI2 * (1 + d) for k in (1, 2, 3, 4) for d in (-1e-9, 0.0, 1e-9)),
-    np.nextafter(16.0, 0.0),
-    16.0,
-    np.nextafter(16.0, 20.0),
-    40.0,
-    110.0,
-    1e4,
-]
 DTYPES = pytest.mark.parametrize("dtype", [np.float32, np.float64])
 
 
@@ -90,7 +69,7 @@ def derivative_bound(n, k, s, value, unit):
 def exact():
     """All references, for the arguments rounded to each precision: `[dtype][i][n][k]`."""
     return {
-        dtype: [[reference(n, s) for n in range(12)] for s in np.array(ARGUMENTS, dtype)]
+        dtype: [[reference(n, s) for n in range(12)] for s in np.array(SQUARES_OF_ANGLES, dtype)]
         for dtype in (np.float32, np.float64)
     }
 
@@ -113,7 +92,7 @@ def derivatives(n):
 @DTYPES
 @pytest.mark.parametrize("n", range(6))
 def test_values_and_three_derivatives(n, dtype, exact):
-    arguments = np.array(ARGUMENTS, dtype)
+    arguments = np.array(SQUARES_OF_ANGLES, dtype)
     got = derivatives(n)(arguments)
     assert got.dtype == dtype
     # A few units: the reduced angle, a square, a polynomial and a product round once each.
@@ -165,27 +144,6 @@ def test_what_is_not_finite_gives_nan(bad, dtype):
         assert np.isfinite(got[1]), n
 
 
-def three(s):
-    near, d1, d2, c3 = stumpff_1_to_3_apart(s)
-    return near + d1, near / 2 + d2, c3
-
-
-@pytest.mark.representatives(1)
-@pytest.mark.parametrize("together", [stumpff_1_2, three])
-@DTYPES
-def test_several_together(together, dtype):
-    s = jnp.asarray(ARGUMENTS, dtype)
-    ones = jnp.ones_like(s)
-    for n, (got, slope) in enumerate(
-        zip(*jax.jit(lambda s: jax.jvp(together, (s,), (ones,)))(s), strict=True), start=1
-    ):
-        want, want_slope = jax.jvp(lambda s, n=n: stumpff(n, s), (s,), (ones,))
-        # The same formulas, but XLA may round them in another order: the bound of either, twice.
-        eps = 8 * np.finfo(dtype).eps
-        np.testing.assert_allclose(got, want, rtol=eps, atol=eps)
-        np.testing.assert_allclose(slope, want_slope, rtol=eps, atol=eps)
-
-
 @pytest.mark.parametrize("shape", [(), (0,), (2, 3)])
 def test_shapes(shape):
     s = jnp.linspace(0.0, 30.0, math.prod(shape)).reshape(shape)
@@ -210,53 +168,3 @@ def test_an_angle_without_digits_is_nan(dtype):
     for big in (1.01 * limit, info.max / 2, np.inf, np.nan):
         for n in range(5):
             assert np.isnan(stumpff(n, jnp.asarray(big, dtype))), (n, big)
-
-
-@DTYPES
-def test_the_excess_of_the_cotangent(dtype):
-    """Against `(1 - x/2 cot(x/2)) / x^2` itself, with 60 digits for what cancels, and its slopes.
-
-    By differences of 60 digits, which leave 20.
-    """
-    x = np.array([0.0, 1e-20, 1e-4, 0.1, 1.0, np.pi, 4.5, 6.0, 6.2])
-    s = jnp.asarray(x * x, dtype)
-    first = jax.grad(cotangent_excess)
-    functions = cotangent_excess, first, jax.grad(first)
-    found = [jax.jit(jax.vmap(f))(s) for f in functions]
-
-    def exact(s):
-        x = mpmath.sqrt(s)
-        return (1 - x / 2 * mpmath.cot(x / 2)) / s
-
-    with mpmath.workdps(60):
-        for k, at in enumerate(s):
-            at = mpmath.mpf(float(at))
-            h = mpmath.mpf(10) ** -12
-            # The series about zero, of which the first term that is left out is below 1e-40.
-            f = exact if at > 1e-10 else lambda s: 1 / mpmath.mpf(12) + s / 720 + s**2 / 30240
-            values = [f(at + j * h) for j in (-1, 0, 1)]
-            wants = (
-                values[1],
-                (values[2] - values[0]) / (2 * h),
-                (values[2] - 2 * values[1] + values[0]) / h**2,
-            )
-            # One unit of s moves the pole by that much, each derivative once more; and a
-            # derivative of the polynomial is ten times as far off as that is.
-            near = float(4 * mpmath.pi**2 / (4 * mpmath.pi**2 - at))
-            for n, (got, want) in enumerate(zip(found, wants, strict=True)):
-                rtol = 8 * 10**n * (n + 1) * near * np.finfo(dtype).eps
-                # Markov's inequality: what a rounding of the polynomial, of degree 13 on an
-                # interval of length 4 pi^2, can be in its derivatives at an end.
-                atol = np.finfo(dtype).eps / 12 * (2 * 13**2 / (4 * np.pi**2)) ** n
-                np.testing.assert_allclose(
-                    float(got[k]), float(want), rtol, atol, err_msg=f"{n} at {at}"
-                )
-
-
-@pytest.mark.representatives(1)
-@DTYPES
-def test_beyond_a_full_turn_the_excess_of_the_cotangent_is_finite(dtype):
-    s = jnp.asarray([4 * PI2 * 1.0001, 100.0, np.finfo(dtype).max, np.inf], dtype)
-    got, slope = jax.vmap(jax.value_and_grad(cotangent_excess))(s)
-    np.testing.assert_allclose(got, 1 / 12, rtol=4 * np.finfo(dtype).eps)
-    np.testing.assert_array_equal(slope, 0)

@@ -9,10 +9,11 @@ import pytest
 import scipy.fft
 
 import cfjax
-from cfjax._numerics.transforms import _MAX_DENSE
 
+# Up to here a product with a dense matrix, as the docstrings say.
+MAX_DENSE = 160
 # The dense path, both sides of the switch, and a prime number of intervals, 251.
-SIZES = [1, 2, 8, 99, _MAX_DENSE, _MAX_DENSE + 1, 250, 1023, 1024]
+SIZES = [1, 2, 8, 99, MAX_DENSE, MAX_DENSE + 1, 250, 1023, 1024]
 
 
 def transform(kind, n):
@@ -86,6 +87,15 @@ def test_complex_points(kind, n):
     c = t.forward(jnp.asarray(x))
     close(c, SCIPY[kind](x.real) + 1j * SCIPY[kind](x.imag), n)
     close(t.inverse(c), x, n)
+
+
+@pytest.mark.parametrize("kind", ["sine", "cosine"])
+def test_a_dense_product_up_to_so_many_points(kind):
+    def program(n):
+        return str(jax.make_jaxpr(transform(kind, n).forward)(jnp.ones(n)))
+
+    assert "dot_general" in program(MAX_DENSE) and "fft" not in program(MAX_DENSE)
+    assert "fft" in program(MAX_DENSE + 1) and "dot_general" not in program(MAX_DENSE + 1)
 
 
 def operator(kind, n):
@@ -163,7 +173,7 @@ def test_eigenvalues_of_the_second_difference(kind, n):
 
 PAIRS = [(a, b) for a in SCIPY for b in SCIPY if (a, b) != ("real Fourier",) * 2]
 # Small grids, and beyond the dense limit along either axis, for the kinds that have one.
-LARGE = {(_MAX_DENSE + 2, 3): 0, (3, _MAX_DENSE + 1): 1}
+LARGE = {(MAX_DENSE + 2, 3): 0, (3, MAX_DENSE + 1): 1}
 GRIDS = [(pair, (4, 5)) for pair in PAIRS] + [
     (pair, shape)
     for shape, axis in LARGE.items()

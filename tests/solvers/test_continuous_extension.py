@@ -1,7 +1,8 @@
-"""Output within the steps: orders, the manifold, the nodes, events."""
+"""Output within the steps: observed orders, the manifold, the nodes, events.
 
-from fractions import Fraction
-from functools import lru_cache
+The order conditions of its coefficients are in methods/test_order_conditions.py.
+"""
+
 from typing import Any
 
 import diffrax
@@ -12,158 +13,13 @@ import numpy as np
 import optimistix as optx
 import problems
 import pytest
+from extended import FLOWS, SERIES
 from scipy.integrate import solve_ivp
 
 import cfjax
-from cfjax._methods.continuous_extension import continuous_extension, runge_kutta_extension
 
-# The uniform order of each: at most one below that of the method.
-FLOWS: dict[str, Any] = {
-    "LieEuler": (cfjax.LieEuler(), 1),
-    "CF2": (cfjax.CF2(), 2),
-    "CF3": (cfjax.CF3(), 2),
-    "CF4": (cfjax.CF4(), 3),
-    "CF43": (cfjax.CF43(), 3),
-    "CF54": (cfjax.CF54(), 4),
-    "CG3": (cfjax.CG3(), 2),
-    "CG4": (cfjax.CG4(), 3),
-    "CG5": (cfjax.CG5(), 4),
-    "Williamson3": (cfjax.Williamson3(), 2),
-    "BWRRK33": (cfjax.BWRRK33(), 2),
-    "BWRRK53": (cfjax.BWRRK53(), 3),
-    "CK34": (cfjax.CK34(), 3),
-    "CK54": (cfjax.CK54(), 3),
-    "Luscher3": (cfjax.Luscher3(), 2),
-    "YRK135": (cfjax.YRK135(), 4),
-    "CFEES25": (cfjax.CFEES25(), 2),
-    "CFEES27": (cfjax.CFEES27(), 2),
-    "first family": (cfjax.CommutatorFree(cfjax.third_order_a(0.5)), 2),
-    "second family": (cfjax.CommutatorFree(cfjax.third_order_b(Fraction(2, 3))), 2),
-}
-SERIES: dict[str, Any] = {
-    "Heun": (cfjax.RKMK(diffrax.Heun.tableau), 2),
-    "Bosh3": (cfjax.RKMK(diffrax.Bosh3.tableau), 2),
-    "Dopri5": (cfjax.RKMK(diffrax.Dopri5.tableau), 4),
-    "Tsit5": (cfjax.RKMK(diffrax.Tsit5.tableau), 4),
-    "Dopri8": (cfjax.RKMK(diffrax.Dopri8.tableau), 7),
-}
 EXTENDED = FLOWS | SERIES | {"RKMK3": (cfjax.RKMK3(), 2), "RKMK4": (cfjax.RKMK4(), 3)}
 BODY = problems.driven_body, jnp.asarray(problems.MOMENTUM), jnp.asarray(problems.INERTIA)
-
-
-# The order conditions, evaluated on their own: words of trees, their weights by recursion.
-
-
-@lru_cache
-def words(n):
-    if n == 0:
-        return [()]
-    return [(t, *w) for k in range(1, n + 1) for t in words(k - 1) for w in words(n - k)]
-
-
-def size(word):
-    return sum(1 + size(tree) for tree in word)
-
-
-def exact(word):
-    if not word:
-        return Fraction(1)
-    return exact(word[:-1]) * exact(word[-1]) / size(word)
-
-
-def weights_at(continuous_extension, theta):
-    return [
-        [sum(a * theta ** (i + 1) for i, a in enumerate(column)) for column in zip(*p, strict=True)]
-        for p in continuous_extension
-    ]
-
-
-@pytest.mark.representatives(8)
-@pytest.mark.parametrize("solver, order", FLOWS.values(), ids=FLOWS)
-def test_the_order_conditions_of_the_continuous_extension(solver, order):
-    """Its weights must be `theta^n` times those of the exact solution, for words of order n."""
-    tableau = solver.tableau
-    within = continuous_extension(tableau)
-    # Exact where the tableau is; Fraction(2) / 3 and 2.0 / 3 are both right below.
-    is_exact = tableau.is_exact and tableau.continuous_extension is not None
-    number = Fraction if is_exact else float
-    products = [[list(map(number, r)) for r in p] for p in (*tableau.alpha, tableau.beta)]
-
-    @lru_cache(None)
-    def stage(k, tree):
-        return weigher(products[k])(tree, len(products[k]))
-
-    def weigher(rows):
-        @lru_cache(None)
-        def weight(word, j):
-            """Over all splits of the word's letters into one group for each of j flows."""
-            if not word or not j:
-                return number(not word)
-            total = number(0)
-            for i in range(len(word) + 1):
-                term = weight(word[:i], j - 1)
-                for m, tree in enumerate(word[i:], 1):
-                    term *= sum(a * stage(k, tree) for k, a in enumerate(rows[j - 1]) if a) / m
-                total += term
-            return total
-
-        return weight
-
-    def defect(n, theta):
-        rows = weights_at(within, theta)
-        weight = weigher(rows)
-        return max(abs(weight(w, len(rows)) - theta**n * number(exact(w))) for w in words(n))
-
-    # Coefficients up to 10 that are rounded, in products of up to four that are rarely all large;
-    # or exact. In YRK135, up to 12, they grow and cancel: 12^4 units of rounding are 2e-12.
-    tolerance = 0 if is_exact else 2e-14 if solver != cfjax.YRK135() else 1e-12
-    for theta in (number(1) / 7, number(1) / 2, number(1)):
-        for n in range(1, order + 1):
-            assert defect(n, theta) <= tolerance
-    # And no more than that.
-    assert defect(order + 1, number(1) / 2) > 1e-5
-    # The end of the step is met.
-    for row, end in zip(weights_at(within, number(1)), tableau.beta, strict=True):
-        rest = [*end, *[0] * (len(row) - len(end))]
-        np.testing.assert_allclose(np.array(row, float), np.array(rest, float), rtol=0, atol=1e-14)
-
-
-@pytest.mark.parametrize("solver, order", SERIES.values(), ids=SERIES)
-def test_the_order_conditions_in_the_algebra(solver, order):
-    """Those of continuous Runge-Kutta methods, tree by tree, at every stage by recursion."""
-    a = solver.a[: len(solver.b)]
-    (powers,), more, times = runge_kutta_extension(a, solver.b, solver.order(None))
-    rows = (*a, *more)
-    np.testing.assert_allclose([sum(row) for row in more], times, rtol=0, atol=1e-14)
-
-    @lru_cache
-    def stages(tree):
-        product = np.ones(len(rows))
-        for child in tree:
-            product *= [np.dot(row, stages(child)[: len(row)]) for row in rows]
-        return product
-
-    def density(tree):
-        return (1 + size(tree)) * np.prod([density(child) for child in tree])
-
-    def defect(n, theta):
-        (weights,) = weights_at((powers,), theta)
-        return max(abs(weights @ stages(t) - theta**n / density(t)) for t in words(n - 1))
-
-    for theta in (1 / 7, 1 / 2, 1.0):
-        for n in range(1, order + 1):
-            # Coefficients up to 6, Tsit5's up to 66, Dopri8's up to 707, and sums of products.
-            assert defect(n, theta) < 1e-12
-    assert defect(order + 1, 1 / 3) > 1e-6
-
-
-def test_a_method_that_needs_the_field_at_the_end_of_the_step_evaluates_it():
-    """The methods of order 5 whose stages reach order 3 only."""
-    assert {
-        name
-        for name, (solver, _) in FLOWS.items()
-        if any(map(solver.tableau.uses_last, continuous_extension(solver.tableau)))
-    } == {"CF54", "CG5"}
 
 
 def test_output_within_a_step_is_a_short_program():

@@ -1,7 +1,10 @@
 """`pack` and `unpack`: the numbers of `jnp.stack` under every transformation."""
 
+import sys
+
 import jax
 import jax.numpy as jnp
+import meshes
 import numpy as np
 import pytest
 
@@ -81,3 +84,23 @@ def test_transformations(transform, stack):
         jax.tree.map(
             lambda a, b: np.testing.assert_allclose(a, b, rtol=0, atol=1e-13), run(x, y), want
         )
+
+
+def over_a_batch(ys):
+    def one(y):
+        entries = unpack(y)
+        # Of an entry of the batch, and one that all have.
+        whole = pack([*entries, jnp.asarray(2.0)])
+        along = materialised([whole, *entries], in_batches=True)
+        return jnp.sum(along[0]) * pack(along[1:], sums=True)
+
+    return jax.vmap(one)(ys) + jax.grad(lambda ys: jnp.sum(jax.vmap(one)(ys) ** 2))(ys)
+
+
+@pytest.mark.parametrize("kind", meshes.KINDS)
+def test_a_batch_on_a_mesh_is_that_on_one_device(kind):
+    meshes.check(__file__, ["packed"], kind)
+
+
+if __name__ == "__main__":
+    meshes.show(sys.argv[1], [("packed", over_a_batch, False)])
