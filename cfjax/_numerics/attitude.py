@@ -13,7 +13,7 @@ from jaxtyping import Array, Bool, Float
 
 from .._xla import is_rewritten
 from .quaternion import Order, check_choice, from_parts, parts
-from .vectors import cross, pack, smooth
+from .vectors import Vector, cross, pack, smooth
 
 
 def quaternion_to_matrix(
@@ -124,7 +124,7 @@ def quaternion_from_matrix(
 
 
 @smooth
-def _quaternion(q: Array | np.ndarray, order: Order) -> tuple[tuple[Array, ...], Array]:
+def _quaternion(q: Array | np.ndarray, order: Order) -> tuple[Vector, Array]:
     """The parts of q, and `2 / |q|^2`."""
     check_choice("order", order)
     w, x, y, z = parts(_array("q", q, (4,)), order)
@@ -141,7 +141,7 @@ def _quaternion(q: Array | np.ndarray, order: Order) -> tuple[tuple[Array, ...],
         jnp.where(is_near, inverse, jnp.nan),
         "q must have length 1, and is off by more than 0.1 in q @ q. Divide it by its length.",
     )
-    return (w, x, y, z), 2 * inverse
+    return [w, x, y, z], 2 * inverse
 
 
 def _checked_matrix(matrix: Array) -> Array:

@@ -136,7 +136,7 @@ def _by_products(product: Callable[[Array], Array], x: Array, chosen: _Chosen) -
         jnp.zeros_like(x),
         pieces,
         root=_ROOT_OF_MOST,
-        is_mostly_one=True,
+        mostly=1,
     )
     return _by_real(moved, lambda x: jnp.where(possible, x, jnp.nan))
 

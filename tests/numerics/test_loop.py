@@ -10,25 +10,25 @@ import pytest
 from cfjax._numerics.loop import loop
 
 
-def power(a, x, n, is_mostly_one=False):
+def power(a, x, n, mostly=0):
     """`a^n x / n!`, with what is closed over and the number of the step."""
     step = lambda k, x: a * x / (k + 1).astype(x.dtype)  # noqa: E731
-    return loop(step, jnp.asarray(x), n, root=4, is_mostly_one=is_mostly_one)
+    return loop(step, jnp.asarray(x), n, root=4, mostly=mostly)
 
 
 @functools.partial(jax.jit, static_argnums=3)
-def everything(a, x, n, is_mostly_one):
-    f = lambda a, x: power(a, x, n, is_mostly_one)  # noqa: E731
+def everything(a, x, n, mostly):
+    f = lambda a, x: power(a, x, n, mostly)  # noqa: E731
     forward = jax.jvp(lambda a: f(a, x), (a,), (1.0,))[1]
     return f(a, x), forward, jax.grad(f)(a, x), jax.grad(jax.grad(f))(a, x)
 
 
 @pytest.mark.representatives(2)
-@pytest.mark.parametrize("is_mostly_one", [False, True])
+@pytest.mark.parametrize("mostly", [0, 1, 3])
 @pytest.mark.parametrize("n", [0, 1, 3, 4, 5, 16])
-def test_powers_and_their_derivatives(n, is_mostly_one):
+def test_powers_and_their_derivatives(n, mostly):
     a, x = 1.5, 0.7
-    found = everything(a, x, jnp.asarray(n, jnp.int32), is_mostly_one)
+    found = everything(a, x, jnp.asarray(n, jnp.int32), mostly)
     c = x / float(np.prod(np.arange(1, n + 1.0)))
     first, second = n * c * a ** (n - 1), n * (n - 1) * c * a ** (n - 2)
     # Some roundings for each step.

@@ -8,12 +8,7 @@ import mpmath
 import numpy as np
 import pytest
 
-from cfjax._numerics.stumpff import (
-    cotangent_excess,
-    stumpff,
-    stumpff_1_2,
-    stumpff_1_to_3_apart,
-)
+from cfjax._numerics.stumpff import cotangent_excess, stumpff, stumpff_1_to_3_apart
 
 ORDERS = 3
 PI2 = math.pi**2
@@ -171,13 +166,12 @@ def three(s):
 
 
 @pytest.mark.representatives(1)
-@pytest.mark.parametrize("together", [stumpff_1_2, three])
 @DTYPES
-def test_several_together(together, dtype):
+def test_several_together(dtype):
     s = jnp.asarray(ARGUMENTS, dtype)
     ones = jnp.ones_like(s)
     for n, (got, slope) in enumerate(
-        zip(*jax.jit(lambda s: jax.jvp(together, (s,), (ones,)))(s), strict=True), start=1
+        zip(*jax.jit(lambda s: jax.jvp(three, (s,), (ones,)))(s), strict=True), start=1
     ):
         want, want_slope = jax.jvp(lambda s, n=n: stumpff(n, s), (s,), (ones,))
         # The same formulas, but XLA may round them in another order: the bound of either, twice.
