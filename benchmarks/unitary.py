@@ -23,7 +23,6 @@ import results
 from cfjax._measure.work_precision import take_turns
 from cfjax._numerics.expm import TAYLOR_SCHEMES, by_norm, taylor_from_second
 from cfjax._numerics.matmul import small_product
-from cfjax._numerics.squaring import repeat
 from cfjax.scenes import wilson_flow
 
 Programs = dict[str, Callable[[], object]]
@@ -67,11 +66,11 @@ def by_products(a: Array) -> Array:
     """By the polynomial that `cfjax.expm` uses for larger matrices."""
     schemes = TAYLOR_SCHEMES[a.dtype.name]
 
-    def approximate(k: int, a: Array, a2: Array, s: Array) -> Array:
-        e = taylor_from_second(schemes[k], a, a2) + a + jnp.eye(a.shape[0])
-        return repeat(lambda x: small_product(x, x), e, s)
+    def approximate(k: int, a: Array, a2: Array) -> Array:
+        return taylor_from_second(schemes[k], a, a2) + a + jnp.eye(a.shape[0])
 
-    return by_norm([scheme.theta for scheme in schemes], a, small_product(a, a), approximate)
+    thetas = [scheme.theta for scheme in schemes]
+    return by_norm(thetas, a, small_product(a, a), approximate, lambda _, e: e)[1]
 
 
 def exponentials(n: int, gradient: bool, batch: int, repeats: int) -> Iterator[results.Row]:

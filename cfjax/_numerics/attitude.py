@@ -12,7 +12,7 @@ import numpy as np
 from jaxtyping import Array, Bool, Float
 
 from .quaternion import Order, check_choice, from_parts, parts
-from .vectors import cross, is_rewritten, pack, smooth
+from .vectors import Vector, cross, is_rewritten, pack, smooth
 
 
 def quaternion_to_matrix(
@@ -123,7 +123,7 @@ def quaternion_from_matrix(
 
 
 @smooth
-def _quaternion(q: Array | np.ndarray, order: Order) -> tuple[tuple[Array, ...], Array]:
+def _quaternion(q: Array | np.ndarray, order: Order) -> tuple[Vector, Array]:
     """The parts of q, and `2 / |q|^2`."""
     check_choice("order", order)
     w, x, y, z = parts(_array("q", q, (4,)), order)
@@ -140,7 +140,7 @@ def _quaternion(q: Array | np.ndarray, order: Order) -> tuple[tuple[Array, ...],
         inverse,
         "q must have length 1, and is off by more than 0.1 in q @ q. Divide it by its length.",
     )
-    return (w, x, y, z), 2 * inverse
+    return [w, x, y, z], 2 * inverse
 
 
 def _checked_matrix(matrix: Array) -> Array:

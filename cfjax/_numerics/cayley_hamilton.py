@@ -16,8 +16,8 @@ import numpy as np
 from jax import lax
 from jaxtyping import Array, Inexact
 
-from .matmul import small_product
-from .squaring import exponent, max_over_batch, squared, squarings
+from .matmul import plus_identity, small_product
+from .squaring import exponent, squared, squarings
 from .vectors import materialised, unpack
 
 # Of Taylor's polynomial.
@@ -43,16 +43,8 @@ def expm_parts(
 
     The rounding of the rest is as small as a^2.
     """
-    c, s, scale = _scaled(a)
-    rest = _taylor(a, small_product(a, a), c, scale)
-
-    def with_squarings(a: Array, rest: Array) -> Array:
-        return jnp.where(s == 0, rest, squared(_exponential(_times_real(scale, a), rest), s))
-
-    # Without a checkpoint the branch not taken must still hand out room for what the other saves.
-    is_needed = max_over_batch(s) > 0
-    rest = lax.cond(is_needed, jax.checkpoint(with_squarings), lambda a, rest: rest, a, rest)
-    return (s == 0).astype(a.dtype), rest
+    weight, (rest,) = _parts(a, both=False)
+    return weight, rest
 
 
 @jax.jit
@@ -60,27 +52,24 @@ def expm_both_parts(
     a: Inexact[Array, "n n"],
 ) -> tuple[Inexact[Array, ""], Inexact[Array, "n n"], Inexact[Array, "n n"]]:
     """`w, p, m` with `exp(a) = w (I + a) + p` and `exp(-a) = w (I - a) + m`, for n = 2 or 3."""
+    weight, (plus, minus) = _parts(a, both=True)
+    return weight, plus, minus
+
+
+def _parts(a: Array, *, both: bool) -> tuple[Array, list[Array]]:
     c, s, scale = _scaled(a)
     square = small_product(a, a)
-    # Those of -a: the k-th from the last has k factors a.
-    opposite = [x if (len(c) - j) % 2 == 0 else -x for j, x in enumerate(c)]
-    both = _taylor(a, square, c, scale), _taylor(-a, square, opposite, scale)
+    matrices = [(a, c)]
+    if both:
+        # The k-th from the last has k factors a.
+        matrices += [(-a, [x if (len(c) - j) % 2 == 0 else -x for j, x in enumerate(c)])]
+    rests = [_taylor(x, square, c, scale) for x, c in matrices]
 
-    def with_squarings(a: Array, both: tuple[Array, Array]) -> tuple[Array, Array]:
-        first = (
-            _exponential(_times_real(scale, a), both[0]),
-            _exponential(_times_real(-scale, a), both[1]),
-        )
-        plus, minus = squared(first, s)
-        return jnp.where(s == 0, both[0], plus), jnp.where(s == 0, both[1], minus)
+    def exponentials(rests: list[Array]) -> list[Array]:
+        pairs = zip(rests, matrices, strict=True)
+        return [plus_identity(rest + _times_real(scale, x)) for rest, (x, _) in pairs]
 
-    is_needed = max_over_batch(s) > 0
-    both = lax.cond(is_needed, jax.checkpoint(with_squarings), lambda a, both: both, a, both)
-    return (s == 0).astype(a.dtype), *both
-
-
-def _exponential(a: Array, rest: Array) -> Array:
-    return rest + a + jnp.eye(a.shape[0], dtype=a.dtype)
+    return (s == 0).astype(a.dtype), squared(rests, exponentials, s)
 
 
 def _scaled(a: Array) -> tuple[list[Array], Array, Array]:

@@ -1,7 +1,7 @@
 """The exponential of a small dense matrix, as a Taylor polynomial with scaling and squaring."""
 
 from collections.abc import Callable, Sequence
-from typing import Any, NamedTuple, TypeVar
+from typing import NamedTuple, TypeVar
 
 import jax
 import jax.numpy as jnp
@@ -11,8 +11,8 @@ from jax import lax
 from jaxtyping import Array, Inexact, PyTree
 
 from . import cayley_hamilton
-from .matmul import small_product
-from .squaring import exponent, max_over_batch, repeat, squarings
+from .matmul import plus_identity, small_product
+from .squaring import exponent, max_over_batch, squared, squarings
 
 T = TypeVar("T", bound=PyTree)
 
@@ -34,7 +34,7 @@ class Scheme(NamedTuple):
 # method from random starts, refined in 60 digits and rounded to double so that 1/2! to 1/6! come
 # out within 1e-17: an error of 1/2! is one of exp(a)ᵀ exp(a), the same in every step. theta is
 # where the backward error of the rest of the series reaches half a unit in the last place.
-# tests/numerics/test_expm.py derives both again.
+# tests/numerics/test_exponentials.py derives both again.
 _DEGREE_15 = Scheme(
     powers=2,
     theta=2.346,
@@ -103,12 +103,6 @@ def one_norm(a: Array) -> Array:
     return jnp.max(jnp.sum(magnitude, axis=0))
 
 
-def _scaling(theta: float, size: Array) -> tuple[Array, Array]:
-    """The number of squarings s for ‖a²‖ = `size`, and 2⁻ˢ (NaN where no s will do)."""
-    s = jnp.maximum((exponent(size / theta**2) + 1) // 2, 0)
-    return squarings(s, size.dtype)
-
-
 def expm(a: Inexact[Array | np.ndarray, "n n"]) -> Inexact[Array, "n n"]:
     """The matrix exponential of `a`, for small dense matrices in loops, batches and derivatives.
 
@@ -164,22 +158,17 @@ def expm_parts(
 
     schemes = TAYLOR_SCHEMES[a.dtype.name]
 
-    def parts(k: int, a: Array, a2: Array, s: Array | None) -> tuple[Array, Array]:
-        rest = taylor_from_second(schemes[k], a, a2)
-        if s is None:
-            return jnp.ones((), a.dtype), rest
-        squared = repeat(lambda x: small_product(x, x), plus_identity(rest + a), s)
-        return (s == 0).astype(a.dtype), jnp.where(s == 0, rest, squared)
-
     n = a.shape[0]
     a = in_full_register(a)
     thetas = [scheme.theta for scheme in schemes]
-    weight, rest = by_norm(thetas, a, small_product(a, a), parts)
+    weight, rest = by_norm(
+        thetas,
+        a,
+        small_product(a, a),
+        lambda k, a, a2: taylor_from_second(schemes[k], a, a2),
+        lambda a, rest: plus_identity(rest + a),
+    )
     return weight, rest[:n, :n]
-
-
-def plus_identity(a: Array) -> Array:
-    return a + jnp.eye(a.shape[0], dtype=a.dtype)
 
 
 def in_full_register(a: Array) -> Array:
@@ -195,15 +184,19 @@ def by_norm(
     thetas: Sequence[float],
     first: PyTree,
     second: PyTree,
-    approximate: Callable[[int, PyTree, PyTree, Any], T],
-) -> T:
-    """`approximate(k, first / 2^s, second / 4^s, s)` with what suits the norm of a.
+    approximate: Callable[[int, PyTree, PyTree], T],
+    start: Callable[[PyTree, T], T],
+    double: Callable[[T], T] | None = None,
+) -> tuple[Array, T]:
+    """What suits the norm of a, in the end by squarings; and first, 0 if some are needed or 1.
 
     **Arguments:**
 
-    - `thetas`: for each k the largest norm it may be used for. With the last one s is the number
-      of squarings that are left to do, with one before it None.
+    - `thetas`: for each k the largest norm that `approximate` may be used for. What is longer is
+      scaled to the last.
     - `first`, `second`: a and a^2, or pytrees whose first leaf they are.
+    - `approximate`: the result, from k, `first / 2^s` and `second / 4^s`, if s is 0.
+    - `start`, `double`: what is doubled otherwise, made of `first / 2^s` and this result, and how.
     """
     *cheaper, theta = thetas
     # ‖a²‖ bounds every even power, and an odd one up to a factor ‖a‖, which is what a backward
@@ -211,14 +204,16 @@ def by_norm(
     a2 = jtu.tree_leaves(second)[0]
     size = one_norm(lax.stop_gradient(a2))
 
-    def scaled(first: PyTree, second: PyTree) -> T:
+    def scaled(first: PyTree, second: PyTree) -> tuple[Array, T]:
+        s = jnp.maximum((exponent(size / theta**2) + 1) // 2, 0)
         # The power of two is locally constant, so its derivative is zero.
-        s, scale = _scaling(theta, size)
-        small, small2 = (
+        s, scale = squarings(s, size.dtype)
+        first, second = (
             jtu.tree_map(lambda x: x * factor.astype(x.dtype), blocks)  # noqa: B023
             for blocks, factor in [(first, scale), (second, scale * scale)]
         )
-        return approximate(len(cheaper), small, small2, s)
+        small = approximate(len(cheaper), first, second)
+        return (s == 0).astype(a2.dtype), squared(small, lambda x: start(first, x), s, double)
 
     # Up to size 4 products fuse with what is around them, and a branch costs more than one saves.
     if not cheaper or a2.shape[0] <= 4:
@@ -227,7 +222,7 @@ def by_norm(
     # A size of NaN is scaled, and stays NaN.
     return lax.cond(
         max_over_batch(size) <= cheaper[0] ** 2,
-        lambda first, second: approximate(0, first, second, None),
+        lambda first, second: (jnp.ones((), a2.dtype), approximate(0, first, second)),
         jax.checkpoint(scaled),
         first,
         second,

@@ -12,8 +12,8 @@ import numpy as np
 from jax import lax
 from jaxtyping import Array, Float
 
-from .matmul import matmul
-from .squaring import max_over_batch
+from .matmul import matmul, plus_identity
+from .squaring import exponent, max_over_batch, squarings
 
 # On shorter intervals the error of the second derivative at zero, `eps / length^2`, would show.
 _SHORTEST = 0.1
@@ -69,7 +69,7 @@ def phi_1_action(
     _, total = lax.scan(step, (b, b), coefficients)[0]
     return lax.cond(
         bound > intervals[-1].astype(b.dtype),
-        jax.checkpoint(lambda total: _phi_1(*dense(), bound, b)),
+        jax.checkpoint(lambda total: _by_squaring(*dense(), bound, b)),
         lambda total: total,
         total,
     )
@@ -112,29 +112,25 @@ def _chebyshev(degree: int, length: Fraction) -> list[Fraction]:
     return powers
 
 
-def _phi_1(
+def _by_squaring(
     a: Float[Array, "m m"], scale: Float[Array, " m"], bound: Float[Array, ""], b: Array
 ) -> Array:
-    """`phi_1(a) b` for every norm: `exp [[a, b], [0, 0]]` by scaling and squaring."""
+    """`phi_1(a) b` from `exp [[a, b], [0, 0]]`, in a shorter program than `phi_1_times`."""
     m, k = b.shape
     # The result does not depend on the scales.
     scale = lax.stop_gradient(scale)[:, None]
-    s = jnp.maximum(jnp.ceil(jnp.log2(bound)), 0)
-    top = jnp.concatenate([a * scale.T / scale, b / scale], axis=1) * jnp.exp2(-s)
+    s, power = squarings(jnp.maximum(exponent(bound), 0), b.dtype)
+    top = jnp.concatenate([a * scale.T / scale, b / scale], axis=1) * power
     x = jnp.pad(top, ((0, k), (0, 0)))
 
     def add(carry: tuple[Array, Array], degree: Array) -> tuple[tuple[Array, Array], None]:
-        term, total = carry
-        term = matmul(x, term) / degree
-        return (term, total + term), None
+        term = matmul(x, carry[0]) / degree
+        return (term, carry[1] + term), None
 
     def square(x: Array, n: Array) -> tuple[Array, None]:
         return lax.cond(n < s, lambda x: matmul(x, x), lambda x: x, x), None
 
-    one = jnp.eye(m + k, dtype=b.dtype)
     # The norm is 1 at most, and 1 / 20! is below rounding.
-    (_, e), _ = lax.scan(add, (x, one + x), jnp.arange(2, 20, dtype=b.dtype))
-    # Every squaring doubles the error: after as many as there are digits, none is left.
-    nmant = jnp.finfo(b.dtype).nmant
-    e, _ = lax.scan(square, e, jnp.arange(nmant, dtype=b.dtype))
-    return jnp.where(s <= nmant, scale * e[:m, m:], jnp.nan)
+    (_, e), _ = lax.scan(add, (x, plus_identity(x)), jnp.arange(2, 20, dtype=b.dtype))
+    e, _ = lax.scan(square, e, jnp.arange(jnp.finfo(b.dtype).nmant, dtype=s.dtype))
+    return scale * e[:m, m:]

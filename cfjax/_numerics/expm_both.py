@@ -6,9 +6,8 @@ import jax.numpy as jnp
 from jaxtyping import Array, Inexact
 
 from . import cayley_hamilton
-from .expm import by_norm, in_full_register, plus_identity, weighted_sum
-from .matmul import small_product
-from .squaring import repeat
+from .expm import by_norm, in_full_register, weighted_sum
+from .matmul import plus_identity, small_product
 
 # `Z^4 + 120 Z^3`, which both polynomials contain, as Z² times these weights of Z and Z².
 _SHARED = (120.0, 1.0)
@@ -28,7 +27,7 @@ _ODD = (
     tuple(w / (240 * math.factorial(15)) for w in (3278592, 36000, 1)),
     (1 / 6, 5275939 / 945945000, 509 / 363242880),
 )
-# Where the backward error reaches half a unit in the last place. tests/numerics/test_expm_both.py
+# Where the backward error reaches half a unit in the last place. tests/numerics/test_exponentials.py
 # derives the weights and these.
 _THETA = {"float32": 2.645, "float64": 0.862}
 
@@ -50,21 +49,20 @@ def expm_both_parts(
     if a.shape[0] in (2, 3):
         return cayley_hamilton.expm_both_parts(a)
 
-    def parts(k: int, a: Array, z: Array, s: Array) -> tuple[Array, Array, Array]:
+    def approximate(_: int, a: Array, z: Array) -> tuple[Array, Array]:
         z2 = small_product(z, z)
         known = [z, z2, small_product(z2, weighted_sum(_SHARED, [z, z2]))]
         even, odd = _evaluated(_EVEN, known), small_product(a, _evaluated(_ODD, known))
-        both = even + odd, even - odd
-        squared = tuple(plus_identity(rest + x) for rest, x in zip(both, (a, -a), strict=True))
-        squared = repeat(lambda x: tuple(small_product(y, y) for y in x), squared, s)
-        p, m = (jnp.where(s == 0, *pair) for pair in zip(both, squared, strict=True))
-        return (s == 0).astype(a.dtype), p, m
+        return even + odd, even - odd
+
+    def start(a: Array, both: tuple[Array, Array]) -> tuple[Array, Array]:
+        return plus_identity(both[0] + a), plus_identity(both[1] - a)
 
     n = a.shape[0]
     a = in_full_register(a)
     theta = _THETA[jnp.finfo(a.dtype).dtype.name]
-    weight, p, m = by_norm([theta], a, small_product(a, a), parts)
-    return weight, p[:n, :n], m[:n, :n]
+    weight, (plus, minus) = by_norm([theta], a, small_product(a, a), approximate, start)
+    return weight, plus[:n, :n], minus[:n, :n]
 
 
 def _evaluated(rows: tuple[tuple[float, ...], ...], known: list[Array]) -> Array:

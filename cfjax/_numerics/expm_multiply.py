@@ -17,7 +17,7 @@ from .squaring import max_over_batch
 
 # Of Taylor polynomials of growing degree, beginning with these, the largest norm for which they
 # have a backward error below half a unit in the last place; up to where the terms grow and cancel.
-# As in Table 3.1 of Al-Mohy & Higham; tests/numerics/test_expm_multiply.py derives them.
+# As in Table 3.1 of Al-Mohy & Higham; tests/numerics/test_kernels.py derives them.
 FIRST_DEGREE = {"float32": 3, "float64": 5}
 LONGEST = {
     "float32": [
@@ -136,7 +136,7 @@ def _by_products(product: Callable[[Array], Array], x: Array, chosen: _Chosen) -
         jnp.zeros_like(x),
         pieces,
         root=_ROOT_OF_MOST,
-        is_mostly_one=True,
+        mostly=1,
     )
     return _by_real(moved, lambda x: jnp.where(possible, x, jnp.nan))
 

@@ -1,20 +1,12 @@
 """The exponential of a dense matrix, and what a constant source adds to a congruence by it."""
 
-import jax.numpy as jnp
 from jaxtyping import Array, Inexact
 
-from .expm import (
-    TAYLOR_SCHEMES,
-    by_norm,
-    in_full_register,
-    plus_identity,
-    taylor_from_second,
-)
-from .matmul import small_product
-from .squaring import repeat
+from .expm import TAYLOR_SCHEMES, by_norm, in_full_register, taylor_from_second
+from .matmul import plus_identity, small_product
 
 # The backward error in the source has a factor k in its k-th term, so norms must be smaller.
-# tests/numerics/test_expm_source.py derives it.
+# tests/numerics/test_exponentials.py derives it.
 _SMALLER = 0.83
 
 # Block matrices `[[a, q], [0, b^H]]`.
@@ -39,23 +31,25 @@ def expm_parts_with_source(
     """
     schemes = TAYLOR_SCHEMES[a.dtype.name]
 
-    def parts(
-        k: int, first: tuple[Array, Array], second: tuple[Array, Array], s: Array | None
-    ) -> tuple[Array, Array, Array]:
+    def approximate(
+        k: int, first: tuple[Array, Array], second: tuple[Array, Array]
+    ) -> tuple[Array, Array]:
         (a, q), (a2, aq) = first, second
         rest, source, _ = taylor_from_second(schemes[k], (a, q, -a), (a2, aq, a2), _block_product)
-        e = plus_identity(rest + a)
-        g = small_product(q + source, _adjoint(e))
-        if s is None:
-            return jnp.ones((), a.dtype), rest, g
-        e, g = repeat(_doubled, (e, g), s)
-        return (s == 0).astype(a.dtype), jnp.where(s == 0, rest, e), g
+        return rest, small_product(q + source, _adjoint(plus_identity(rest + a)))
 
     n = a.shape[0]
     a, q = in_full_register(a), in_full_register(q)
     second = small_product(a, a), small_product(a, q) - small_product(q, _adjoint(a))
     thetas = [_SMALLER * scheme.theta for scheme in schemes]
-    weight, rest, g = by_norm(thetas, (a, q), second, parts)
+    weight, (rest, g) = by_norm(
+        thetas,
+        (a, q),
+        second,
+        approximate,
+        lambda first, small: (plus_identity(small[0] + first[0]), small[1]),
+        _doubled,
+    )
     return weight, rest[:n, :n], g[:n, :n]
 
 

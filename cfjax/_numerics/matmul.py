@@ -51,3 +51,7 @@ def small_product(x: Array, y: Array) -> Array:
             return jnp.sum(x[:, None] * y, axis=0)
         return jnp.sum(x * y[None, :] if y.ndim == 1 else x[:, :, None] * y[None, :, :], axis=1)
     return matmul(x, y)
+
+
+def plus_identity(a: Inexact[Array, "n n"]) -> Inexact[Array, "n n"]:
+    return a + jnp.eye(a.shape[0], dtype=a.dtype)

@@ -10,12 +10,11 @@ from .expm import (
     by_norm,
     in_full_register,
     one_norm,
-    plus_identity,
     taylor_from_second,
 )
 from .expm_multiply import FIRST_DEGREE, LONGEST
-from .matmul import matmul, promoted, small_product
-from .squaring import max_over_batch, repeat
+from .matmul import matmul, plus_identity, promoted, small_product
+from .squaring import max_over_batch
 
 # So many terms of Taylor's series.
 _DEGREES = {"float32": (5, 10, 15), "float64": (12, 16, 20, 25)}
@@ -70,20 +69,24 @@ def phi_1_times(a: Inexact[Array, "n n"], v: Inexact[Array, " n"]) -> Inexact[Ar
 
 def _by_squaring(a: Array, v: Array) -> Array:
     """From exp([[a, v], [0, 0]]) = [[exp(a), phi_1(a) v], [0, 1]]."""
-    schemes = TAYLOR_SCHEMES[a.dtype.name]
+    scheme = TAYLOR_SCHEMES[a.dtype.name][-1]
 
-    def parts(k: int, first: _Pair, second: _Pair, s: Array | None) -> Array:
-        (a, v), rest = first, taylor_from_second(schemes[k], first, second, _product)
-        v = v + rest[1]
-        if s is None:
-            return v
-        return repeat(_doubled, (plus_identity(rest[0] + a), v), s)[1]
+    def approximate(_: int, first: _Pair, second: _Pair) -> _Pair:
+        rest, moved = taylor_from_second(scheme, first, second, _product)
+        return rest, first[1] + moved
 
-    n = v.shape[0]
+    n = len(v)
     a = in_full_register(a)
-    v = jnp.pad(v, (0, a.shape[0] - n))
-    thetas = [scheme.theta for scheme in schemes]
-    return by_norm(thetas, (a, v), _product((a, v), (a, v)), parts)[:n]
+    v = jnp.pad(v, (0, len(a) - n))
+    _, (_, moved) = by_norm(
+        [scheme.theta],
+        (a, v),
+        _product((a, v), (a, v)),
+        approximate,
+        lambda first, small: (plus_identity(small[0] + first[0]), small[1]),
+        _doubled,
+    )
+    return moved[:n]
 
 
 def _product(x: _Pair, y: _Pair) -> _Pair:

@@ -13,8 +13,8 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
-from .stumpff import cotangent_excess, stumpff_1_2_apart
-from .vectors import Vector, entries, pack
+from .stumpff import dexpinv_times, stumpff_1_to_3_apart
+from .vectors import Vector, entries, pack, plus
 
 
 @functools.partial(jax.jit, static_argnames="frame")
@@ -30,15 +30,8 @@ def increment(
     w: Float[Array, ""], v: Float[Array, "2"], x: Float[Array, "..."], frame: str
 ) -> Float[Array, "..."]:
     """What `x` moves by in unit time, with a rounding as small as it is."""
-    near, d1, d2 = stumpff_1_2_apart(w * w)
-
-    def way(w: Array, u: Vector) -> Vector:
-        # What c_1 and c_2 are at zero is apart for the reason that `rotate.increment` gives.
-        return [
-            near * (a + b / 2) + (d1 * a + d2 * b) for a, b in zip(u, _times_i(w, u), strict=True)
-        ]
-
-    return _moved(way, w, v, x, frame)
+    exponential = stumpff_1_to_3_apart(w * w)
+    return _moved(lambda w, u: exponential.increment(u, _times_i(w, u)), w, v, x, frame)
 
 
 @jax.jit
@@ -46,8 +39,7 @@ def bracket(
     w1: Float[Array, ""], v1: Float[Array, "2"], w2: Float[Array, ""], v2: Float[Array, "2"]
 ) -> tuple[Float[Array, ""], Float[Array, "2"]]:
     """`ab - ba` for the matrices a and b of two motions."""
-    v = _plus(_times_i(w1, [v2[0], v2[1]]), _times_i(-w2, [v1[0], v1[1]]))
-    return jnp.zeros_like(w1), pack(v, sums=True)
+    return jnp.zeros_like(w1), pack(_bracket(w1, v1, w2, v2), sums=True)
 
 
 @jax.jit
@@ -55,18 +47,16 @@ def dexpinv(
     w1: Float[Array, ""], v1: Float[Array, "2"], w2: Float[Array, ""], v2: Float[Array, "2"]
 ) -> tuple[Float[Array, ""], Float[Array, "2"]]:
     """The inverse derivative of the exponential at the first motion, of the second."""
-    excess = cotangent_excess(w1 * w1)
     # Of two motions the bracket has no rotation: a translation, u, which the first one turns.
-    u = _plus(_times_i(w1, [v2[0], v2[1]]), _times_i(-w2, [v1[0], v1[1]]))
-    bent = [excess * b - a / 2 for a, b in zip(u, _times_i(w1, u), strict=True)]
-    return w2, pack(_plus([v2[0], v2[1]], bent), sums=True)
+    u = _bracket(w1, v1, w2, v2)
+    return w2, pack(dexpinv_times(w1 * w1, entries(v2), u, _times_i(w1, u)), sums=True)
 
 
 def _moved(
     way: Callable[[Array, Vector], Vector], w: Array, v: Array, x: Array, frame: str
 ) -> Array:
     """What `x` moves by, where `way` makes it of a velocity that turns with w."""
-    vs = [v[0], v[1]]
+    vs = entries(v)
     if x.ndim == 2 and frame == "body":
         # A row of the matrix turns with -w.
         r0, r1 = x[:, 0], x[:, 1]
@@ -75,13 +65,13 @@ def _moved(
     numbers = entries(x)
     if x.ndim == 2:
         *rows, last = numbers
-        u = _plus(_times_i(w, rows), [last * a for a in vs])
+        u = plus(_times_i(w, rows), [last * a for a in vs])
         return pack([*way(w, u), jnp.zeros_like(last)], sums=True)
     z, place = numbers[:-2], numbers[-2:]
     if frame == "fixed":
-        u = _plus(_times_i(w, place), vs)
+        u = plus(_times_i(w, place), vs)
     else:
-        u = _plus([z[0] * a for a in vs], _times_i(z[1], vs))
+        u = plus([z[0] * a for a in vs], _times_i(z[1], vs))
     turned = way(w, _times_i(w, z)) if z else []
     return pack([*turned, *way(w, u)], sums=True)
 
@@ -91,5 +81,5 @@ def _times_i(w: Any, x: Vector) -> Vector:
     return [-(w * x[1]), w * x[0]]
 
 
-def _plus(a: Vector, b: Vector) -> Vector:
-    return [a[0] + b[0], a[1] + b[1]]
+def _bracket(w1: Array, v1: Array, w2: Array, v2: Array) -> Vector:
+    return plus(_times_i(w1, entries(v2)), _times_i(-w2, entries(v1)))

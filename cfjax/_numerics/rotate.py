@@ -3,7 +3,7 @@
 import jax
 from jaxtyping import Array, Float
 
-from .stumpff import cotangent_excess, stumpff_1_2_apart
+from .stumpff import dexpinv_times, stumpff_1_to_3_apart
 from .vectors import cross, dot, entries, pack
 
 
@@ -24,27 +24,16 @@ def rotate(a: Float[Array, "3"], x: Float[Array, "3 *k"]) -> Float[Array, "3 *k"
 
 @jax.jit
 def increment(a: Float[Array, "3"], x: Float[Array, "3 *k"]) -> Float[Array, "3 *k"]:
-    """`rotate(a, x) - x`, with a rounding as small as it is.
-
-    The rounding of c_1 and c_2 is the same in every step of equal angle, so lengths would drift
-    in proportion to the number of steps. What c_1 and c_2 are at zero is exact, and is kept apart:
-    then the roundings are smaller by the square of the angle.
-    """
+    """`rotate(a, x) - x`, with a rounding as small as it is."""
     axis = entries(a)
-    near, d1, d2 = stumpff_1_2_apart(dot(axis, axis))
     once = cross(axis, entries(x))
-    twice = cross(axis, once)
-    return pack(
-        [near * (once[i] + twice[i] / 2) + (d1 * once[i] + d2 * twice[i]) for i in range(3)],
-        sums=True,
-    )
+    exponential = stumpff_1_to_3_apart(dot(axis, axis))
+    return pack(exponential.increment(once, cross(axis, once)), sums=True)
 
 
 @jax.jit
 def dexpinv(a: Float[Array, "3"], x: Float[Array, "3"]) -> Float[Array, "3"]:
     """The inverse derivative of the exponential at `a`, `x - a*x/2 + a*(a*x)/12 - ...`."""
-    axis = entries(a)
-    excess = cotangent_excess(dot(axis, axis))
-    once = cross(axis, entries(x))
-    twice = cross(axis, once)
-    return pack([x[i] + (excess * twice[i] - once[i] / 2) for i in range(3)], sums=True)
+    axis, xs = entries(a), entries(x)
+    once = cross(axis, xs)
+    return pack(dexpinv_times(dot(axis, axis), xs, once, cross(axis, once)), sums=True)

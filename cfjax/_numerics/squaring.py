@@ -11,12 +11,14 @@ from jax import lax
 from jax.custom_batching import custom_vmap
 from jaxtyping import Array, Int, PyTree, Real
 
+from .loop import loop
 from .matmul import small_product
 
 T = TypeVar("T", bound=PyTree)
 
-# Squarings beyond these go through a loop: each one written out costs compile time everywhere.
-_WRITTEN_OUT = 4
+# The square root of the most squarings, which are as many as there are digits, or more.
+_ROOT_OF_MOST = 8
+_MOSTLY = 4
 
 
 def exponent(size: Real[Array, ""]) -> Int[Array, ""]:
@@ -50,52 +52,26 @@ def _(axis_size: int, in_batched: list[bool], s: Array) -> tuple[Array, bool]:
     return max_over_batch(jnp.max(s, initial=0)), False
 
 
-def repeat(step: Callable[[T], T], x: T, s: Array) -> T:
-    """`step` s times. A loop of branches, since one of unknown length has no reverse mode."""
+def squared(
+    small: T, start: Callable[[T], T], s: Int[Array, ""], double: Callable[[T], T] | None = None
+) -> T:
+    """`small` where s is 0, otherwise `start(small)` doubled s times: if not said how, squared.
+
+    Each member of a batch as often as it needs.
+    """
+    double = double or (lambda x: jtu.tree_map(lambda x: small_product(x, x), x))
     most = max_over_batch(s)
 
-    # Without checkpoints the branch not taken must still hand out room for what the other saves.
-    @jax.checkpoint
-    def once(x: T, k: int | Array) -> T:
-        return jtu.tree_map(lambda new, old: jnp.where(k < s, new, old), step(x), x)
+    def double_if(k: Array, x: T) -> T:
+        return _where(k < s, double(x), x)
 
-    def step_if(x: T, k: int | Array) -> tuple[T, None]:
-        return lax.cond(k < most, once, lambda x, k: x, x, k), None
+    def with_squarings(small: T) -> T:
+        whole = loop(double_if, start(small), most, root=_ROOT_OF_MOST, mostly=_MOSTLY)
+        return _where(s == 0, small, whole)
 
-    @jax.checkpoint
-    def many(x: T) -> T:
-        digits = jnp.finfo(jtu.tree_leaves(x)[0].dtype).nmant
-        ks = jnp.arange(_WRITTEN_OUT, digits, dtype=s.dtype)
-        return lax.scan(step_if, x, ks)[0]
-
-    for k in range(_WRITTEN_OUT):
-        x, _ = step_if(x, k)
-    return lax.cond(most > _WRITTEN_OUT, many, lambda x: x, x)
+    # Without a checkpoint the branch not taken must still hand out room for what the other saves.
+    return lax.cond(most > 0, jax.checkpoint(with_squarings), lambda small: small, small)
 
 
-@jax.custom_jvp
-def squared(x: T, s: Int[Array, ""]) -> T:
-    """Square matrices to the power 2^s. Compiles faster than `repeat`."""
-    return lax.fori_loop(0, max_over_batch(s), lambda k, x: _square_if(k < s, x), x)
-
-
-@squared.defjvp
-def _(primals, tangents):
-    x, s = primals
-    most = max_over_batch(s)
-    digits = jnp.finfo(jtu.tree_leaves(x)[0].dtype).nmant
-    ks = jnp.arange(-(-digits // 4) * 4, dtype=s.dtype).reshape(-1, 4)
-
-    # A loop of unknown length has no reverse mode. Four at a time, as most are not needed.
-    @jax.checkpoint
-    def four(x: T, ks: Array) -> T:
-        return lax.scan(lambda x, k: (_square_if(k < s, x), None), x, ks)[0]
-
-    def four_if(x: T, ks: Array) -> tuple[T, None]:
-        return lax.cond(ks[0] < most, four, lambda x, ks: x, x, ks), None
-
-    return jax.jvp(lambda x: lax.scan(four_if, x, ks)[0], (x,), tangents[:1])
-
-
-def _square_if(condition: Array, x: T) -> T:
-    return jtu.tree_map(lambda x: jnp.where(condition, small_product(x, x), x), x)
+def _where(condition: Array, x: T, y: T) -> T:
+    return jtu.tree_map(lambda x, y: jnp.where(condition, x, y), x, y)

@@ -12,7 +12,7 @@ from jax import lax
 from jaxtyping import Array, Float
 
 from .polynomial import polynomial
-from .vectors import smooth
+from .vectors import Vector, smooth
 
 
 def stumpff(n: int, s: Float[Array | np.ndarray, "*batch"]) -> Float[Array, "*batch"]:
@@ -45,71 +45,45 @@ def stumpff(n: int, s: Float[Array | np.ndarray, "*batch"]) -> Float[Array, "*ba
     s = jnp.asarray(s)
     if s.dtype not in (jnp.float32, jnp.float64):
         raise TypeError(f"s must be float32 or float64, got {s.dtype}.")
-    return _stumpff(n, jnp.where(s >= 0, s, jnp.nan))
+    return _stumpff_to(max(n, 3), jnp.where(s >= 0, s, jnp.nan))[n]
 
 
-@functools.partial(jax.custom_jvp, nondiff_argnums=(0,))
-@smooth
-def _stumpff(n: int, s: Float[Array, "*batch"]) -> Float[Array, "*batch"]:
-    if n == 0:
-        return 1 - s * _stumpff(2, s)
-    if n <= 2:
-        return stumpff_1_2(s)[n - 1]
-    # The recursion loses digits to cancellation for small s, the series for large s.
-    small = s < 16
-    coefficients = [(-1) ** j / factorial(n + 2 * j) for j in range(18)]
-    series = polynomial(coefficients, jnp.where(small, s, 0))
-    recursion = (1 / factorial(n - 2) - _stumpff(n - 2, s)) / jnp.where(small, 1, s)
-    return jnp.where(small, series, recursion)
+class Exponential(NamedTuple):
+    """`exp(A) = I + c_1 A + c_2 A^2` for an A with `A^3 = -s A`, and `c_3`.
 
-
-@_stumpff.defjvp
-def _(n, primals, tangents):
-    (s,), (s_dot,) = primals, tangents
-    return _stumpff(n, s), (n * _stumpff(n + 2, s) - _stumpff(n + 1, s)) / 2 * s_dot
-
-
-def stumpff_1_2(s: Float[Array, "*batch"]) -> tuple[Float[Array, "*batch"], Float[Array, "*batch"]]:
-    """`stumpff(1, s)` and `stumpff(2, s)` together, for the price of one and a half."""
-    near, d1, d2 = stumpff_1_2_apart(s)
-    return near + d1, near / 2 + d2
-
-
-@jax.custom_jvp
-def stumpff_1_2_apart(s: Float[Array, "*batch"]) -> tuple[Float[Array, "*batch"], ...]:
-    """`n, d1, d2` with `c_1 = n + d1` and `c_2 = n / 2 + d2`. n is 1 up to half a turn, 0 beyond.
-
-    So for a small s the roundings of d1 and d2 are as small as s.
+    `c_1 = near + d1` and `c_2 = near / 2 + d2`, where `near` is 1 up to half a turn and 0 beyond.
+    The rounding of c_1 and c_2 is the same in every step of equal angle, so lengths would drift in
+    proportion to the number of steps. What they are at zero is exact, and is kept apart: then the
+    roundings are smaller by the square of the angle.
     """
-    return _apart(s)[:3]
 
+    near: Array
+    d1: Array
+    d2: Array
+    c3: Array
 
-@stumpff_1_2_apart.defjvp
-def _(primals, tangents):
-    (s,), (s_dot,) = primals, tangents
-    near, d1, d2 = stumpff_1_2_apart(s)
-    _, c2, c3, c4 = _stumpff_1_to(4, s)
-    return (near, d1, d2), (jnp.zeros_like(s), (c3 - c2) / 2 * s_dot, (c4 - c3 / 2) * s_dot)
+    def increment(self, once: Vector, twice: Vector) -> Vector:
+        """`exp(A) x - x` from `A x` and `A^2 x`."""
+        near, d1, d2, _ = self
+        return [near * (a + b / 2) + (d1 * a + d2 * b) for a, b in zip(once, twice, strict=True)]
 
 
 @jax.custom_jvp
-def stumpff_1_to_3_apart(s: Float[Array, "*batch"]) -> tuple[Float[Array, "*batch"], ...]:
-    """`n, d1, d2` as of `stumpff_1_2_apart`, and `c_3`, for the price of the three."""
+def stumpff_1_to_3_apart(s: Float[Array, "*batch"]) -> Exponential:
     return _apart(s)
 
 
 @stumpff_1_to_3_apart.defjvp
 def _(primals, tangents):
     (s,), (s_dot,) = primals, tangents
-    near, d1, d2, c3 = stumpff_1_to_3_apart(s)
-    _, c2, _, c4, c5, _ = _stumpff_1_to(6, s)
+    _, _, c2, c3, c4, c5 = _stumpff_to(5, s)
     slopes = (jnp.zeros_like(s), (c3 - c2) / 2, c4 - c3 / 2, (3 * c5 - c4) / 2)
-    return (near, d1, d2, c3), tuple(slope * s_dot for slope in slopes)
+    return stumpff_1_to_3_apart(s), Exponential(*(slope * s_dot for slope in slopes))
 
 
 @smooth
-def _apart(s: Float[Array, "*batch"]) -> tuple[Float[Array, "*batch"], ...]:
-    constants = _DOUBLE if s.dtype == jnp.float64 else _SINGLE
+def _apart(s: Float[Array, "*batch"]) -> Exponential:
+    constants = _constants(s)
     turns, inverse = _turns(s, constants)
     near = jnp.where(turns == 0, 1, jnp.zeros_like(s))
     excess = turns * ((2 * pi) * inverse)
@@ -122,28 +96,34 @@ def _apart(s: Float[Array, "*batch"]) -> tuple[Float[Array, "*batch"], ...]:
     d2 = (square * z) * p2 + square * ((1 - near) / 2)
     # Without a full turn the inverse may be too large to be squared.
     c3 = (excess * inverse) * inverse - (scale * square) * p1
-    return near, d1, d2, c3
+    return Exponential(near, d1, d2, c3)
+
+
+def dexpinv_times(s: Array, x: Vector, once: Vector, twice: Vector) -> Vector:
+    """The inverse derivative of the exponential at u, of x, from `[u, x]` and `[u, [u, x]]`.
+
+    In a Lie algebra with `ad_u^3 = -s ad_u` it is `x - [u, x] / 2 + excess [u, [u, x]]`.
+    """
+    excess = cotangent_excess(s)
+    return [c + (excess * b - a / 2) for a, b, c in zip(once, twice, x, strict=True)]
 
 
 @smooth
 def cotangent_excess(s: Float[Array, "*batch"]) -> Float[Array, "*batch"]:
     """`(1 - x/2 cot(x/2)) / x^2` with `s = x^2`, which is 1/12 at zero, and smooth there.
 
-    In a Lie algebra with `ad_u^3 = -s ad_u` the inverse derivative of the exponential at u is `1 -
-    ad_u / 2 + (this) ad_u^2`. It is `sum_k 2 / (4 pi^2 k^2 - s)`: a pole at a full turn, and a
-    polynomial to rounding. From the full turn on, where the exponential is not invertible, it is
-    1/12.
+    It is `sum_k 2 / (4 pi^2 k^2 - s)`: a pole at a full turn, and a polynomial to rounding. From
+    the full turn on, where the exponential is not invertible, it is 1/12.
     """
     pole = 4 * pi**2
     s = jnp.where(s < pole, s, 0)
-    constants = _DOUBLE if s.dtype == jnp.float64 else _SINGLE
-    return 2 * _reciprocal(pole - s) + polynomial(constants.excess, s)
+    return 2 * _reciprocal(pole - s) + polynomial(_constants(s).excess, s)
 
 
 @jax.custom_jvp
 def _reciprocal(x: Float[Array, "*batch"]) -> Float[Array, "*batch"]:
     """`1 / x` for a positive x, without a division, which XLA would materialise. See `_turns`."""
-    constants = _DOUBLE if x.dtype == jnp.float64 else _SINGLE
+    constants = _constants(x)
     bits = lax.bitcast_convert_type(x, constants.bits)
     # Off by 5.1 % at most.
     guess = lax.bitcast_convert_type(constants.reciprocal_seed - bits, x.dtype)
@@ -161,40 +141,30 @@ def _(primals, tangents):
 
 @functools.partial(jax.custom_jvp, nondiff_argnums=(0,))
 @smooth
-def _stumpff_1_to(n: int, s: Float[Array, "*batch"]) -> tuple[Float[Array, "*batch"], ...]:
-    """`c_1` to `c_n`, for an even `n >= 4`, without the branches and divisions of `stumpff`.
+def _stumpff_to(n: int, s: Float[Array, "*batch"]) -> tuple[Float[Array, "*batch"], ...]:
+    """`c_0` to `c_n`, for `n >= 3`, which a derivative of high order needs together.
 
-    A loop of small steps would feel these, and a derivative of high order needs all of them.
+    Without branches and divisions, which a loop of small steps would feel.
     """
-    constants = _DOUBLE if s.dtype == jnp.float64 else _SINGLE
-    turns, inverse = _turns(s, constants)
-    # Without a full turn `inverse` may be too large to be squared.
-    inverse = jnp.where(turns == 0, 0, inverse)
-    excess = turns * ((2 * pi) * inverse)
-    scale = 1 - excess
-    square = scale * scale
-    z = s * square
-    c1, c3 = (polynomial(c, z) for c in (constants.sin, [-c for c in constants.sin[1:]]))
-    c2, c4 = (polynomial(c, z) for c in (constants.versin, [-c for c in constants.versin[1:]]))
-    # With the reduced angle y = scale x: x - sin x = (x - y) + (y - sin y), and likewise c_4.
-    inverse = inverse * inverse
-    c3 = scale * (square * c3) + excess * inverse
-    c4 = square * (square * c4) + (excess * (1 + scale)) * (inverse / 2)
-    c = [scale * c1, square * c2, c3, c4]
-    for k in range(5, n + 1):
-        # Up to half a turn the series, whose terms fall below the rounding; beyond, the recursion
-        # loses no digits.
-        series = polynomial([(-1) ** j / factorial(k + 2 * j) for j in range(13)], z)
-        recursion = (1 / factorial(k - 2) - c[k - 3]) * inverse
-        c.append(jnp.where(turns == 0, series, recursion))
+    near, d1, d2, c3 = _apart(s)
+    c2 = near / 2 + d2
+    c = [1 - s * c2, near + d1, c2, c3]
+    _, inverse = _turns(s, _constants(s))
+    # The recursion loses digits to cancellation for small s, the series for large s.
+    small = s < 16
+    for k in range(4, n + 1):
+        terms = [(-1) ** j / factorial(k + 2 * j) for j in range(18)]
+        series = polynomial(terms, jnp.where(small, s, 0))
+        recursion = (1 / factorial(k - 2) - c[k - 2]) * (inverse * inverse)
+        c.append(jnp.where(small, series, recursion))
     return tuple(c)
 
 
-@_stumpff_1_to.defjvp
+@_stumpff_to.defjvp
 def _(n, primals, tangents):
     (s,), (s_dot,) = primals, tangents
-    c = _stumpff_1_to(n + 2, s)
-    return c[:n], tuple((k * c[k + 1] - c[k]) / 2 * s_dot for k in range(1, n + 1))
+    c = _stumpff_to(n + 2, s)
+    return c[: n + 1], tuple((k * c[k + 2] - c[k + 1]) / 2 * s_dot for k in range(n + 1))
 
 
 class _Constants(NamedTuple):
@@ -208,6 +178,10 @@ class _Constants(NamedTuple):
     seed: int
     reciprocal_seed: int
     bits: type
+
+
+def _constants(x: Array) -> _Constants:
+    return _DOUBLE if x.dtype == jnp.float64 else _SINGLE
 
 
 def _turns(

@@ -31,6 +31,10 @@ def cross(a: Vector, b: Vector) -> Vector:
     ]
 
 
+def plus(a: Vector, b: Vector) -> Vector:
+    return [x + y for x, y in zip(a, b, strict=True)]
+
+
 def dot(a: Vector, b: Vector) -> Any:
     """The inner product of two vectors of three entries."""
     return a[0] * b[0] + a[1] * b[1] + a[2] * b[2]
