@@ -17,7 +17,7 @@ from jax import lax
 from jaxtyping import Array, Inexact
 
 from .matmul import plus_identity, small_product
-from .squaring import exponent, squared, squarings
+from .squaring import exponent, magnitude, squared, squarings
 from .vectors import materialised, unpack
 
 # Of Taylor's polynomial.
@@ -101,21 +101,17 @@ def _characteristic(a: Array) -> tuple[list[Array], list[Array]]:
     x = {(i, j): entries[n * i + j] for i in range(n) for j in range(n)}
     pairs = {(i, j): x[i, j] * x[j, i] for i in range(n) for j in range(i, n)}
     minors = [pair - x[i, i] * x[j, j] for (i, j), pair in pairs.items() if i < j]
-    squares = _plus(*((1 + (i < j)) * _magnitude(pair) for (i, j), pair in pairs.items()))
+    squares = _plus(*((1 + (i < j)) * magnitude(pair) for (i, j), pair in pairs.items()))
     if n == 2:
         return [minors[0], x[0, 0] + x[1, 1]], [squares]
     around = [x[0, 1] * x[1, 2] * x[2, 0], x[0, 2] * x[2, 1] * x[1, 0]]
     rest = x[0, 0] * minors[2] + x[2, 2] * pairs[0, 1] + x[1, 1] * pairs[0, 2]
     c = [around[0] + around[1] - rest, _plus(*minors), x[0, 0] + x[1, 1] + x[2, 2]]
-    return c, [squares, _plus(*map(_magnitude, around))]
+    return c, [squares, _plus(*map(magnitude, around))]
 
 
 def _times_real(factor: Array, x: Array) -> Array:
     return lax.complex(factor * x.real, factor * x.imag) if jnp.iscomplexobj(x) else factor * x
-
-
-def _magnitude(x: Array) -> Array:
-    return jnp.abs(x.real) + jnp.abs(x.imag) if jnp.iscomplexobj(x) else jnp.abs(x)
 
 
 def _taylor(a: Array, square: Array, c: list[Array], scale: Array) -> Array:

@@ -12,7 +12,7 @@ from jaxtyping import Array, Inexact, PyTree
 
 from . import cayley_hamilton
 from .matmul import plus_identity, small_product
-from .squaring import exponent, max_over_batch, squared, squarings
+from .squaring import exponent, magnitude, max_over_batch, squared, squarings
 
 T = TypeVar("T", bound=PyTree)
 
@@ -98,9 +98,8 @@ def taylor_from_second(
 
 
 def one_norm(a: Array) -> Array:
-    """The 1-norm, with |re| + |im| for the absolute value: consistent too, and without a hypot."""
-    magnitude = jnp.abs(a.real) + jnp.abs(a.imag) if jnp.iscomplexobj(a) else jnp.abs(a)
-    return jnp.max(jnp.sum(magnitude, axis=0))
+    """The 1-norm, with the magnitude for the absolute value: consistent too."""
+    return jnp.max(jnp.sum(magnitude(a), axis=0))
 
 
 def expm(a: Inexact[Array | np.ndarray, "n n"]) -> Inexact[Array, "n n"]:

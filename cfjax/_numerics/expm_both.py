@@ -27,8 +27,8 @@ _ODD = (
     tuple(w / (240 * math.factorial(15)) for w in (3278592, 36000, 1)),
     (1 / 6, 5275939 / 945945000, 509 / 363242880),
 )
-# Where the backward error reaches half a unit in the last place. tests/numerics/test_exponentials.py
-# derives the weights and these.
+# Where the backward error reaches half a unit in the last place.
+# tests/numerics/test_exponentials.py derives the weights and these.
 _THETA = {"float32": 2.645, "float64": 0.862}
 
 

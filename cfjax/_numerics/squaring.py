@@ -21,6 +21,11 @@ _ROOT_OF_MOST = 8
 _MOSTLY = 4
 
 
+def magnitude(x: Array) -> Array:
+    """`|re| + |im|`: no hypot, which no vector instruction has."""
+    return jnp.abs(x.real) + jnp.abs(x.imag) if jnp.iscomplexobj(x) else jnp.abs(x)
+
+
 def exponent(size: Real[Array, ""]) -> Int[Array, ""]:
     """The least e with `size < 2^e`; large if the size is inf or NaN."""
     # The exponent field is exact where a rounded log2 is not, and puts inf and NaN on top.

@@ -77,8 +77,8 @@ def stumpff_1_to_3_apart(s: Float[Array, "*batch"]) -> Exponential:
 def _(primals, tangents):
     (s,), (s_dot,) = primals, tangents
     _, _, c2, c3, c4, c5 = _stumpff_to(5, s)
-    slopes = (jnp.zeros_like(s), (c3 - c2) / 2, c4 - c3 / 2, (3 * c5 - c4) / 2)
-    return stumpff_1_to_3_apart(s), Exponential(*(slope * s_dot for slope in slopes))
+    slopes = [slope * s_dot for slope in ((c3 - c2) / 2, c4 - c3 / 2, (3 * c5 - c4) / 2)]
+    return stumpff_1_to_3_apart(s), Exponential(jnp.zeros_like(s), *slopes)
 
 
 @smooth
