@@ -167,6 +167,22 @@ def test_scenes_and_the_paper_use_the_public_names():
     assert used == PRIVATE.keys()
 
 
+def test_methods_and_fields_do_not_know_xla():
+    """What a method or a field says to the compiler, it says through its chart or short vectors."""
+    users = {module for module, target in edges() if room(target) == "_xla" != room(module)}
+    assert users == {
+        FACE,
+        "_integrate",
+        "_measure.flops",
+        "_numerics.vectors",
+        "_solvers.base",
+        "_solvers.chart",
+        "_solvers.dense",
+        "_solvers.stages",
+        "scenes.wilson_flow",
+    }
+
+
 def test_there_is_no_circle():
     after = {}
     for (module, target), is_lazy in edges().items():
