@@ -301,7 +301,8 @@ class _Stacked(eqx.Module):
 
     def kept(self, k: Any) -> PyTree:
         """What `entered` returns, where no field is evaluated."""
-        return jtu.tree_map(lambda f: jnp.zeros(f.shape[1:], f.dtype), self.stacked)
+        # Varying along the axes of a mesh as they do.
+        return jtu.tree_map(lambda f: jnp.zeros_like(f[0]), self.stacked)
 
     def entered(self, field: PyTree) -> PyTree:
         """What to keep of a field that was evaluated."""
