@@ -682,16 +682,16 @@ DEFECTS = [
         "xla/test_loop.py",
     ),
     Defect(
-        "_xla/struct_of_arrays.py",
+        "_xla/arithmetic.py",
         "sides[k] = x.sides[k]",
         "pass",
         "in a sum, entries that are equal along an axis count once",
         "xla/test_struct_of_arrays.py",
     ),
     Defect(
-        "_xla/struct_of_arrays.py",
-        "[n + x.places for n, x in zip(firsts, arrays, strict=True)]",
-        "[x.places for n, x in zip(firsts, arrays, strict=True)]",
+        "_xla/moves.py",
+        "places.append(np.asarray(len(entries) + x.places))",
+        "places.append(x.places)",
         "joined arrays that all have the entries of the first",
         "xla/test_struct_of_arrays.py",
     ),
@@ -703,7 +703,7 @@ DEFECTS = [
         "xla/test_understood.py",
     ),
     Defect(
-        "_xla/scalars.py",
+        "_xla/moves.py",
         'params | {"fill_value": -1, "mode": mode}',
         'params | {"mode": mode}',
         "what fills out of bounds is taken for an entry",
@@ -724,7 +724,7 @@ DEFECTS = [
         "xla/test_understood.py",
     ),
     Defect(
-        "_xla/scalars.py",
+        "_xla/arithmetic.py",
         "return extreme, total / functools.reduce(operator.add, shares)",
         "return extreme, total",
         "a derivative of a maximum that counts each of its ties",

@@ -17,6 +17,11 @@ ELEMENTWISE = frozenset(
     "select_n sign sin sinh sqrt square stop_gradient sub tan tanh xor".split()
 )
 REDUCTIONS = frozenset("reduce_and reduce_max reduce_min reduce_or reduce_prod reduce_sum".split())
+# Those that only move entries.
+MOVES = frozenset(
+    "broadcast_in_dim cfjax_pack cfjax_unpack concatenate dynamic_slice dynamic_update_slice "
+    "gather pad reshape rev scatter slice split squeeze stack transpose".split()
+)
 # XLA updates an array in place for these, and jaxlib 0.10 then reads what it has overwritten if the
 # array, or the result, also has another shape: `x.at[1:].set(lax.dynamic_slice_in_dim(x, k, 99))`
 # with a reshape beside it. Taken apart, arrays have other shapes in many places.
