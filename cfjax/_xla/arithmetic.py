@@ -41,13 +41,17 @@ def elementwise(call: Call) -> StructOfArrays | None:
         else itertools.repeat(x)
         for x in values
     ]
+    compute = functools.partial(call.eqn.primitive.bind, **call.params)
+    if not call.is_large:
+        # Each on its own, so that a derivative has the order of sums that JAX has.
+        return StructOfArrays(map(compute, *columns), call.shape)
     made: dict[Any, Any] = {}
 
     def entry(*row: Any) -> Any:
         key = tuple(map(id, row))
         if key not in made:
             # With the row, so that none of it is forgotten and its identity used again.
-            made[key] = call.eqn.primitive.bind(*aligned(row), **call.params), row
+            made[key] = compute(*aligned(row)), row
         return made[key][0]
 
     return StructOfArrays(map(entry, *columns), call.shape, is_short)

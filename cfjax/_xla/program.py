@@ -25,8 +25,9 @@ from jax.extend.core import (
 )
 from jaxtyping import Array, PyTree
 
+from .jaxprs import evaluate, without_dead_code
 from .materialise import materialised, materialised_p
-from .operation import evaluate, operation, without_dead_code
+from .operation import operation
 from .rules import on_entries
 from .scope import (
     MAX_LENGTH,

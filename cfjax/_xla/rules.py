@@ -8,7 +8,7 @@ import numpy as np
 from jax.extend.core import Jaxpr, JaxprEqn
 
 from . import arithmetic, moves
-from .operation import evaluate
+from .jaxprs import evaluate
 from .scope import MAX_SIZE, is_numeric
 from .struct_of_arrays import Call, StructOfArrays, is_inexact, is_whole, known
 from .understood import ELEMENTWISE, REDUCTIONS, is_understood
