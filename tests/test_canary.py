@@ -419,7 +419,7 @@ def test_a_function_learns_that_it_is_batched():
         return jnp.asarray(True), False
 
     assert not is_batched(1.0)
-    assert jax.vmap(is_batched, out_axes=None)(X), "cfjax/_xla/scalars.py asks custom_vmap."
+    assert jax.vmap(is_batched, out_axes=None)(X), "cfjax/_numerics/squaring.py asks custom_vmap."
 
 
 def test_metadata_reaches_a_call():

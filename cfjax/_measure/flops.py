@@ -15,7 +15,7 @@ import numpy as np
 from jax.extend.core import ClosedJaxpr, Jaxpr, JaxprEqn, Literal, jaxprs_in_params
 from jaxtyping import PyTree
 
-from .._xla.operation import parameters
+from .._xla.jaxprs import parameters
 
 
 def count_flops(fun: Callable[..., PyTree], *args: PyTree) -> int:

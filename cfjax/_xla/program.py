@@ -25,18 +25,10 @@ from jax.extend.core import (
 )
 from jaxtyping import Array, PyTree
 
+from .jaxprs import evaluate, without_dead_code
 from .materialise import materialised, materialised_p
-from .operation import evaluate, operation, without_dead_code
-from .pack import pack_p, unpack_p
-from .scalars import (
-    MOVES,
-    Scalars,
-    is_inexact,
-    is_small,
-    literal,
-    on_scalars,
-    scalars,
-)
+from .operation import operation
+from .rules import on_entries
 from .scope import (
     MAX_LENGTH,
     MAX_SIZE,
@@ -51,8 +43,15 @@ from .scope import (
     within,
 )
 from .smooth import by_fixed, has_reciprocals, scaled_reciprocal
-from .struct_of_arrays import StructOfArrays, conformed, on_struct_of_arrays, struct_of_arrays
-from .understood import REDUCTIONS, is_in_place, is_readable
+from .struct_of_arrays import (
+    StructOfArrays,
+    apart_like,
+    is_inexact,
+    is_small,
+    literal,
+    struct_of_arrays,
+)
+from .understood import MOVES, REDUCTIONS, is_in_place, is_readable
 
 # A state is scalarised if all of it is numbers and short vectors, so many entries together, and if
 # a step is not longer than that, counted in operations on single numbers: the time to compile grows
@@ -75,9 +74,7 @@ def split(tree: PyTree, rows: bool = False) -> PyTree:
     """The tree, small arrays as scalars and with `rows` short vectors as structs of arrays."""
 
     def apart(x: Any) -> Any:
-        if is_small(x):
-            return scalars(x)
-        return struct_of_arrays(x) if rows and is_rows(x) else x
+        return struct_of_arrays(x) if is_small(x) or (rows and is_rows(x)) else x
 
     return jtu.tree_map(apart, tree, is_leaf=_is_apart)
 
@@ -86,9 +83,7 @@ def split_like(other: PyTree, tree: PyTree) -> PyTree:
     """The tree scalarised as another one of its structure, shapes and dtypes is."""
 
     def apart(like: Any, x: Any) -> Any:
-        if isinstance(like, StructOfArrays):
-            return conformed(x, like)
-        return scalars(x) if isinstance(like, Scalars) else _whole(x)
+        return apart_like(like, x) if _is_apart(like) else _whole(x)
 
     return jtu.tree_map(apart, other, tree, is_leaf=_is_apart)
 
@@ -99,7 +94,7 @@ def join(tree: PyTree) -> PyTree:
 
 
 def _is_apart(x: Any) -> bool:
-    return isinstance(x, Scalars | StructOfArrays)
+    return isinstance(x, StructOfArrays)
 
 
 def _whole(x: Any) -> Any:
@@ -258,7 +253,7 @@ def _operations_of(eqn: JaxprEqn) -> int:
     name = eqn.primitive.name
     if name in _CALLS:
         return _operations(eqn.params["jaxpr"].jaxpr)
-    if name in MOVES or name in ("split", "stack") or eqn.primitive in (pack_p, unpack_p):
+    if name in MOVES:
         return 0
     terms = 1
     if name == "dot_general":
@@ -309,7 +304,7 @@ def _evaluate(
 
     variables = (*jaxpr.constvars, *jaxpr.invars)
     for variable, value, is_one in zip(variables, values, fixed, strict=True):
-        env[variable] = scalars(value) if is_small(value) else value
+        env[variable] = struct_of_arrays(value) if is_small(value) else value
         if not is_one:
             loose.add(variable)
     # Each reciprocal once.
@@ -367,11 +362,7 @@ def _apart(
         groups = [jtu.tree_flatten(x) for x in values]
         new = iter(materialised([x for group, _ in groups for x in group], **eqn.params))
         return [shape.unflatten(next(new) for _ in group) for group, shape in groups]
-    if form.rows:
-        sizes = (math.prod(getattr(v.aval, "shape", ())) for v in (*eqn.invars, *eqn.outvars))
-        if any(isinstance(x, StructOfArrays) for x in values) or max(sizes) > MAX_SIZE:
-            return on_struct_of_arrays(eqn, values, fixed)
-    return on_scalars(jaxpr, eqn, values)
+    return on_entries(jaxpr, eqn, values, fixed, form.rows)
 
 
 def _materialised(tree: Any) -> Any:

@@ -4,7 +4,6 @@ A rule looks at the parameters that are listed here, and at no others. An operat
 parameter, as a newer JAX may have, or another value of one, gets its arrays whole.
 """
 
-from collections.abc import Callable
 from typing import Any
 
 from jax import lax
@@ -17,97 +16,67 @@ ELEMENTWISE = frozenset(
     "select_n sign sin sinh sqrt square stop_gradient sub tan tanh xor".split()
 )
 REDUCTIONS = frozenset("reduce_and reduce_max reduce_min reduce_or reduce_prod reduce_sum".split())
+# Those that only move entries.
+MOVES = frozenset(
+    "broadcast_in_dim cfjax_pack cfjax_unpack concatenate dynamic_slice dynamic_update_slice "
+    "gather pad reshape rev scatter slice split squeeze stack transpose".split()
+)
 # XLA updates an array in place for these, and jaxlib 0.10 then reads what it has overwritten if the
 # array, or the result, also has another shape: `x.at[1:].set(lax.dynamic_slice_in_dim(x, k, 99))`
 # with a reshape beside it. Taken apart, arrays have other shapes in many places.
 _IN_PLACE = frozenset(("dynamic_update_slice",))
-
-
-def _any(value: Any) -> bool:
-    return True
-
-
-def _none(value: Any) -> bool:
-    return value is None
-
-
-def _is_precision(value: Any) -> bool:
-    """Not an algorithm, which may ask for the rounding of another dtype."""
-    pair = value if isinstance(value, tuple) else (value,)
-    return all(x is None or isinstance(x, lax.Precision) for x in pair)
-
-
-# The rules of these hand all parameters on.
-_HANDED_ON = dict(
-    accuracy=_any,
-    input_dtype=_any,
-    new_dtype=_any,
-    out_dtype=_any,
-    rounding_method=_any,
-    sharding=_none,
-    weak_type=_any,
-    y=_any,
-)
-_GATHER = dict(
-    dimension_numbers=_any,
-    fill_value=_any,
-    indices_are_sorted=_any,
-    mode=_any,
-    slice_sizes=_any,
-    unique_indices=_any,
-)
-_SCATTER = dict(
-    dimension_numbers=_any,
-    indices_are_sorted=_any,
-    mode=_any,
-    unique_indices=_any,
-    update_consts=_any,
-)
-_PARAMETERS: dict[str, dict[str, Callable[[Any], bool]]] = {
-    "broadcast_in_dim": dict(shape=_any, broadcast_dimensions=_any, sharding=_none),
-    "cfjax_pack": dict(axis=_any, sums=_any),
-    "cfjax_unpack": dict(axis=_any),
-    "concatenate": dict(dimension=_any),
-    "cumprod": dict(axis=_any, reverse=_any),
-    "cumsum": dict(axis=_any, reverse=_any),
-    "dot_general": dict(
-        dimension_numbers=_any,
-        out_sharding=_none,
-        precision=_is_precision,
-        preferred_element_type=_any,
+# The parameters of each operation. The rules of elementwise ones hand all of theirs on.
+_HANDED_ON = "accuracy input_dtype new_dtype out_dtype rounding_method sharding weak_type y"
+_INDEXED = "dimension_numbers indices_are_sorted mode unique_indices "
+_TEXTS: dict[str, str] = {
+    "broadcast_in_dim": "broadcast_dimensions shape sharding",
+    "cfjax_pack": "axis sums",
+    "cfjax_unpack": "axis",
+    "concatenate": "dimension",
+    "cumprod": "axis reverse",
+    "cumsum": "axis reverse",
+    "dot_general": "dimension_numbers out_sharding precision preferred_element_type",
+    "dynamic_slice": "slice_sizes",
+    "dynamic_update_slice": "",
+    "fft": "fft_lengths fft_type",
+    "gather": _INDEXED + "fill_value slice_sizes",
+    "pad": "padding_config",
+    "reshape": "dimensions new_sizes sharding",
+    "rev": "dimensions",
+    **dict.fromkeys(
+        ("scatter", "scatter-add", "scatter-mul", "scatter_add", "scatter_mul"),
+        _INDEXED + "update_consts update_jaxpr",
     ),
-    "dynamic_slice": dict(slice_sizes=_any),
-    "dynamic_update_slice": dict(),
-    "fft": dict(fft_lengths=_any, fft_type=_any),
-    "gather": _GATHER,
-    "pad": dict(padding_config=_any),
-    "reshape": dict(dimensions=_none, new_sizes=_any, sharding=_none),
-    "rev": dict(dimensions=_any),
-    # `x.at[i].apply(f)` has f there.
-    "scatter": _SCATTER | dict(update_jaxpr=_none),
-    # Here it repeats what the name says.
-    "scatter-add": _SCATTER | dict(update_jaxpr=_any),
-    "scatter-mul": _SCATTER | dict(update_jaxpr=_any),
-    "scatter_add": _SCATTER | dict(update_jaxpr=_any),
-    "scatter_mul": _SCATTER | dict(update_jaxpr=_any),
-    "slice": dict(limit_indices=_any, start_indices=_any, strides=_any),
-    "split": dict(axis=_any, sizes=_any),
-    "squeeze": dict(dimensions=_any),
-    "stack": dict(axis=_any),
-    "transpose": dict(permutation=_any),
+    "slice": "limit_indices start_indices strides",
+    "split": "axis sizes",
+    "squeeze": "dimensions",
+    "stack": "axis",
+    "transpose": "permutation",
+    **dict.fromkeys(ELEMENTWISE, _HANDED_ON),
+    **dict.fromkeys(REDUCTIONS, "axes out_sharding"),
 }
+_PARAMETERS = {name: frozenset(text.split()) for name, text in _TEXTS.items()}
+# Those that must be None. `x.at[i].apply(f)` has f in its scatter; in `scatter-add` it repeats what
+# the name says.
+_NONE = frozenset((("reshape", "dimensions"), ("scatter", "update_jaxpr")))
 
 
 def is_understood(eqn: JaxprEqn) -> bool:
     """Whether the rules know all of an operation."""
     name = eqn.primitive.name
-    if name in ELEMENTWISE:
-        known = _HANDED_ON
-    elif name in REDUCTIONS:
-        known = dict(axes=_any, out_sharding=_none)
-    else:
-        known = _PARAMETERS.get(name)
-    return known is not None and all(k in known and known[k](v) for k, v in eqn.params.items())
+    return name in _PARAMETERS and all(
+        k in _PARAMETERS[name] and _is_known(name, k, value) for k, value in eqn.params.items()
+    )
+
+
+def _is_known(name: str, parameter: str, value: Any) -> bool:
+    if parameter in ("sharding", "out_sharding") or (name, parameter) in _NONE:
+        return value is None
+    if parameter == "precision":
+        # Not an algorithm, which may ask for the rounding of another dtype.
+        pair = value if isinstance(value, tuple) else (value,)
+        return all(x is None or isinstance(x, lax.Precision) for x in pair)
+    return True
 
 
 def is_in_place(eqn: JaxprEqn) -> bool:

@@ -1,0 +1,217 @@
+"""Programs of JAX as values: what they need, what reaches what, parts of them, their evaluation."""
+
+import itertools
+from collections.abc import Callable, Hashable, Iterable, Sequence
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jax.extend.core import (
+    ClosedJaxpr,
+    DropVar,
+    Jaxpr,
+    JaxprEqn,
+    Literal,
+    Primitive,
+    jaxpr_as_fun,
+    jaxprs_in_params,
+)
+from jaxtyping import Array
+
+# A program within a program (`operation.py`).
+operation_p = Primitive("cfjax_operation")
+operation_p.multiple_results = True
+
+# Operations that call a program, and under which parameter. Where nothing is differentiated any
+# more, rules for that are not needed either.
+_CALLS = {
+    "cfjax_operation": "program",
+    "closed_call": "call_jaxpr",
+    "custom_jvp_call": "call_jaxpr",
+    "custom_vmap_call": "call",
+    "jit": "jaxpr",
+    "pjit": "jaxpr",
+}
+_FREE = frozenset(
+    "broadcast_in_dim cfjax_pack cfjax_unpack convert_element_type copy reshape slice squeeze "
+    "transpose".split()
+)
+
+
+def program_of(fun: Callable[..., Sequence[Array]], *structs: Any) -> ClosedJaxpr:
+    made = jax.make_jaxpr(fun)(*structs)
+    return ClosedJaxpr(without_dead_code(made.jaxpr), made.consts)
+
+
+def structs(atoms: Sequence[Any]) -> list[jax.ShapeDtypeStruct]:
+    return [jax.ShapeDtypeStruct(v.aval.shape, v.aval.dtype) for v in atoms]
+
+
+def variables(atoms: Iterable[Any]) -> list[Any]:
+    return [v for v in atoms if not isinstance(v, Literal)]
+
+
+def altered(jaxpr: Jaxpr, **parts: Any) -> Jaxpr:
+    """The same with other parts, whose names are not known."""
+    return jaxpr.replace(debug_info=jaxpr.debug_info.with_unknown_names(), **parts)
+
+
+def replaced(values: Sequence[Any], places: Sequence[int], new: Sequence[Any]) -> list[Any]:
+    values = list(values)
+    for k, x in zip(places, new, strict=True):
+        values[k] = x
+    return values
+
+
+def is_inexact(x: Any) -> bool:
+    return jnp.issubdtype(x.dtype, jnp.inexact)
+
+
+def num_operations(eqn: JaxprEqn) -> int:
+    """How many operations on numbers or whole arrays."""
+    if eqn.primitive.name in _CALLS:
+        return sum(map(num_operations, eqn.params[_CALLS[eqn.primitive.name]].eqns))
+    return int(eqn.primitive.name not in _FREE)
+
+
+def without_dead_code(jaxpr: Jaxpr) -> Jaxpr:
+    """Only what the results need."""
+    wanted = set(variables(jaxpr.outvars))
+    kept = []
+    for eqn in reversed(jaxpr.eqns):
+        if eqn.effects or not wanted.isdisjoint(eqn.outvars):
+            if eqn.primitive is operation_p:
+                eqn = _pruned(eqn, wanted)
+            kept.append(eqn)
+            wanted.update(variables(eqn.invars))
+    return jaxpr.replace(eqns=kept[::-1])
+
+
+def _pruned(eqn: JaxprEqn, wanted: set[Any]) -> JaxprEqn:
+    """An operation that gives only what is wanted."""
+    gives = [k for k, v in enumerate(eqn.outvars) if v in wanted]
+    kind, size = eqn.params["kind"], len(eqn.invars)
+    program, takes = narrowed(eqn.params["program"], gives)
+    linear = sum(k >= size - kind.linear for k in takes)
+    return eqn.replace(
+        invars=[eqn.invars[k] for k in takes],
+        outvars=[eqn.outvars[k] for k in gives],
+        params={"program": program, "kind": kind._replace(linear=linear), "plain": None},
+    )
+
+
+def narrowed(program: ClosedJaxpr, gives: Sequence[int]) -> tuple[ClosedJaxpr, list[int]]:
+    """A program for some of the results, and the operands that it needs for that."""
+    jaxpr = program.jaxpr
+    code = without_dead_code(altered(jaxpr, outvars=[jaxpr.outvars[k] for k in gives]))
+    used = {v for e in code.eqns for v in variables(e.invars)} | set(variables(code.outvars))
+    takes = [k for k, v in enumerate(code.invars) if v in used]
+    code = altered(code, invars=[code.invars[k] for k in takes])
+    return ClosedJaxpr(code, program.consts), takes
+
+
+def reached(jaxpr: Jaxpr, sources: Sequence[bool]) -> list[bool]:
+    """Which results may depend on some of the operands."""
+    found = {v for v, is_one in zip(jaxpr.invars, sources, strict=True) if is_one}
+
+    def are_found(atoms: Sequence[Any]) -> list[bool]:
+        return [not isinstance(v, Literal) and v in found for v in atoms]
+
+    for eqn in jaxpr.eqns:
+        given = are_found(eqn.invars)
+        if any(given):
+            outs = [True] * len(eqn.outvars)
+            if eqn.primitive is operation_p:
+                outs = reached(eqn.params["program"].jaxpr, given)
+            found.update(itertools.compress(eqn.outvars, outs))
+    return are_found(jaxpr.outvars)
+
+
+def by_parts(
+    program: ClosedJaxpr,
+    ends: Sequence[int],
+    run: Callable[[ClosedJaxpr, Sequence[Any], bool], Sequence[Any]],
+    *operands: Any,
+) -> list[Any]:
+    """The results of a program whose parts, from one end to the next, `run` computes.
+
+    It gets a part, what that takes from those before, and whether it is the last. It returns what
+    later ones and the results need.
+    """
+    jaxpr, env = program.jaxpr, _environment(program, operands)
+    for start, stop in itertools.pairwise(ends):
+        eqns = jaxpr.eqns[start:stop]
+        made = {v for e in eqns for v in e.outvars}
+        taken = dict.fromkeys(v for e in eqns for v in variables(e.invars) if v not in made)
+        later = [v for e in jaxpr.eqns[stop:] for v in variables(e.invars)]
+        given = dict.fromkeys(v for v in (*later, *variables(jaxpr.outvars)) if v in made)
+        part = altered(jaxpr, eqns=eqns, constvars=[], invars=list(taken), outvars=list(given))
+        outs = run(ClosedJaxpr(part, []), [env[v] for v in taken], stop == len(jaxpr.eqns))
+        env.update(zip(given, outs, strict=True))
+    return [_read(v, env) for v in jaxpr.outvars]
+
+
+def _environment(program: ClosedJaxpr, operands: Sequence[Any]) -> dict[Any, Any]:
+    jaxpr = program.jaxpr
+    names, values = (*jaxpr.constvars, *jaxpr.invars), (*program.consts, *operands)
+    return dict(zip(names, values, strict=True))
+
+
+def _read(v: Any, env: dict[Any, Any]) -> Any:
+    aval: Any = v.aval
+    return jnp.asarray(v.val, aval.dtype) if isinstance(v, Literal) else env[v]
+
+
+def evaluate(jaxpr: Jaxpr, eqn: JaxprEqn, values: Sequence[Any]) -> Sequence[Any]:
+    """The results of one operation of a program; None for those that are dropped."""
+    # Most are of this kind, and the other way makes a program of each.
+    if not eqn.primitive.multiple_results and not any(jaxprs_in_params(eqn.params)):
+        return [eqn.primitive.bind(*values, **eqn.params)]
+    known = {v: x for v, x in zip(eqn.invars, values, strict=True) if not isinstance(v, Literal)}
+    # JAX's own evaluator knows how every operation is called, in every version of JAX.
+    outvars = [v for v in eqn.outvars if not isinstance(v, DropVar)]
+    alone = altered(jaxpr, constvars=[], invars=list(known), outvars=outvars, eqns=[eqn])
+    outs = iter(jaxpr_as_fun(ClosedJaxpr(alone, []))(*known.values()))
+    return [None if isinstance(v, DropVar) else next(outs) for v in eqn.outvars]
+
+
+def flattened(program: ClosedJaxpr, *operands: Array) -> list[Array]:
+    """The program without calls, and with everything once that is computed alike."""
+    # With the operands, so that none of them is forgotten and its identity used again.
+    known: dict[Any, tuple[list[Any], Sequence[Any]]] = {}
+
+    def run(program: ClosedJaxpr, operands: Sequence[Any]) -> list[Any]:
+        jaxpr, env = program.jaxpr, _environment(program, operands)
+        for eqn in jaxpr.eqns:
+            name = eqn.primitive.name
+            if name in _CALLS:
+                outs = run(eqn.params[_CALLS[name]], [_read(v, env) for v in eqn.invars])
+            else:
+                keys = (
+                    # Every bit: as text, numbers that agree in eight digits would be one.
+                    (str(v.aval), np.asarray(v.val).tobytes())
+                    if isinstance(v, Literal)
+                    else id(env[v])
+                    for v in eqn.invars
+                )
+                dropped = [isinstance(v, DropVar) for v in eqn.outvars]
+                key = eqn.primitive, *keys, *dropped, parameters(eqn)
+                if key not in known:
+                    values = [_read(v, env) for v in eqn.invars]
+                    known[key] = values, evaluate(jaxpr, eqn, values)
+                _, outs = known[key]
+            env.update(zip(eqn.outvars, outs, strict=True))
+        return [_read(v, env) for v in jaxpr.outvars]
+
+    return run(program, operands)
+
+
+def parameters(eqn: JaxprEqn) -> Hashable:
+    """What tells the operation from others on the same operands."""
+    values = tuple(sorted(eqn.params.items(), key=lambda item: item[0]))
+    try:
+        hash(values)
+    except TypeError:
+        return object()  # Equal to no other, so such operations are never merged.
+    return values
