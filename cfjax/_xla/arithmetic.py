@@ -13,7 +13,7 @@ import numpy as np
 from jax import lax
 from jax.extend.core import JaxprEqn
 
-from .scope import MAX_LENGTH
+from .limits import MAX_LENGTH, MAX_PRODUCT
 from .struct_of_arrays import (
     Call,
     StructOfArrays,
@@ -24,9 +24,6 @@ from .struct_of_arrays import (
     spread,
     struct_of_arrays,
 )
-
-# Of the products of numbers that a product of arrays is scalarised into.
-_MAX_PRODUCT = 216
 
 
 def elementwise(call: Call) -> StructOfArrays | None:
@@ -189,7 +186,7 @@ def product(call: Call) -> StructOfArrays | None:
             return None  # Of two matrices, which XLA knows best.
     x, y = conformed(x, x.shape, flags[0]), conformed(y, y.shape, flags[1])
     left, right = _factor(x, batches[0], sums[0]), _factor(y, batches[1], sums[1])
-    if left.places.size * right.places.shape[1] > _MAX_PRODUCT:
+    if left.places.size * right.places.shape[1] > MAX_PRODUCT:
         return None
     batch, free, summed = left.long
     options = {k: params[k] for k in ("precision", "preferred_element_type")}

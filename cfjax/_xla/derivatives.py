@@ -11,11 +11,19 @@ from jax.extend.core import ClosedJaxpr, jaxpr_as_fun
 from jax.interpreters import ad, batching
 from jaxtyping import Array
 
-from .jaxprs import is_inexact, narrowed, operation_p, program_of, reached, replaced, structs
+from .jaxprs import (
+    is_inexact,
+    narrowed,
+    num_operations,
+    operation_p,
+    program_of,
+    reached,
+    replaced,
+    structs,
+)
+from .limits import FUNCTION, MAX_ENTRIES
+from .materialise import materialised
 from .scope import Place
-
-# Of so many directions each is computed on its own.
-_FEW = 16
 
 
 class Kind(NamedTuple):
@@ -174,9 +182,9 @@ def _linear(
 def _batch(operands, dims, *, program, kind, plain):
     size = next(x.shape[d] for x, d in zip(operands, dims, strict=True) if d is not None)
     fixed = len(operands) - kind.linear
-    if size <= _FEW and all(d is None for d in dims[:fixed]):
-        # As for a Jacobian: in a program for all of them single numbers meet arrays, and XLA would
-        # compute the former anew for every use.
+    if size <= MAX_ENTRIES["step"] and all(d is None for d in dims[:fixed]):
+        # As for a Jacobian. Each on its own: in a program for all of them single numbers meet
+        # arrays, and XLA would compute the former anew for every use.
         moving = [k for k, d in enumerate(dims) if d is not None]
 
         def one(some):
@@ -186,6 +194,12 @@ def _batch(operands, dims, *, program, kind, plain):
         outs = lax.map(one, [jnp.moveaxis(operands[k], dims[k], 0) for k in moving])
         out_dims = [0] * len(outs)
     else:
+        if not kind.linear and sum(map(num_operations, program.jaxpr.eqns)) > FUNCTION:
+            # Single numbers, as the time of a step, that XLA would compute anew in each of its
+            # functions: 100 ms for a step of a thousand bodies with `RKMK8`.
+            single = [k for k, x in enumerate(operands) if dims[k] is None and is_inexact(x)]
+            new = materialised([operands[k] for k in single]) if single else []
+            operands = replaced(operands, single, new)
         batched, plain, out_dims = _batched(program, plain, tuple(dims), size)
         kind = kind._replace(is_batch=True)
         outs = operation_p.bind(*operands, program=batched, kind=kind, plain=plain)

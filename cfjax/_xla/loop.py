@@ -11,13 +11,11 @@ import jax.tree_util as jtu
 from jax import lax
 from jaxtyping import Array, Int, PyTree
 
+from .limits import MAX_ENTRIES
 from .operation import operation
 from .pack import pack, unpack
 from .program import join, split, split_like, trace
 from .scope import within_equal_steps
-
-# Beyond, the derivative gains less than copying them costs.
-_MAX_TRAVELLERS = 16
 
 
 def repeat(
@@ -108,7 +106,8 @@ def _repeat(
 def _(primals, tangents, *, step, num_steps, is_kept):
     moves = [[tangent is not None for tangent in group] for group in tangents]
     sizes = [len(jtu.tree_leaves(split(x, step.rows))) for x in primals[1]]
-    if sum(n for n, is_one in zip(sizes, moves[1], strict=True) if is_one) > _MAX_TRAVELLERS:
+    # Of more the derivative gains less than copying them costs.
+    if sum(n for n, is_one in zip(sizes, moves[1], strict=True) if is_one) > MAX_ENTRIES["step"]:
         moves[1] = [False] * len(sizes)
     return eqx.filter_jvp(
         lambda leaves, parameters: _scan(

@@ -13,11 +13,9 @@ from jax.extend.core import Primitive
 from jax.interpreters import ad, batching, mlir
 from jaxtyping import Array, PyTree
 
+from .limits import MAX_RESULTS, MAX_SIZE
 from .pack import pack, sharding, unpack
-from .scope import MAX_SIZE, has_rows, is_short, where
-
-# XLA takes what more entries are made of apart, and computes all that leads there for each of them.
-_MAX_TOGETHER = 15
+from .scope import has_rows, is_short, where
 
 
 def materialised(
@@ -55,7 +53,7 @@ def materialised_together(tree: PyTree, alone: bool) -> PyTree:
     leaves, structure = jtu.tree_flatten(tree)
     groups: list[list[Array]] = [[]]
     for x in leaves:
-        if groups[-1] and sum(map(np.size, (*groups[-1], x))) > _MAX_TOGETHER:
+        if groups[-1] and sum(map(np.size, (*groups[-1], x))) > MAX_RESULTS:
             groups.append([])
         groups[-1].append(x)
     alone = alone or where() == "loop"
@@ -108,7 +106,7 @@ def _materialised_impl(*entries, in_batches, alone, now, is_cut, has_calls=False
         is_batch = in_batches and shape != ()
         if has_calls if is_batch else alone:
             through = _by_call if is_batch else _by_reduction
-            most = len(places) if is_batch else _MAX_TOGETHER
+            most = len(places) if is_batch else MAX_RESULTS
             for start in range(0, len(places), most):
                 some = places[start : start + most]
                 for k, x in zip(some, through([entries[k] for k in some]), strict=True):

@@ -17,7 +17,7 @@ from jax import lax
 from jax.extend.core import JaxprEqn
 from jaxtyping import Array
 
-from .scope import MAX_LENGTH
+from .limits import MAX_LENGTH
 from .struct_of_arrays import (
     Call,
     StructOfArrays,

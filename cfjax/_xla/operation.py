@@ -39,19 +39,13 @@ from .jaxprs import (
     variables,
     without_dead_code,
 )
+from .limits import FUNCTION, WHOLE, WHOLE_IN_BATCHES
 from .materialise import materialised
 from .scope import Place
 
-# What two of its functions need, XLA computes in both, and into one it puts some 2000 operations.
-# In long programs it then computes single ones exponentially often: in values never as measured, in
-# first derivatives from some 8000 operations on, counted as they are written, within diffrax's loop
-# from 4000, in batches from 5000, and in second ones earlier. Those are compiled as several, though
-# to materialise what they share takes time.
-_WHOLE = {"loop": (math.inf, 6000, 3000), "step": (math.inf, 3500, 3000)}
-_WHOLE_IN_BATCHES = (math.inf, 4500, 3000)
-_GROUP = 1000
+_GROUP = FUNCTION // 2
 # A derivative has up to five times the operations, and should fit.
-_PIECE = 250
+_PIECE = FUNCTION // 8
 
 
 def operation(
@@ -143,9 +137,9 @@ def _places(jaxpr: Jaxpr) -> list[int]:
 @operation_p.def_impl
 def _run(*operands, program, kind, plain):
     order = min(kind.order, 2)
-    most = _WHOLE[kind.place][order]
+    most = WHOLE[kind.place][order]
     if kind.is_batch:
-        most = min(most, _WHOLE_IN_BATCHES[order])
+        most = min(most, WHOLE_IN_BATCHES[order])
     ends = _groups(program.jaxpr, most)
     # Of a second derivative there are several in one loop.
     if len(ends) == 2 and kind.order < 2:

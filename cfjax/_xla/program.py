@@ -26,12 +26,11 @@ from jax.extend.core import (
 from jaxtyping import Array, PyTree
 
 from .jaxprs import evaluate, without_dead_code
+from .limits import FUNCTION, MAX_ENTRIES, MAX_LENGTH, MAX_OPERATIONS, MAX_SIZE
 from .materialise import materialised, materialised_p
 from .operation import operation
 from .rules import on_entries
 from .scope import (
-    MAX_LENGTH,
-    MAX_SIZE,
     Place,
     is_numeric,
     is_on,
@@ -53,18 +52,10 @@ from .struct_of_arrays import (
 )
 from .understood import MOVES, REDUCTIONS, is_in_place, is_readable
 
-# A state is scalarised if all of it is numbers and short vectors, so many entries together, and if
-# a step is not longer than that, counted in operations on single numbers: the time to compile grows
-# with it, and more so in derivatives. `README.md` here has what that buys and costs. What a loop
-# carries may have what sums have lost of each entry too, the number of the step and a result.
-_MAX_ENTRIES: dict[Place, int] = {"step": 16, "loop": 34}
-_MAX_OPERATIONS = 4000
-# One that is longer is more than one of XLA's functions, and is cut.
-_SHORT = 2000
 # Of a longer step that stands alone, not in a loop of equal steps, derivatives are left to JAX: a
 # gradient through diffrax's loop would take two to three times as long to compile.
-_SHORT_TO_DIFFERENTIATE = 1000
-# About as many combine the stages of a long method.
+_SHORT_TO_DIFFERENTIATE = FUNCTION // 2
+# About as many operations combine the stages of a long method.
 _COMBINATIONS = 1000
 
 _CALLS = frozenset(("jit", "pjit"))
@@ -134,7 +125,7 @@ def scalarised(fun: Callable[[PyTree], PyTree], y: PyTree) -> PyTree:
 def are_long(fun: Callable[[PyTree], PyTree], y: PyTree, times: int) -> bool:
     """Whether so many of `fun(y)`, and what combines them, are too long to be scalarised."""
     code = without_dead_code(jax.make_jaxpr(fun)(y).jaxpr)
-    return times * _operations(code) > _MAX_OPERATIONS - _COMBINATIONS
+    return times * _operations(code) > MAX_OPERATIONS - _COMBINATIONS
 
 
 class Program(NamedTuple):
@@ -161,8 +152,8 @@ def trace(fun: Callable[[PyTree], PyTree], y: PyTree, place: Place) -> Program |
 
     It must have no effects and be readable (`is_readable`).
     """
-    rows = _has_rows(y, _MAX_ENTRIES[place])
-    if not is_on() or not (rows or _is_small_state(y, _MAX_ENTRIES[place])):
+    rows = _has_rows(y, MAX_ENTRIES[place])
+    if not is_on() or not (rows or _is_small_state(y, MAX_ENTRIES[place])):
         return None
     with within(place, rows):
         jaxpr, out = jax.make_jaxpr(fun, return_shape=True)(y)
@@ -170,7 +161,7 @@ def trace(fun: Callable[[PyTree], PyTree], y: PyTree, place: Place) -> Program |
     try:
         code = without_dead_code(jaxpr.jaxpr)
         num_operations = _operations(code)
-        if jaxpr.effects or not is_readable(code) or num_operations > _MAX_OPERATIONS:
+        if jaxpr.effects or not is_readable(code) or num_operations > MAX_OPERATIONS:
             return None
     except Exception as error:
         return unread(error)
@@ -191,7 +182,7 @@ def trace(fun: Callable[[PyTree], PyTree], y: PyTree, place: Place) -> Program |
         first = [x if _constant(x) is None else _constant(x) for x in jaxpr.consts]
         first, moving = values(first, parameters), jtu.tree_leaves(y, is_leaf=_is_apart)
         fixed = [True] * len(first) + [False] * len(moving)
-        form = _Form(rows, num_operations > _SHORT, has_reciprocals(code, fixed))
+        form = _Form(rows, num_operations > FUNCTION, has_reciprocals(code, fixed))
         outs, _ = _evaluate(code, (*first, *moving), fixed, form)
         # What is known before the program runs may come out as NumPy's.
         outs = [x if _is_apart(x) else jnp.asarray(x) for x in outs]

@@ -9,7 +9,8 @@ from jax.extend.core import Jaxpr, JaxprEqn
 
 from . import arithmetic, moves
 from .jaxprs import evaluate
-from .scope import MAX_SIZE, is_numeric
+from .limits import MAX_SIZE
+from .scope import is_numeric
 from .struct_of_arrays import Call, StructOfArrays, is_inexact, is_whole, known
 from .understood import ELEMENTWISE, REDUCTIONS, is_understood
 

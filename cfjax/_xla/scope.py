@@ -9,11 +9,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-# Of vectors that are scalarised. A pose is a quaternion and a position.
-MAX_LENGTH = 7
-# Of arrays all of whose entries are scalarised, as they come up within a step: the 4 x 4 matrix of
-# a quaternion, and the 4 x 4 x 4 numbers that multiply two.
-MAX_SIZE = 64
+from .limits import MAX_LENGTH, MAX_SIZE
 
 # JAX compiles anew where it changes.
 _is_on = jax.make_user_context(os.environ.get("CFJAX_REWRITE", "1") != "0")

@@ -16,9 +16,10 @@ from jax import lax
 from jax.extend.core import JaxprEqn, Literal
 from jaxtyping import Array
 
+from .limits import MAX_LENGTH, MAX_SIZE
 from .materialise import materialised
 from .pack import pack, unpack
-from .scope import MAX_LENGTH, MAX_SIZE, is_numeric, is_rows
+from .scope import is_numeric, is_rows
 
 
 @jtu.register_pytree_node_class
