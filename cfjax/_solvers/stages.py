@@ -133,8 +133,11 @@ class _Flow(NamedTuple):
     c: Any
 
 
-def _flows(products: Sequence[Product], stages: Sequence[Product], times: Row) -> list[_Flow]:
-    """The flows of a step, each to a point of its own; the last of `stages` is its end."""
+def _flows(products: Sequence[Product], stages: Sequence[Product], times: Row) -> _Flow:
+    """The flows of a step as arrays, one turn of a loop for each, and each to a point of its own.
+
+    The last of `stages` is its end.
+    """
     place = {product: k for k, product in enumerate(products)}
     evaluated = {rows: k for k, rows in enumerate(stages[:-1])}
     flows = []
@@ -142,14 +145,8 @@ def _flows(products: Sequence[Product], stages: Sequence[Product], times: Row) -
         stage = evaluated.get(product, len(times))
         c = float(times[stage]) if product in evaluated else 0.0
         flows.append(_Flow(place[product[:-1]], product[-1], target, stage, c))
-    return flows
-
-
-def _turns(flows: Sequence[_Flow], num_stages: int) -> _Flow:
-    """The flows as arrays, one turn of a loop for each."""
     turns = _Flow(*zip(*flows, strict=True))
-    turns = turns._replace(row=_padded(turns.row, num_stages))
-    return _Flow(*map(jnp.asarray, turns))
+    return _Flow(*map(jnp.asarray, turns._replace(row=_padded(turns.row, len(times)))))
 
 
 def rolled(
@@ -159,7 +156,7 @@ def rolled(
 
     `stages` are the products of flows that lead to the stages, each to a point of its own, and to
     the end; `times` are the times of the stages. There are no points where the field allows no
-    loop, and where `unroll` asks for none.
+    loop, where `unroll` asks for none, and where it does not pay.
     """
     first, num_stages = chart.fields[0], len(times)
     fields: Any = None
@@ -172,7 +169,6 @@ def rolled(
         return {}
     # Each after those that it begins with. The first has no flows.
     products = list(dict.fromkeys(rows[:n] for rows in stages for n in range(len(rows) + 1)))
-    flows = _flows(products, stages, times)
 
     def body(carry: Any, x: _Flow) -> Any:
         points, fields = carry
@@ -188,9 +184,8 @@ def rolled(
         return (_put(points, x.target, z), fields.put(x.stage, new)), None
 
     start = fields.coordinates(chart.start)
-    (points, fields), _ = lax.scan(
-        body, (_stack(start, len(flows) + 1), fields), _turns(flows, num_stages)
-    )
+    carry = _stack(start, len(products)), fields
+    (points, fields), _ = lax.scan(body, carry, _flows(products, stages, times))
     chart.start = fields.point(start)
     chart.fields[:] = [fields.at(k) for k in range(num_stages)]
     return {rows: fields.point(_at(points, k)) for k, rows in enumerate(products) if k}
@@ -207,7 +202,8 @@ def rolled_elements(
     """The known stages k, and for each row and time c the stage `element(u, f)`.
 
     Here `u = sum_j row[j] k[j]`, and f is the field at time c and the point where u leads from the
-    start. None where the field allows no loop, and where `unroll` asks for none.
+    start. None where the field allows no loop, where `unroll` asks for none, and where it does not
+    pay.
     """
     first, n = known[0], len(known) + len(rows)
     if len(rows) < 2 or not all(map(any, rows)):
