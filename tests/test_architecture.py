@@ -61,6 +61,7 @@ TESTS = Path(__file__).parent
 PRIVATE_IN_TESTS = {
     "measure/test_flops.py": "counts of single operations, of which users see the sums over a step",
     "methods/derive.py": "the tool that derives what is stored",
+    "methods/test_derive.py": "what is stored, and what is derived",
     "methods/test_order_conditions.py": "words, trees and their weights",
     "numerics/test_exponentials.py": "coefficients of polynomials, and parts of an exponential",
     "numerics/test_kernels.py": "loops and products that fields are made of",

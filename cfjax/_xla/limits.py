@@ -1,13 +1,13 @@
-"""The numbers that were measured, and are no property of a program.
+"""What is small and what is long: the numbers that decide what is rewritten, and how.
 
-They were set on two cores with AVX-512. To measure one anew, change it and run the benchmark that
-is named with it before and after, on a machine with nothing else to do.
+The benchmark that is named with one shows what a change of it does. They were set on two cores with
+AVX-512.
 """
 
 import math
 
-# Of vectors that are scalarised. A pose is a quaternion and a position, and longer vectors gain
-# nothing. (`benchmarks/fields.py`)
+# Of vectors that are scalarised. A pose is a quaternion and a position.
+# (`benchmarks/attitude.py`, `benchmarks/leading_axes.py`)
 MAX_LENGTH = 7
 
 # Of arrays all of whose entries are scalarised, as they come up within a step: the 4 x 4 matrix of
@@ -18,13 +18,13 @@ MAX_SIZE = 64
 # matrices. (`benchmarks/fields.py`)
 MAX_PRODUCT = 216
 
-# Of the numbers in the state of a step, together; beyond, compiling takes longer than running
-# gains. What a loop carries has what sums have lost of each entry too, the number of the step and a
-# result. As many directions or parameters are few, too. (`benchmarks/chain.py`)
+# Of the numbers in the state of a step, together: the time to compile grows with them, and more so
+# in derivatives. What a loop carries may have what sums have lost of each entry too, the number of
+# the step and a result. As many directions or parameters are few, too. (`benchmarks/chain.py`)
 MAX_ENTRIES = {"step": 16, "loop": 34}
 
-# XLA splits what has more results into functions, and computes for each of them all that leads
-# there. (`benchmarks/attitude.py`, controlled steps)
+# XLA takes what more entries are made of apart, and computes all that leads there for each of them.
+# (`benchmarks/scenes.py`, controlled steps)
 MAX_RESULTS = 15
 
 # Of the operations of a step on single numbers. The time to compile grows with them, and more so in

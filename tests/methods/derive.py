@@ -9,15 +9,11 @@ from typing import Any
 import cfjax
 from cfjax._methods.continuous_extension import (
     STORED,
-    continuous_extension,
     derived_extension,
     derived_runge_kutta_extension,
     identity,
-    runge_kutta_extension,
 )
 from cfjax._methods.tableau import Tableau
-
-__all__ = ["STORED", "continuous_extension", "derived_extension", "runge_kutta_extension"]
 
 CLASSICAL = ((), (0.5,), (0.0, 0.5), (0.0, 0.0, 1.0)), (1 / 6, 1 / 3, 1 / 3, 1 / 6), 4
 

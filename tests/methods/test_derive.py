@@ -4,9 +4,14 @@ import json
 
 import numpy as np
 from methods import derive
-from methods.derive import STORED, continuous_extension, derived_extension, runge_kutta_extension
 
 import cfjax
+from cfjax._methods.continuous_extension import (
+    STORED,
+    continuous_extension,
+    derived_extension,
+    runge_kutta_extension,
+)
 
 WRITE = "Run python tests/methods/derive.py."
 
