@@ -349,7 +349,8 @@ def test_programs_are_found_in_parameters():
     (eqn,) = (e for e in jax.make_jaxpr(fun)(1.0).jaxpr.eqns if e.primitive.name == "cond")
     assert len(list(jaxprs_in_params(eqn.params))) == 2, "jaxprs_in_params finds every branch."
     assert len(eqn.params["branches"]) == 2, "cfjax/_measure/flops.py takes the branch by number."
-    assert eqn.invars[0].aval.dtype == jnp.int32, "The first operand of cond is the branch."
+    branch: Any = eqn.invars[0].aval
+    assert branch.dtype == jnp.int32, "The first operand of cond is the branch."
 
 
 @pytest.mark.parametrize("reverse", [False, True])

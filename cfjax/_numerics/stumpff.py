@@ -3,7 +3,7 @@
 import functools
 from collections.abc import Sequence
 from math import factorial, pi
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -177,7 +177,7 @@ class _Constants(NamedTuple):
     excess: Sequence[float]
     seed: int
     reciprocal_seed: int
-    bits: type
+    bits: Any
 
 
 def _constants(x: Array) -> _Constants:

@@ -189,7 +189,7 @@ def drift(cls, a, x):
     """Of the spectrum over 10^4 steps, relative, for each of a batch."""
     term = cfjax.LieTerm(lambda t, y, args: cls((1 + 0.3 * jnp.sin(t)) * args))
     sol = cfjax.integrate(term, cfjax.LieEuler(), 0.0, 1e4, x, a, num_steps=10_000)
-    ends = [np.sort(np.linalg.eigvals(y).real, axis=1) for y in (x, np.asarray(sol.ys[-1]))]
+    ends = [np.sort(np.real(np.linalg.eigvals(y)), axis=1) for y in (x, np.asarray(sol.ys[-1]))]
     return np.linalg.norm(ends[1] - ends[0], axis=1) / np.linalg.norm(ends[0], axis=1)
 
 

@@ -1,5 +1,7 @@
 """A program as one operation."""
 
+from typing import Any
+
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -142,7 +144,8 @@ def test_reverse_mode_keeps_the_operands_alone():
 
 def test_what_a_batch_does_not_reach_is_in_no_batch():
     program = jax.make_jaxpr(jax.vmap(whole, (0, None), [0, 0, None, None]))(jnp.outer(X, X), SCALE)
-    assert [v.aval.shape for v in program.jaxpr.outvars] == [(3, 3), (3, 3), (), ()]
+    avals: list[Any] = [v.aval for v in program.jaxpr.outvars]
+    assert [aval.shape for aval in avals] == [(3, 3), (3, 3), (), ()]
 
 
 def test_directions_that_are_zero_are_not_computed():
