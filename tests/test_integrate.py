@@ -826,7 +826,13 @@ def test_the_transpose_of_a_small_solve_that_is_rewritten(rewritten):
     def end(y0):
         return cfjax.integrate(term, cfjax.CF2(), 0.0, 1.0, y0, num_steps=12).ys[-1]
 
-    (back,) = jax.linear_transpose(end, jnp.ones(3))(jnp.arange(3.0))
+    if jax.__version_info__ >= (0, 12):
+        with pytest.raises(NotImplementedError, match=r"Call it within cfjax\.rewriting\(False\)"):
+            jax.linear_transpose(end, jnp.ones(3))(jnp.arange(3.0))
+        with cfjax.rewriting(False):
+            (back,) = jax.linear_transpose(end, jnp.ones(3))(jnp.arange(3.0))
+    else:
+        (back,) = jax.linear_transpose(end, jnp.ones(3))(jnp.arange(3.0))
     # The matrix of the solve, column by column; a hundred products of numbers below 10.
     matrix = jnp.stack([end(e) for e in jnp.eye(3)], axis=1)
     np.testing.assert_allclose(back, jnp.arange(3.0) @ matrix, rtol=0, atol=1e-13)

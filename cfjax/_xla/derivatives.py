@@ -115,6 +115,12 @@ def _transpose(cotangents, *operands, program, kind, plain):
     results: list[Any] = [None] * len(operands)
     if not coming:
         return results
+    if not all(is_inexact(operands[k].aval) for k in unknown):
+        # The number of a step, for one. From 0.12 on JAX hands over what is not linear too.
+        raise NotImplementedError(
+            "jax.linear_transpose of a solve that is rewritten for XLA needs jax 0.11 or older. "
+            "Call it within cfjax.rewriting(False), or take jax.vjp."
+        )
     transposed = _transposed(program, plain, unknown, coming)
     fixed = (x for k, x in enumerate(operands) if k not in unknown)
     new = transposed.bind([*fixed, *(cotangents[k] for k in coming)], kind)

@@ -123,8 +123,13 @@ def _while(values: list[Any], params: dict[str, Any]) -> list[Any]:
 
 
 def _scan(values: list[Any], params: dict[str, Any]) -> list[Any]:
-    body, n = params["jaxpr"], params["num_consts"]
-    m = n + params["num_carry"]
+    body = params["jaxpr"]
+    if "num_consts" in params:
+        n, m = params["num_consts"], params["num_consts"] + params["num_carry"]
+    else:
+        # From jax 0.12 on.
+        consts, carry, _ = params["ft_in"].unpack()
+        n, m = len(list(consts)), len(list(consts)) + len(list(carry))
     consts, carry, xs = values[:n], values[n:m], values[m:]
     rows: list[list[Any]] = []
     order = range(params["length"])
