@@ -9,6 +9,7 @@ if _signals.is_command():
     # Before the imports below, which take seconds.
     _signals.end_the_command()
 
+from ._control_term import LieControlTerm as LieControlTerm
 from ._field import AbstractAlgebraElement as AbstractAlgebraElement
 from ._field import AbstractFrozenField as AbstractFrozenField
 from ._field import bracket as bracket
@@ -89,8 +90,14 @@ if TYPE_CHECKING:
     from ._solvers.munthe_kaas import RKMK4 as RKMK4
     from ._solvers.munthe_kaas import RKMK5 as RKMK5
     from ._solvers.munthe_kaas import RKMK8 as RKMK8
+    from ._solvers.pieces import ShiftedNoise as ShiftedNoise
+    from ._solvers.pieces import WeakOrder2 as WeakOrder2
     from ._solvers.retraction import CayleyRK4 as CayleyRK4
     from ._solvers.richardson import Richardson as Richardson
+    from ._solvers.splitting import BlanesMoan4 as BlanesMoan4
+    from ._solvers.splitting import BlanesMoan6 as BlanesMoan6
+    from ._solvers.splitting import Splitting as Splitting
+    from ._solvers.splitting import Strang as Strang
     from ._testing import check_field as check_field
 
 __version__ = "0.2.0"
@@ -130,8 +137,10 @@ _NAMES_LATER = {
     ),
     "_solvers.magnus": ("Magnus10", "Magnus2", "Magnus4", "Magnus4Lobatto", "Magnus6", "Magnus8"),
     "_solvers.munthe_kaas": ("RKMK", "RKMK3", "RKMK4", "RKMK5", "RKMK8"),
+    "_solvers.pieces": ("ShiftedNoise", "WeakOrder2"),
     "_solvers.retraction": ("CayleyRK4",),
     "_solvers.richardson": ("Richardson",),
+    "_solvers.splitting": ("BlanesMoan4", "BlanesMoan6", "Splitting", "Strang"),
 }
 _LATER = {name: f".{module}" for module, names in _NAMES_LATER.items() for name in names}
 _LATER["scenes"] = ".scenes"

@@ -180,6 +180,28 @@ class AbstractAlgebraElement(AbstractFrozenField):
         return type(terms[-1]).combine(weights, terms)
 
 
+class Rest(AbstractAlgebraElement):
+    """The field of a part of the state that a term does not move: there a user writes None.
+
+    It is added to fields of every kind.
+    """
+
+    acts_on_subtree = True
+
+    def flow(self, point: PyTree) -> PyTree:
+        return point
+
+    def tangent(self, point: PyTree) -> PyTree:
+        return jtu.tree_map(jnp.zeros_like, point)
+
+    def increment(self, point: PyTree) -> PyTree:
+        # Another term may make a compensated sum of this part.
+        return self.tangent(point)
+
+    def bracket(self, other: "Rest") -> "Rest":
+        return self
+
+
 def is_field(x: Any) -> bool:
     return isinstance(x, AbstractFrozenField)
 
@@ -233,6 +255,10 @@ def combine(weights: Sequence[Weight], fields: Sequence[PyTree]) -> PyTree:
         ) from error
 
     def combine_part(path: Any, *leaves: Any) -> Any:
+        pairs = [(w, x) for w, x in zip(weights, leaves, strict=True) if not isinstance(x, Rest)]
+        if not pairs:
+            return leaves[0]
+        moving, leaves = zip(*pairs, strict=True)
         if len({_kind(leaf) for leaf in leaves}) > 1:
             names = " and ".join(dict.fromkeys(map(_name, leaves)))
             place = jtu.keystr(path) and f" at {jtu.keystr(path)}"
@@ -241,9 +267,9 @@ def combine(weights: Sequence[Weight], fields: Sequence[PyTree]) -> PyTree:
                 "of a diffrax.MultiTerm, give each a part of the state of its own."
             )
         if is_field(leaves[0]):
-            return type(leaves[0]).combine(weights, leaves)
+            return type(leaves[0]).combine(moving, leaves)
         _check_coordinates("A translation", leaves[0])
-        return _linear_combination(weights, leaves)
+        return _linear_combination(moving, leaves)
 
     columns = zip(parts, *others, strict=True)
     return treedef.unflatten(combine_part(path, part, *rest) for (path, part), *rest in columns)

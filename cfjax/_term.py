@@ -11,7 +11,7 @@ import jax.tree_util as jtu
 import numpy as np
 from jaxtyping import Array, PyTree, Real
 
-from ._field import combine, describe, is_field, struct, tangent
+from ._field import Rest, combine, describe, is_field, struct, tangent
 
 _ARRAY_TYPES = jax.Array | np.ndarray | np.generic | int | float | complex
 
@@ -20,7 +20,8 @@ class LieTerm(diffrax.AbstractTerm):
     """The term `f(t, y, args) dt` of an ordinary differential equation on a manifold.
 
     `field(t, y, args)` returns the frozen vector field at `y`: a pytree whose structure is a
-    prefix of the state's, with an `AbstractFrozenField` or an array (a translation) for each part.
+    prefix of the state's, with an `AbstractFrozenField`, an array (a translation) or None (a part
+    at rest) for each part.
 
     ```python
     def field(t, y, args):
@@ -48,7 +49,7 @@ class LieTerm(diffrax.AbstractTerm):
             raise TypeError(f"field must be a function of t, y and args, got {self.field!r}.")
 
     def vf(self, t: Any, y: PyTree, args: PyTree) -> PyTree:
-        return _checked(self.field(t, y, args), y)
+        return checked(self.field(t, y, args), y)
 
     def contr(self, t0: Any, t1: Any, **kwargs: Any) -> Any:
         return t1 - t0
@@ -63,16 +64,17 @@ class LieTerm(diffrax.AbstractTerm):
 def product(terms: diffrax.AbstractTerm, value: PyTree, control: PyTree) -> PyTree:
     """The product of what a term's vector field returned with its control: a frozen field.
 
-    `diffrax.MultiTerm` would add the arrays within the fields of its terms, whatever they are.
+    `diffrax.MultiTerm` would add the arrays within the fields of its terms, whatever they are, a
+    spectrum too.
 
     **Raises** `TypeError` for a term that cannot multiply a frozen field, or a sum of terms whose
     fields are of different kinds.
     """
-    if not any(map(is_field, jtu.tree_leaves(value, is_leaf=is_field))):
-        return terms.prod(value, control)
     if isinstance(terms, diffrax.MultiTerm):
         parts = [product(*each) for each in zip(terms.terms, value, control, strict=True)]
         return combine([1.0] * len(parts), parts)
+    if not any(map(is_field, jtu.tree_leaves(value, is_leaf=is_field))):
+        return terms.prod(value, control)
     if isinstance(value, tuple) and isinstance(control, tuple):
         raise TypeError(
             "A diffrax.MultiTerm of frozen fields must not be wrapped in another term, got "
@@ -104,13 +106,18 @@ def velocity(terms: diffrax.AbstractTerm, value: PyTree, y: PyTree) -> PyTree:
     return value
 
 
-def _checked(field: PyTree, y: PyTree) -> PyTree:
-    parts, treedef = jtu.tree_flatten_with_path(field, is_leaf=is_field)
+def checked(field: PyTree, y: PyTree) -> PyTree:
+    """What a term's function returned, once it is sure to act on `y`.
+
+    **Raises** `TypeError` or `ValueError` that names the part of the state.
+    """
+    is_part = lambda x: x is None or is_field(x)  # noqa: E731
+    parts, treedef = jtu.tree_flatten_with_path(field, is_leaf=is_part)
     try:
         points = treedef.flatten_up_to(y)
     except ValueError as error:
         raise ValueError(
-            "The field of a LieTerm must return a pytree whose structure is a prefix of the "
+            "The field of a term must return a pytree whose structure is a prefix of the "
             f"state's. Got {eqx.tree_pformat(field)} for the state {describe(y)}: {error} Return "
             "one field for each part of the state; plain numbers take their velocity as an array."
         ) from error
@@ -121,6 +128,8 @@ def _checked(field: PyTree, y: PyTree) -> PyTree:
 
 
 def checked_part(place: str, part: Any, point: PyTree) -> Any:
+    if part is None:
+        return Rest()
     if is_field(part):
         name = type(part).__name__
         if not part.acts_on_subtree and not jtu.all_leaves([point]):

@@ -2,8 +2,8 @@
 
 import abc
 import copy
-from collections.abc import Callable
-from typing import Any, ClassVar
+from collections.abc import Callable, Sequence
+from typing import Any, ClassVar, Self
 
 import diffrax
 import equinox as eqx
@@ -14,6 +14,7 @@ from jax import lax
 from jax.core import Tracer
 from jaxtyping import Array, Bool, PyTree, Real
 
+from .._control_term import is_driven, no_estimate
 from .._field import is_field
 from .._numerics.checks import Fault
 from .._term import product, velocity
@@ -49,27 +50,14 @@ class AbstractLieSolver(diffrax.AbstractSolver):
     # What diffrax asks a solver for first.
     term_compatible_contr_kwargs = _OfInstances(lambda self: {})
 
-    # Whether it evaluates the field at points of the step.
-    is_of_state: ClassVar[bool] = True
-
-    interpolation_cls: ClassVar[Callable[..., diffrax.AbstractLocalInterpolation]] = Interpolation
+    def strong_order(self, terms) -> float:
+        """That of any noise. It is 1 if the noise commutes."""
+        return 0.5
 
     @property
     def first_same_as_last(self) -> bool:
         """Whether the last evaluation of a step is the first one of the next step."""
         return False
-
-    @abc.abstractmethod
-    def step_in(self, chart: Chart) -> "Step":
-        """A step from `chart.start`, with the fields that `chart.frozen` evaluates."""
-
-    def extended(self, path: Path, field: Callable[[Any, PyTree], PyTree]) -> Path:
-        """The way of a step with what only output within it takes.
-
-        `field(c, y)` is `h f(t + c h, y)`. Apart from `step_in`, which is compiled whether anybody
-        asks for that or not.
-        """
-        return path
 
     def init(self, terms, t0, t1, y0, args) -> "State":
         """Checks the times and the start, and makes the state of the solver.
@@ -86,6 +74,7 @@ class AbstractLieSolver(diffrax.AbstractSolver):
 
         That is for a loop which reports it itself, with no call of the host.
         """
+        self = self.for_terms(terms)
 
         def at_start(y0):
             field = product(terms, terms.vf(t0, y0, args), terms.contr(t0, t1))
@@ -97,28 +86,69 @@ class AbstractLieSolver(diffrax.AbstractSolver):
             lambda c, y: None if c is None else jnp.zeros_like(y), compensation, y0
         )
         first = terms.vf(t0, y0, args) if self.first_same_as_last else None
-        return State(compensation, first, None), _fault_of_start(t0, t1, field, y0)
+        return State(compensation, first, None), fault_of_start(t0, t1, (field,), y0)
 
-    def without_estimate(self) -> "AbstractLieSolver":
+    def for_terms(self, terms: PyTree[diffrax.AbstractTerm]) -> Self:
+        """The same method for these terms: without its estimate where a path drives one of them.
+
+        It would compare two methods on the same chord of the path, and not see that the path is
+        not straight.
+
+        **Raises** `TypeError` if the method cannot take such terms.
+        """
+        return self.without_estimate() if is_driven(terms) else self
+
+    def without_estimate(self) -> Self:
         """The same method for steps that nobody controls: it keeps nothing for an estimate."""
         return self._with(estimate=None) if hasattr(self, "estimate") else self
 
-    def unrolled(self) -> "AbstractLieSolver":
+    def unrolled(self) -> Self:
         """The same method with its stages one by one in the program, where each can be counted."""
         return self._with(unroll=True) if hasattr(self, "unroll") else self
 
-    def _with(self, **fields: Any) -> "AbstractLieSolver":
+    def _with(self, **fields: Any) -> Self:
         changed = copy.copy(self)
         for name, value in fields.items():
             # As dataclasses do. Not every solver is made from its fields.
             object.__setattr__(changed, name, value)
         return changed
 
+    def func(self, terms, t0, y0, args) -> Any:
+        """The velocity at `y0`, shaped like it. A control that is not time has diffrax's own."""
+        return velocity(terms, terms.vf(t0, y0, args), y0)
+
+
+class AbstractChartSolver(AbstractLieSolver):
+    """A method whose step is one chart: flows of combinations of the fields in it."""
+
+    # Whether it evaluates the field at points of the step.
+    is_of_state: ClassVar[bool] = True
+
+    interpolation_cls: ClassVar[Callable[..., diffrax.AbstractLocalInterpolation]] = Interpolation
+
+    @abc.abstractmethod
+    def step_in(self, chart: Chart) -> "Step":
+        """A step from `chart.start`, with the fields that `chart.frozen` evaluates."""
+
+    def extended(self, path: Path, field: Callable[[Any, PyTree], PyTree]) -> Path:
+        """The way of a step with what only output within it takes.
+
+        `field(c, y)` is `h f(t + c h, y)`. Apart from `step_in`, which is compiled whether anybody
+        asks for that or not.
+        """
+        return path
+
     def step(self, terms, t0, t1, y0, args, solver_state, made_jump):
         # Not in a loop that is scalarised, which JAX does not know of, nor where times are known.
         is_usual = isinstance(t0, Tracer) and not is_rewritten()
-        step = _step_once if is_usual else AbstractLieSolver._step
-        return step(self, terms, t0, t1, y0, args, solver_state, made_jump)
+        step = _step_once if is_usual else AbstractChartSolver._step
+        solver = self.for_terms(terms)
+        y1, error, dense_info, solver_state, result = step(
+            solver, terms, t0, t1, y0, args, solver_state, made_jump
+        )
+        if solver is not self and isinstance(self, diffrax.AbstractAdaptiveSolver):
+            error = no_estimate(y0)
+        return y1, error, dense_info, solver_state, result
 
     def _step(self, terms, t0, t1, y0, args, solver_state, made_jump):
         compensation, first = solver_state.compensation, solver_state.first
@@ -126,7 +156,7 @@ class AbstractLieSolver(diffrax.AbstractSolver):
             # Of a weak type, if the time is.
             t0 = jnp.where(solver_state.zero == 0, t0, jnp.nan)
         if first is not None and made_jump is not False:
-            first = _select(made_jump, lambda: terms.vf(t0, y0, args), first)
+            first = select(made_jump, lambda: terms.vf(t0, y0, args), first)
 
         def evaluate(c: float | Real[Array, ""], y: PyTree) -> PyTree:
             # The end of the step exactly, not up to rounding: the field may jump there.
@@ -138,7 +168,7 @@ class AbstractLieSolver(diffrax.AbstractSolver):
             return materialised_in_rows(terms.vf(t, y, args))
 
         def stepped(y0):
-            control = terms.contr(t0, t1)
+            control = control_of(terms, t0, t1)
             values = []
 
             def field(c: float | Real[Array, ""], y: PyTree) -> PyTree:
@@ -151,7 +181,7 @@ class AbstractLieSolver(diffrax.AbstractSolver):
             step = self.step_in(Chart(field, y0, compensation))
             end, error = step.end, step.error
             if not step.is_shared:
-                end, error = _shared(compensation, end, error, is_followed=first is not None)
+                end, error = shared_end(compensation, end, error, is_followed=first is not None)
             if first is None:
                 last = None
             elif is_rewritten() and self.is_of_state:
@@ -168,10 +198,6 @@ class AbstractLieSolver(diffrax.AbstractSolver):
         state = State(compensation, last, solver_state.zero)
         return y1, error, dict(path=path), state, result_of(y1)
 
-    def func(self, terms, t0, y0, args) -> Any:
-        """The velocity at `y0`, shaped like it. A control that is not time has diffrax's own."""
-        return velocity(terms, terms.vf(t0, y0, args), y0)
-
 
 class Step(eqx.Module):
     """A step: where it ends, the way there for output within it, and an estimate of its error.
@@ -183,6 +209,14 @@ class Step(eqx.Module):
     path: Path
     error: PyTree = None
     is_shared: bool = eqx.field(static=True, default=False)
+
+
+def control_of(terms: diffrax.AbstractTerm, t0: Any, t1: Any, **kwargs: Any) -> PyTree:
+    """The control of a step, whose random numbers are drawn once."""
+    control = terms.contr(t0, t1, **kwargs)
+    # XLA draws them again for each flow that uses them, but in what is rewritten.
+    is_alone = is_driven(terms) and not is_rewritten()
+    return lax.optimization_barrier(control) if is_alone else control
 
 
 def check_choice(name: str, value: Any, *choices: Any) -> None:
@@ -204,7 +238,7 @@ def result_of(y: PyTree) -> diffrax.RESULTS:
     return diffrax.RESULTS.where(is_finite(y), diffrax.RESULTS.successful, nonfinite)
 
 
-def _select(made_jump: Any, anew: Callable[[], PyTree], kept: PyTree) -> PyTree:
+def select(made_jump: Any, anew: Callable[[], PyTree], kept: PyTree) -> PyTree:
     if made_jump is True:
         return anew()
     return lax.cond(made_jump, anew, lambda: kept)
@@ -228,29 +262,35 @@ class State(eqx.Module):
 _LEVELS = (1e-7, 1e-6, 1e-5, 1e-4, 1e-3, 1e-2, 0.1, 1.0, 10.0)
 
 
-def _fault_of_start(t0: Any, t1: Any, field: PyTree, y0: PyTree) -> Fault:
-    """Whether a time is NaN or `y0` off the manifold of `field`, which is given by shape."""
+def fault_of_start(t0: Any, t1: Any, fields: Sequence[PyTree], y0: PyTree) -> Fault:
+    """Whether a time is NaN or `y0` off the manifold of a field. The fields are given by shape."""
     is_nan = jnp.isnan(t0) | jnp.isnan(t1)
     fault = Fault.none().with_case(is_nan, "t0, t1 and dt0 must be numbers, got NaN.")
-    parts, treedef = jtu.tree_flatten_with_path(field, is_leaf=is_field)
-    for (path, part), point in zip(parts, treedef.flatten_up_to(y0), strict=True):
-        defect = part.defect(point) if is_field(part) else None
-        if defect is None:
-            continue
-        off, expected = lax.stop_gradient(defect[0]), defect[1]
-        # Within it one step of Newton's method, which the fields take, leads to the manifold. NaN
-        # has an error of its own.
-        least = float(np.sqrt(jnp.finfo(off.dtype).eps))
-        for x in (least, *(level for level in _LEVELS if level > least)):
-            fault = fault.with_case(
-                off > x,
-                f"y{jtu.keystr(path)} must start on the manifold that {type(part).__name__} acts "
-                f"on: y0{jtu.keystr(path)} must have {expected}, and is off by more than {x:.1g}.",
-            )
+    for field in fields:
+        parts, treedef = jtu.tree_flatten_with_path(field, is_leaf=is_field)
+        for (path, part), point in zip(parts, treedef.flatten_up_to(y0), strict=True):
+            fault = _off_manifold(fault, part, jtu.keystr(path), point)
     return fault
 
 
-def _shared(
+def _off_manifold(fault: Fault, part: Any, place: str, point: PyTree) -> Fault:
+    defect = part.defect(point) if is_field(part) else None
+    if defect is None:
+        return fault
+    off, expected = lax.stop_gradient(defect[0]), defect[1]
+    # Within it one step of Newton's method, which the fields take, leads to the manifold. NaN has
+    # an error of its own.
+    least = float(np.sqrt(jnp.finfo(off.dtype).eps))
+    for x in (least, *(level for level in _LEVELS if level > least)):
+        fault = fault.with_case(
+            off > x,
+            f"y{place} must start on the manifold that {type(part).__name__} acts on: y0{place} "
+            f"must have {expected}, and is off by more than {x:.1g}.",
+        )
+    return fault
+
+
+def shared_end(
     compensation: PyTree, end: PyTree, error: PyTree, is_followed: bool
 ) -> tuple[PyTree, PyTree]:
     """The end of a step and its error, which XLA would otherwise compute for each use of an entry.
@@ -267,4 +307,4 @@ def _shared(
 
 # diffrax traces a step three times, which takes longer than all else that it traces. Inline, the
 # program is as if traced anew. (equinox hands on what it does not know to `jax.jit`.)
-_step_once = eqx.filter_jit(AbstractLieSolver._step, inline=True)  # pyright: ignore[reportCallIssue]
+_step_once = eqx.filter_jit(AbstractChartSolver._step, inline=True)  # pyright: ignore[reportCallIssue]

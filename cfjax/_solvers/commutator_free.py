@@ -10,6 +10,7 @@ import jax.tree_util as jtu
 from jax import lax
 from jaxtyping import Array, Inexact, PyTree
 
+from .._control_term import is_driven
 from .._field import combine, tangent
 from .._methods import pairs as _pairs
 from .._methods import tableau as _tableau
@@ -17,13 +18,13 @@ from .._methods.continuous_extension import continuous_extension
 from .._methods.proved import order_of
 from .._methods.tableau import Product, Row, Tableau
 from .._numerics.vectors import smooth
-from .base import AbstractLieSolver, Step, check_choice
+from .base import AbstractChartSolver, Step, check_choice
 from .chart import Chart
 from .dense import Path
 from .stages import rolled
 
 
-class AbstractCommutatorFree(AbstractLieSolver):
+class AbstractCommutatorFree(AbstractChartSolver):
     """Flows of linear combinations of frozen fields, and no commutator.
 
     Where the tableau has an embedded method, its end point is compared with the step's: the error
@@ -65,7 +66,9 @@ class AbstractCommutatorFree(AbstractLieSolver):
     def order(self, terms) -> int:
         return order_of(self.tableau)
 
-    def error_order(self, terms) -> int | None:
+    def error_order(self, terms):
+        if is_driven(terms):
+            return super().error_order(terms)
         embedded = self.tableau.embedded_method
         return None if embedded is None else order_of(embedded) + 1
 
@@ -175,7 +178,9 @@ def _seen(
     return jnp.where(factor * factor * apart_square > error_square, other, error)
 
 
-class CommutatorFree(AbstractCommutatorFree, diffrax.AbstractAdaptiveSolver):
+class CommutatorFree(
+    AbstractCommutatorFree, diffrax.AbstractAdaptiveSolver, diffrax.AbstractStratonovichSolver
+):
     """The commutator-free method of a `cfjax.Tableau`.
 
     One step costs `tableau.num_evaluations` evaluations of the field and `tableau.num_flows`
@@ -198,13 +203,15 @@ class CommutatorFree(AbstractCommutatorFree, diffrax.AbstractAdaptiveSolver):
             raise TypeError(f"tableau must be a cfjax.Tableau, got {self.tableau!r}.")
 
 
-class LieEuler(AbstractCommutatorFree):
+class LieEuler(AbstractCommutatorFree, diffrax.AbstractItoSolver):
     """The exponential Euler step. Order 1, 1 evaluation, 1 flow. Dense output of order 1."""
 
     tableau: ClassVar[Tableau] = _tableau.LIE_EULER
 
 
-class CF2(AbstractCommutatorFree, diffrax.AbstractAdaptiveSolver):
+class CF2(
+    AbstractCommutatorFree, diffrax.AbstractAdaptiveSolver, diffrax.AbstractStratonovichSolver
+):
     """The midpoint rule. Order 2, 2 evaluations, 2 flows. Dense output of order 2.
 
     The estimate, with a step of `LieEuler`, costs 1 flow more.
@@ -213,7 +220,9 @@ class CF2(AbstractCommutatorFree, diffrax.AbstractAdaptiveSolver):
     tableau: ClassVar[Tableau] = _tableau.CF2
 
 
-class CF3(AbstractCommutatorFree, diffrax.AbstractAdaptiveSolver):
+class CF3(
+    AbstractCommutatorFree, diffrax.AbstractAdaptiveSolver, diffrax.AbstractStratonovichSolver
+):
     """Celledoni, Marthinsen & Owren's method of order 3: 3 evaluations, 3 flows.
 
     The estimate, with an embedded method of order 2, costs 1 flow more. Dense output of order 2.
@@ -226,7 +235,9 @@ class CF3(AbstractCommutatorFree, diffrax.AbstractAdaptiveSolver):
     tableau: ClassVar[Tableau] = _tableau.CF3
 
 
-class CF4(AbstractCommutatorFree, diffrax.AbstractAdaptiveSolver):
+class CF4(
+    AbstractCommutatorFree, diffrax.AbstractAdaptiveSolver, diffrax.AbstractStratonovichSolver
+):
     """Celledoni, Marthinsen & Owren's method of order 4: 4 evaluations, 5 flows.
 
     In a linear space this is the classical Runge-Kutta method. It is the choice for
@@ -244,7 +255,9 @@ class CF4(AbstractCommutatorFree, diffrax.AbstractAdaptiveSolver):
     tableau: ClassVar[Tableau] = _tableau.CF4
 
 
-class CF43(AbstractCommutatorFree, diffrax.AbstractAdaptiveSolver):
+class CF43(
+    AbstractCommutatorFree, diffrax.AbstractAdaptiveSolver, diffrax.AbstractStratonovichSolver
+):
     """Order 4 with an embedded method of order 3: 6 evaluations, 6 flows, 1 more for the estimate.
 
     Its error constant is 15 times smaller than that of `CF4`, and it is stable for undamped
@@ -256,7 +269,9 @@ class CF43(AbstractCommutatorFree, diffrax.AbstractAdaptiveSolver):
     tableau: ClassVar[Tableau] = _pairs.CF43
 
 
-class CF54(AbstractCommutatorFree, diffrax.AbstractAdaptiveSolver):
+class CF54(
+    AbstractCommutatorFree, diffrax.AbstractAdaptiveSolver, diffrax.AbstractStratonovichSolver
+):
     """Order 5 with an embedded method of order 4: 7 evaluations, 9 flows, 2 more for the estimate.
 
     Stable for undamped oscillations only up to 0.86 (decay: 3.95), so for these take `CF43` at
@@ -275,7 +290,9 @@ class CF54(AbstractCommutatorFree, diffrax.AbstractAdaptiveSolver):
     tableau: ClassVar[Tableau] = _pairs.CF54
 
 
-class CG3(AbstractCommutatorFree, diffrax.AbstractAdaptiveSolver):
+class CG3(
+    AbstractCommutatorFree, diffrax.AbstractAdaptiveSolver, diffrax.AbstractStratonovichSolver
+):
     """Crouch & Grossman's method of order 3: 3 evaluations, 6 flows of single fields.
 
     The estimate, with an embedded method of order 2, costs 3 flows more. Dense output of order 2.
@@ -288,7 +305,7 @@ class CG3(AbstractCommutatorFree, diffrax.AbstractAdaptiveSolver):
     tableau: ClassVar[Tableau] = _tableau.CG3
 
 
-class CG4(AbstractCommutatorFree):
+class CG4(AbstractCommutatorFree, diffrax.AbstractStratonovichSolver):
     """A Crouch-Grossman method of order 4: 5 evaluations, 15 flows of single fields.
 
     Dense output of order 3.
@@ -301,7 +318,7 @@ class CG4(AbstractCommutatorFree):
     tableau: ClassVar[Tableau] = _tableau.CG4
 
 
-class CG5(AbstractCommutatorFree):
+class CG5(AbstractCommutatorFree, diffrax.AbstractStratonovichSolver):
     """A Crouch-Grossman method of order 5: 9 evaluations, 43 flows of single fields.
 
     Dense output of order 4, which uses the field at the end of the step.

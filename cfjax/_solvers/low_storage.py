@@ -26,7 +26,7 @@ _MAX_UNROLLED = 5
 _LARGE = 4096
 
 
-class AbstractLowStorage(AbstractCommutatorFree):
+class AbstractLowStorage(AbstractCommutatorFree, diffrax.AbstractStratonovichSolver):
     """`d <- a[i] d + h f(t + c[i] h, Y)`, `Y <- exp(b[i] d) Y` for every stage i, with a[0] = 0.
 
     That takes two copies of the state's size, the point and the sum of fields that moves it.

@@ -1,28 +1,27 @@
 """Commutator-free Magnus methods: high order for fields that depend on t but not on y."""
 
-from collections.abc import Callable
 from typing import Any, ClassVar, Literal
 
 import diffrax
 import equinox as eqx
-import jax
 import jax.numpy as jnp
-import jax.tree_util as jtu
 from jaxtyping import PyTree
 
-from .._field import combine, is_field, to_chart
+from .._control_term import is_driven
+from .._field import combine, is_field
 from .._methods import magnus as _magnus
 from .._methods.magnus import MagnusTableau
 from .._methods.tableau import Product
 from .._numerics.checks import Fault
 from .._term import product
-from .base import AbstractLieSolver, State, Step, check_choice
+from .base import AbstractChartSolver, State, Step, check_choice
 from .chart import Chart
 from .dense import Path
+from .dependence import depending_on_state
 from .stages import can_roll, rolled_flows
 
 
-class AbstractMagnus(AbstractLieSolver):
+class AbstractMagnus(AbstractChartSolver):
     """Flows of linear combinations of the fields at some times within the step.
 
     For `y' = A(t) y`, and any other field whose coordinates depend on t but not on y.
@@ -62,13 +61,24 @@ class AbstractMagnus(AbstractLieSolver):
         order = self.tableau.embedded_order
         return None if order is None else order + 1
 
+    def for_terms(self, terms):
+        if is_driven(terms):
+            raise TypeError(
+                f"{type(self).__name__} takes fields at several times of a step, but a path that "
+                "drives a term has one increment for it: use another method, for example "
+                "cfjax.CF4() or, with noise, cfjax.WeakOrder2()."
+            )
+        return self
+
     def start(self, terms, t0, t1, y0, args) -> tuple[State, Fault]:
+        self.for_terms(terms)
+
         def field(y):
             return product(terms, terms.vf(t0, y, args), terms.contr(t0, t1))
 
         name = type(self).__name__
         try:
-            found = _varying(field, y0)
+            found = depending_on_state(field, y0)
         except Exception as error:
             # What is wrong with the field itself, it says itself.
             eqx.filter_eval_shape(field, y0)
@@ -112,38 +122,6 @@ class AbstractMagnus(AbstractLieSolver):
 def _num_shared(a: Product, b: Product) -> int:
     """With how many rows both begin."""
     return next(n for n, (x, y) in enumerate(zip(a, b, strict=False)) if x != y)
-
-
-def _varying(field: Callable[[PyTree], PyTree], y0: PyTree) -> list[tuple[str, Any]]:
-    """The parts of `field(y)` that depend on y or on being frozen there, each with its place.
-
-    Under `jax.vmap` over y alone, what does not depend on it has no axis of the batch. That sees
-    through every operation, and takes shapes and dtypes of y for what they are. (A derivative would
-    not see comparisons.)
-    """
-    found = []
-
-    def look(y: PyTree) -> PyTree:
-        frozen = field(y)
-        parts, treedef = jtu.tree_flatten_with_path(frozen, is_leaf=is_field)
-        charted = treedef.flatten_up_to(to_chart(frozen, y, ())[0])
-        for (path, part), coordinates in zip(parts, charted, strict=True):
-
-            def rule(size, is_mapped, leaves, path=path, part=part):
-                found.append((jtu.keystr(path), part))
-                return leaves, is_mapped[0]
-
-            probe = jax.custom_batching.custom_vmap(lambda leaves: leaves)
-            probe.def_vmap(rule)
-            probe(jtu.tree_leaves(coordinates))
-        return y
-
-    if jtu.tree_leaves(y0):
-        many = jtu.tree_map(
-            lambda y: jax.ShapeDtypeStruct((1, *jnp.shape(y)), jnp.result_type(y)), y0
-        )
-        jax.eval_shape(jax.vmap(look), many)
-    return found
 
 
 def _depends_on_state(solver: str, place: str, part: Any) -> str:

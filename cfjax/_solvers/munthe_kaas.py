@@ -11,6 +11,7 @@ import equinox as eqx
 import jax.tree_util as jtu
 from jaxtyping import PyTree
 
+from .._control_term import is_driven
 from .._field import (
     AbstractAlgebraElement,
     bracket,
@@ -23,7 +24,7 @@ from .._field import (
 from .._methods.continuous_extension import RungeKuttaExtension, runge_kutta_extension
 from .._methods.order_conditions import runge_kutta_order
 from .._methods.tableau import ContinuousExtension, Row
-from .base import AbstractLieSolver, Step, check_choice
+from .base import AbstractChartSolver, Step, check_choice
 from .chart import Chart
 from .dense import Path
 from .stages import rolled_elements
@@ -32,7 +33,7 @@ from .stages import rolled_elements
 _RungeKutta = tuple[tuple[tuple[float, ...], ...], tuple[float, ...]]
 
 
-class AbstractMuntheKaas(AbstractLieSolver):
+class AbstractMuntheKaas(AbstractChartSolver, diffrax.AbstractStratonovichSolver):
     """The step `exp(v) y0` with v in the Lie algebra. Fields without a bracket are refused.
 
     An embedded method is another element of the algebra. The error estimate is the velocity at the
@@ -228,7 +229,9 @@ class RKMK(AbstractMuntheKaas, diffrax.AbstractAdaptiveSolver):
     def order(self, terms) -> int:
         return _order(*self._end)
 
-    def error_order(self, terms) -> int | None:
+    def error_order(self, terms):
+        if is_driven(terms):
+            return super().error_order(terms)
         return None if self.b_error is None else _order(*self._embedded) + 1
 
     # What the order of the end and that of the embedded method follow from.

@@ -2,17 +2,18 @@
 
 from typing import Any, NamedTuple
 
+import diffrax
 import jax.numpy as jnp
 import jax.tree_util as jtu
 from jaxtyping import Array, Float, PyTree
 
-from .._field import combine, is_field, tangent
+from .._field import Rest, combine, is_field, tangent
 from .._fields.elementwise import each
 from .._fields.low_rank import BorderedSkew, LowRankSkew
 from .._fields.sphere import SphereRotation
 from .._methods.continuous_extension import runge_kutta_extension
 from .._numerics.matmul import matmul
-from .base import AbstractLieSolver, Step
+from .base import AbstractChartSolver, Step
 from .dense import Path
 
 _EXTENSION = runge_kutta_extension(
@@ -20,7 +21,7 @@ _EXTENSION = runge_kutta_extension(
 ).weights
 
 
-class CayleyRK4(AbstractLieSolver):
+class CayleyRK4(AbstractChartSolver, diffrax.AbstractStratonovichSolver):
     """The classical Runge-Kutta method on the tangent space, by the Cayley retraction.
 
     Order 4, 4 evaluations. Dense output of order 3. The step from Q solves for the tangent vector V
@@ -82,7 +83,7 @@ class _End(NamedTuple):
 
 def _num_axes(field: Any) -> int:
     """How many axes a point has without leading ones; 0 for a linear space."""
-    if not is_field(field):
+    if not is_field(field) or isinstance(field, Rest):
         return 0
     if isinstance(field, SphereRotation):
         return 1

@@ -11,6 +11,8 @@ import jax.tree_util as jtu
 from jax import lax
 from jaxtyping import Array, PyTree
 
+from .._control_term import is_driven
+
 
 class Richardson(diffrax.AbstractAdaptiveSolver, diffrax.AbstractWrappedSolver):
     """Any solver with an error estimate, by step doubling (Richardson extrapolation).
@@ -101,10 +103,18 @@ class Richardson(diffrax.AbstractAdaptiveSolver, diffrax.AbstractWrappedSolver):
         return inner if self.as_in_paper else _HalvesFactory(inner)
 
     def order(self, terms) -> int:
+        if is_driven(terms):
+            raise TypeError(
+                "Richardson extrapolates the order of an ordinary equation, which an equation "
+                "driven by a path does not have: use diffrax.HalfSolver(solver) for adaptive steps."
+            )
         order = self.solver.order(terms)
         if order is None:
             raise ValueError(f"Richardson needs a solver of known order, got {self.solver!r}.")
         return order
+
+    def strong_order(self, terms) -> None:
+        return None
 
     def error_order(self, terms) -> int:
         # diffrax takes the power of h that the estimate behaves like.

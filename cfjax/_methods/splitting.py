@@ -1,0 +1,78 @@
+"""Coefficients of splitting methods, and their order.
+
+A method is a list of numbers s1, s2, ...: with X = exp(1) exp(2) .. exp(N) for the terms 1 to N and
+X* its mirror image, a step is X(s1 h) X*(s2 h) X(s3 h) ..., and neighbours of one term merge. Its
+order for two terms is its order for any number (McLachlan, SIAM J. Sci. Comput. 16 (1995)).
+"""
+
+from collections.abc import Sequence
+from functools import lru_cache
+from itertools import product
+from math import factorial
+
+# Rounding of coefficients with 15 digits, in sums of some hundred products.
+_TOLERANCE = 1e-12
+_MAX_ORDER = 8
+
+
+def stages(a: Sequence[float], b: Sequence[float]) -> tuple[float, ...]:
+    """Those of the symmetric method exp(a1 A) exp(b1 B) exp(a2 A) .. of two terms.
+
+    `a` and `b` are its first halves without the entries in the middle, which the sums 1 give.
+    """
+    b = [*b, 0.5 - sum(b)]
+    a = [*a, 1 - 2 * sum(a), *reversed(a)]
+    b = [*b, *reversed(b)]
+    found, last = [], 0.0
+    for pair in zip(a, b, strict=False):
+        for x in pair:
+            last = x - last
+            found.append(last)
+    return tuple(found)
+
+
+STRANG = (0.5, 0.5)
+
+# Blanes & Moan, J. Comput. Appl. Math. 142 (2002), doi:10.1016/S0377-0427(01)00492-7, Table 2: S6
+# and S10.
+BLANES_MOAN_4 = stages(
+    (0.0792036964311957, 0.353172906049774, -0.0420650803577195),
+    (0.209515106613362, -0.143851773179818),
+)
+BLANES_MOAN_6 = stages(
+    (
+        0.0502627644003922,
+        0.413514300428344,
+        0.0450798897943977,
+        -0.188054853819569,
+        0.541960678450780,
+    ),
+    (0.148816447901042, -0.132385865767784, 0.067307604692185, 0.432666402578175),
+)
+
+
+@lru_cache
+def splitting_order(stages: Sequence[float]) -> int:
+    """The order of a splitting method, of which all words in two letters are compared.
+
+    The product of the exponentials and the exponential of the sum are series in words; the method
+    has order p if they agree in all words of up to p letters.
+    """
+    series = {"": 1.0}
+    for k, s in enumerate(stages):
+        for letter in "AB" if k % 2 == 0 else "BA":
+            series = _times_exponential(series, letter, s)
+    for n in range(1, _MAX_ORDER + 1):
+        words = map("".join, product("AB", repeat=n))
+        if any(abs(series.get(w, 0.0) - 1 / factorial(n)) > _TOLERANCE for w in words):
+            return n - 1
+    return _MAX_ORDER
+
+
+def _times_exponential(series: dict[str, float], letter: str, s: float) -> dict[str, float]:
+    out: dict[str, float] = {}
+    for word, x in series.items():
+        for n in range(_MAX_ORDER - len(word) + 1):
+            longer = word + n * letter
+            out[longer] = out.get(longer, 0.0) + x * s**n / factorial(n)
+    return out

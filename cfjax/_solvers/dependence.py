@@ -1,0 +1,53 @@
+"""Which fields depend on the state, or on time: some methods must know."""
+
+from collections.abc import Callable
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import jax.tree_util as jtu
+from jaxtyping import PyTree
+
+from .._field import is_field, to_chart
+
+
+def depending_on_state(field: Callable[[PyTree], PyTree], y0: PyTree) -> list[tuple[str, Any]]:
+    """The parts of `field(y)` that depend on y or on being frozen there, each with its place."""
+    return _depending(lambda y: (field(y), y), y0)
+
+
+def depending_on_time(field: Callable[[Any], PyTree], t: Any, y: PyTree) -> list[tuple[str, Any]]:
+    """The parts of `field(t)` that depend on t, each with its place; y is any state."""
+    return _depending(lambda t: (field(t), y), t)
+
+
+def _depending(fun: Callable[[PyTree], tuple[PyTree, PyTree]], x: PyTree) -> list[tuple[str, Any]]:
+    """The parts of a field that depend on x, where `fun(x)` is the field and its state.
+
+    Under `jax.vmap` over x alone, what does not depend on it has no axis of the batch. That sees
+    through every operation, and takes shapes and dtypes of x for what they are. (A derivative would
+    not see comparisons.)
+    """
+    found = []
+
+    def look(x: PyTree) -> PyTree:
+        frozen, y = fun(x)
+        parts, treedef = jtu.tree_flatten_with_path(frozen, is_leaf=is_field)
+        charted = treedef.flatten_up_to(to_chart(frozen, y, ())[0])
+        for (path, part), coordinates in zip(parts, charted, strict=True):
+
+            def rule(size, is_mapped, leaves, path=path, part=part):
+                found.append((jtu.keystr(path), part))
+                return leaves, is_mapped[0]
+
+            probe = jax.custom_batching.custom_vmap(lambda leaves: leaves)
+            probe.def_vmap(rule)
+            probe(jtu.tree_leaves(coordinates))
+        return x
+
+    if jtu.tree_leaves(x):
+        many = jtu.tree_map(
+            lambda x: jax.ShapeDtypeStruct((1, *jnp.shape(x)), jnp.result_type(x)), x
+        )
+        jax.eval_shape(jax.vmap(look), many)
+    return found

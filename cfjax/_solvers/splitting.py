@@ -1,0 +1,288 @@
+"""Splitting: flows of the terms of a sum by turns, each of which is exact."""
+
+from collections.abc import Sequence
+from typing import Any, ClassVar, NamedTuple
+
+import diffrax
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import jax.tree_util as jtu
+from jax import lax
+from jaxtyping import Array, PyTree
+
+from .._control_term import is_driven
+from .._field import Rest, combine, from_chart, is_field, to_chart
+from .._methods.splitting import BLANES_MOAN_4, BLANES_MOAN_6, STRANG, splitting_order
+from .._term import product
+from .._xla import scalarised
+from .base import (
+    AbstractLieSolver,
+    State,
+    control_of,
+    fault_of_start,
+    result_of,
+    select,
+    shared_end,
+)
+from .chart import carried
+from .compensation import added, at, no_compensation, with_sums
+from .dependence import depending_on_time
+
+
+class _Replay(diffrax.AbstractLocalInterpolation):
+    """The flows of a step again, each for a part of its time: on the manifold, of order 1."""
+
+    t0: Any
+    t1: Any
+    start: PyTree
+    first: PyTree
+    # Along the first axis those of all pairs of stages.
+    later: tuple[PyTree, ...]
+
+    def evaluate(self, t0: Any, t1: Any = None, left: bool = True) -> PyTree:
+        """The solution at time `t0`, or what is added to it from `t0` to `t1`."""
+        del left
+        if t1 is not None:
+            start, end = self.evaluate(t0), self.evaluate(t1)
+            return jtu.tree_map(jnp.subtract, end, start)
+        with jax.numpy_dtype_promotion("standard"):
+            length = jnp.asarray(self.t1 - self.t0)
+            # A solve from a time to the same time makes no step, and asks for its end.
+            theta = (t0 - self.t0) / jnp.where(length == 0, 1, length)
+
+        def turn(y: PyTree, fields: tuple[PyTree, ...]) -> tuple[PyTree, None]:
+            for field in fields:
+                y = _flow(combine((theta,), (field,)), y)
+            return y, None
+
+        y, _ = turn(self.start, (self.first,))
+        return lax.scan(turn, y, self.later)[0]
+
+
+def _flow(field: PyTree, y: PyTree) -> PyTree:
+    field, point = to_chart(field, y, ())
+    return from_chart(field, carried(field, point))
+
+
+class AbstractSplitting(AbstractLieSolver, diffrax.AbstractStratonovichSolver):
+    """The flows of the terms of a sum by turns."""
+
+    stages: eqx.AbstractVar[tuple[float, ...]]
+
+    term_structure: ClassVar = diffrax.MultiTerm
+    interpolation_cls: ClassVar[Any] = _Replay
+
+    def order(self, terms):
+        return splitting_order(self.stages)
+
+    def for_terms(self, terms):
+        name, parts = type(self).__name__, terms.terms
+        if len(parts) < 2:
+            raise TypeError(
+                f"{name} takes a diffrax.MultiTerm of two or more terms, got {len(parts)}."
+            )
+        if is_driven(parts[:-1]):
+            raise TypeError(
+                f"{name} takes noise, or what else a path drives, in its last term only: move it "
+                "there, together with what acts at the same time, as a diffrax.MultiTerm."
+            )
+        return self
+
+    def start(self, terms, t0, t1, y0, args):
+        self.for_terms(terms)
+        control = terms.contr(t0, t1)
+        last = terms.terms[-1]
+        if depending_on_time(lambda t: product(last, last.vf(t, y0, args), control[-1]), t0, y0):
+            raise TypeError(
+                f"The last term of {type(self).__name__} must not depend on time, which passes "
+                "while it acts: take another one as the last, or add one that returns None."
+            )
+
+        def fields(y0: PyTree) -> list[PyTree]:
+            parts = zip(terms.terms, control, strict=True)
+            return [product(term, term.vf(t0, y0, args), x) for term, x in parts]
+
+        found = eqx.filter_eval_shape(fields, y0)
+        first = terms.terms[0].vf(t0, y0, args)
+        fault = fault_of_start(t0, t1, found, y0)
+        return State(_no_compensation(found, y0), first, None), fault
+
+    def step(self, terms, t0, t1, y0, args, solver_state, made_jump):
+        parts, controls = terms.terms, control_of(terms, t0, t1)
+        first, compensation = solver_state.first, solver_state.compensation
+        if solver_state.zero is not None:
+            # Of a weak type, if the time is.
+            t0 = jnp.where(solver_state.zero == 0, t0, jnp.nan)
+        if made_jump is not False:
+            first = select(made_jump, lambda: parts[0].vf(t0, y0, args), first)
+
+        def time(c: Any) -> Array:
+            c = jnp.asarray(c, jnp.result_type(t0))
+            return jnp.where(c == 1, t1, t0 + c * (t1 - t0))
+
+        def stepped(y0: PyTree) -> Any:
+            def value(k: int, c: Any, z: PyTree) -> PyTree:
+                return parts[k].vf(time(c), at(y0, z, compensation), args)
+
+            def apply_flow(k: int, value: PyTree, s: Any, z: PyTree) -> tuple[PyTree, PyTree]:
+                field = product(parts[k], value, _scaled(s, controls[k]))
+                return field, _moved(field, z, y0, compensation)
+
+            def pair(carry: tuple[PyTree, PyTree], x: _Pair) -> Any:
+                z, _ = carry
+                last, fields = len(parts) - 1, []
+                turns = [(k, x.there, x.start) for k in range(1, last)]
+                turns += [(last, x.there + x.back, x.start)]
+                turns += [(k, x.back, x.end) for k in reversed(range(1, last))]
+                for k, s, c in turns:
+                    field, z = apply_flow(k, value(k, c, z), s, z)
+                    fields.append(field)
+                new = value(0, x.end, z)
+                field, z = apply_flow(0, new, x.kick, z)
+                return (z, new), (*fields, field)
+
+            start = with_sums(lambda c, y: y if c is None else jnp.zeros_like(y), compensation, y0)
+            field, z = apply_flow(0, first, self.stages[0], start)
+            pairs = _pairs(self.stages)
+            if len(pairs) == 1:
+                carry, later = pair((z, first), pairs[0])
+                later = jtu.tree_map(lambda x: jnp.asarray(x)[None], later)
+            else:
+                many = _Pair(*map(jnp.asarray, zip(*pairs, strict=True)))
+                carry, later = lax.scan(pair, (z, first), many)
+            return carry, (field, later)
+
+        (end, first), (field, later) = scalarised(stepped, y0)
+        end, _ = shared_end(compensation, end, None, is_followed=True)
+        y1, compensation = added(y0, end, compensation)
+        state = State(compensation, first, solver_state.zero)
+        return y1, None, dict(start=y0, first=field, later=later), state, result_of(y1)
+
+
+class Splitting(AbstractSplitting):
+    """Flows of the terms of a `diffrax.MultiTerm` by turns: symplectic where the terms are.
+
+    Each term has a frozen field that does not change along its own flow, such as a force, which
+    moves momenta alone. So its flow is exact, and where the term is Hamiltonian, the step is
+    symplectic. All symmetric methods are reversible. (`cfjax.check_field` does not see whether a
+    field changes along its flow; where it does, the order is 1.)
+
+    ```python
+    term = diffrax.MultiTerm(cfjax.LieTerm(kick), cfjax.LieTerm(drift))
+    sol = cfjax.integrate(term, cfjax.Strang(), 0.0, 100.0, y0, num_steps=10_000)
+    ```
+
+    Each field acts on the whole state, with None for a part at rest. The first term is outermost,
+    as in kick, drift, kick: it has one evaluation in each pair of stages, the last term one, and
+    those between two. Time passes while the last term acts, which must not depend on it: if all
+    terms do, add one that rests. The last term alone may be driven by noise, as in Langevin
+    dynamics by BAOAB, which is `cfjax.Strang` of kick, drift, and a `diffrax.MultiTerm` of friction
+    and noise.
+
+    There is no error estimate, as steps of different lengths would not be symplectic. Output within
+    a step is on the manifold and meets both ends, with order 1 between them.
+
+    **Arguments:** `stages`, an even number of numbers s1, s2, ... with sum 1. With X the flows of
+    all terms in their order and X* in the reverse one, a step of length h is
+    X(s1 h) X*(s2 h) X(s3 h) ....
+
+    **Raises** `ValueError` for other stages; when traced `TypeError` for less than two terms, for a
+    term before the last that a path drives, and for a last term that depends on time.
+
+    Source: McLachlan & Quispel, Splitting methods, Acta Numer. 11 (2002).
+    """
+
+    stages: tuple[float, ...] = eqx.field(static=True, converter=tuple)
+
+    def __check_init__(self):
+        is_number = [isinstance(s, int | float) for s in self.stages]
+        if not all(is_number) or len(self.stages) % 2 or not abs(sum(self.stages) - 1) < 1e-12:
+            raise ValueError(
+                f"stages must be an even number of numbers with sum 1, got {self.stages!r}."
+            )
+
+
+class Strang(AbstractSplitting):
+    """The Störmer-Verlet method, or leapfrog: order 2, 1 evaluation of the first term a step.
+
+    Source: Strang, SIAM J. Numer. Anal. 5 (1968), doi:10.1137/0705041; Hairer, Lubich & Wanner,
+    Geometric Numerical Integration, Section II.5.
+    """
+
+    stages: ClassVar[tuple[float, ...]] = STRANG
+
+
+class BlanesMoan4(AbstractSplitting):
+    """Order 4, 6 evaluations of the first term a step; an error constant of 1.9e-4.
+
+    Source: Blanes & Moan, J. Comput. Appl. Math. 142 (2002), doi:10.1016/S0377-0427(01)00492-7.
+    """
+
+    stages: ClassVar[tuple[float, ...]] = BLANES_MOAN_4
+
+
+class BlanesMoan6(AbstractSplitting):
+    """Order 6, 10 evaluations of the first term a step; an error constant of 1.2e-5.
+
+    Source: Blanes & Moan, J. Comput. Appl. Math. 142 (2002), doi:10.1016/S0377-0427(01)00492-7.
+    """
+
+    stages: ClassVar[tuple[float, ...]] = BLANES_MOAN_6
+
+
+class _Pair(NamedTuple):
+    """Two stages: the parts of the step of the terms on the way there and back, of the first term
+    at the end, and the times before and after, as parts of the step.
+    """
+
+    there: Any
+    back: Any
+    kick: Any
+    start: Any
+    end: Any
+
+
+def _pairs(stages: Sequence[float]) -> list[_Pair]:
+    pairs, time = [], 0.0
+    for k in range(0, len(stages), 2):
+        there, back = stages[k : k + 2]
+        is_last = k + 2 == len(stages)
+        after = 1.0 if is_last else time + there + back
+        kick = back if is_last else back + stages[k + 2]
+        pairs.append(_Pair(there, back, kick, time, after))
+        time = after
+    return pairs
+
+
+def _scaled(s: Any, control: PyTree) -> PyTree:
+    return jtu.tree_map(lambda x: jnp.asarray(s, jnp.result_type(x)) * x, control)
+
+
+def _no_compensation(fields: Sequence[PyTree], y0: PyTree) -> PyTree:
+    """Zeros for each array of the state that one term moves by increments and the others can."""
+
+    def kind(f: Any, y: PyTree) -> PyTree:
+        if not is_field(f) or isinstance(f, Rest):
+            return jtu.tree_map(lambda _: "any", y)
+        is_sum = jtu.tree_leaves(no_compensation(f, y)) != []
+        return jtu.tree_map(lambda _: "sum" if is_sum else "state", y)
+
+    def part(y: Array, *kinds: str) -> Array | None:
+        return jnp.zeros_like(y) if "sum" in kinds and "state" not in kinds else None
+
+    kinds = [jtu.tree_map(kind, field, y0, is_leaf=is_field) for field in fields]
+    return jtu.tree_map(part, y0, *kinds)
+
+
+def _moved(field: PyTree, z: PyTree, y0: PyTree, compensation: PyTree) -> PyTree:
+    """Where a field carries a point, of which sums are increments from the start of the step."""
+
+    def part(f: Any, z: PyTree, c: PyTree, y0: PyTree) -> PyTree:
+        if not is_field(f):
+            return z + f
+        if isinstance(f, Rest):
+            return z
+        return z + f.increment(y0 + z) if isinstance(c, jax.Array) else _flow(f, z)
+
+    return jtu.tree_map(part, field, z, compensation, y0, is_leaf=is_field)
