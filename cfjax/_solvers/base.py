@@ -3,7 +3,7 @@
 import abc
 import copy
 from collections.abc import Callable, Sequence
-from typing import Any, ClassVar, Self
+from typing import Any, ClassVar
 
 import diffrax
 import equinox as eqx
@@ -88,7 +88,7 @@ class AbstractLieSolver(diffrax.AbstractSolver):
         first = terms.vf(t0, y0, args) if self.first_same_as_last else None
         return State(compensation, first, None), fault_of_start(t0, t1, (field,), y0)
 
-    def for_terms(self, terms: PyTree[diffrax.AbstractTerm]) -> Self:
+    def for_terms(self, terms: PyTree[diffrax.AbstractTerm]) -> "AbstractLieSolver":
         """The same method for these terms: without its estimate where a path drives one of them.
 
         It would compare two methods on the same chord of the path, and not see that the path is
@@ -98,15 +98,15 @@ class AbstractLieSolver(diffrax.AbstractSolver):
         """
         return self.without_estimate() if is_driven(terms) else self
 
-    def without_estimate(self) -> Self:
+    def without_estimate(self) -> "AbstractLieSolver":
         """The same method for steps that nobody controls: it keeps nothing for an estimate."""
         return self._with(estimate=None) if hasattr(self, "estimate") else self
 
-    def unrolled(self) -> Self:
+    def unrolled(self) -> "AbstractLieSolver":
         """The same method with its stages one by one in the program, where each can be counted."""
         return self._with(unroll=True) if hasattr(self, "unroll") else self
 
-    def _with(self, **fields: Any) -> Self:
+    def _with(self, **fields: Any) -> "AbstractLieSolver":
         changed = copy.copy(self)
         for name, value in fields.items():
             # As dataclasses do. Not every solver is made from its fields.
@@ -142,7 +142,7 @@ class AbstractChartSolver(AbstractLieSolver):
         # Not in a loop that is scalarised, which JAX does not know of, nor where times are known.
         is_usual = isinstance(t0, Tracer) and not is_rewritten()
         step = _step_once if is_usual else AbstractChartSolver._step
-        solver = self.for_terms(terms)
+        solver: Any = self.for_terms(terms)
         y1, error, dense_info, solver_state, result = step(
             solver, terms, t0, t1, y0, args, solver_state, made_jump
         )

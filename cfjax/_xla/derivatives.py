@@ -59,7 +59,7 @@ class Plain:
     ) -> "Plain":
         """What `make` makes of the program, for some of its operands and results.
 
-        The results depend on no other operands.
+        The results need no other operands.
         """
 
         def fun(*taken: Array) -> list[Array]:
@@ -157,7 +157,7 @@ class _Linear(NamedTuple):
 
     program: ClosedJaxpr
     plain: Plain | None
-    takes: list[int]
+    takes: Sequence[int]
     linear: int
     gives: list[int]
 
@@ -177,10 +177,18 @@ def _linear(
 ) -> _Linear:
     """What `make` makes of a program, linear in operands from `first` on, without what is zero."""
     made = program_of(make(program), *operands)
-    are_reached = reached(made.jaxpr, [k >= first for k in range(len(operands))])
+    everything = range(len(operands))
+    are_reached = reached(made.jaxpr, [k >= first for k in everything])
     gives = [k for k, is_one in enumerate(are_reached) if is_one]
     program, takes = narrowed(made, gives)
-    plain = None if plain is None else plain.derived(make, operands, takes, gives)
+    if plain is not None:
+        if not set(range(first)) <= set(takes):
+            # Whole arrays have entries that their results do not depend on, but which must be what
+            # they are: zero times a derivative that is infinite at zero is NaN.
+            _, needed = narrowed(plain.derived(make, operands, everything, gives).program)
+            more = {k for k in needed if k < first}
+            program, takes = narrowed(made, gives, sorted({*takes, *more}))
+        plain = plain.derived(make, operands, takes, gives)
     linear = sum(k >= first for k in takes)
     return _Linear(program, plain, takes, linear, [places[k] for k in gives])
 

@@ -101,12 +101,19 @@ def _pruned(eqn: JaxprEqn, wanted: set[Any]) -> JaxprEqn:
     )
 
 
-def narrowed(program: ClosedJaxpr, gives: Sequence[int]) -> tuple[ClosedJaxpr, list[int]]:
-    """A program for some of the results, and the operands that it needs for that."""
+def narrowed(
+    program: ClosedJaxpr, gives: Sequence[int] | None = None, takes: Sequence[int] | None = None
+) -> tuple[ClosedJaxpr, Sequence[int]]:
+    """A program for some of the results, by default all, and the operands that it takes.
+
+    By default these are those that it needs.
+    """
     jaxpr = program.jaxpr
-    code = without_dead_code(altered(jaxpr, outvars=[jaxpr.outvars[k] for k in gives]))
-    used = {v for e in code.eqns for v in variables(e.invars)} | set(variables(code.outvars))
-    takes = [k for k, v in enumerate(code.invars) if v in used]
+    outvars = jaxpr.outvars if gives is None else [jaxpr.outvars[k] for k in gives]
+    code = without_dead_code(altered(jaxpr, outvars=outvars))
+    if takes is None:
+        used = {v for e in code.eqns for v in variables(e.invars)} | set(variables(code.outvars))
+        takes = [k for k, v in enumerate(code.invars) if v in used]
     code = altered(code, invars=[code.invars[k] for k in takes])
     return ClosedJaxpr(code, program.consts), takes
 
