@@ -40,35 +40,35 @@ def integrate(
 ) -> diffrax.Solution:
     """Integrates from `t0` to `t1` with `num_steps` equal steps of any diffrax solver.
 
-    A leaner loop than `diffrax.diffeqsolve` for the case that needs no more: one scan, constant
-    memory, one compilation for each shape of the arguments and each number of steps, none for new
-    values. Reverse mode keeps one state a step and computes every step again.
+    This is a leaner loop than `diffrax.diffeqsolve`, for problems that need no more: one scan,
+    constant memory, and one compilation for each shape of the arguments and each number of steps,
+    none for new values. Reverse mode keeps one state a step and computes every step again.
 
     **Arguments:**
 
-    - `term`, `solver`, `t0`, `t1`, `y0`, `args`: as for `diffrax.diffeqsolve`. `t1 < t0`
-      integrates backwards. Times are real scalars and take the precision of `y0`. Parts of `y0` in
-      integers, booleans or half precision become the default floating dtype. (`diffeqsolve`
-      promotes them to the dtype of the times.) Python floats in `args` are traced; a Python int or
-      bool is part of the program, as in equinox.
-    - `num_steps`: how many steps, at least 1, and not so many that a step would be shorter than
-      the rounding of a time: in float32 at most 2^24, and fewer for times far from zero.
-    - `save_every`: saves the state after every so many steps; must divide `num_steps`. By default
-      only the final state is saved.
+    - `term`, `solver`, `t0`, `t1`, `y0`, `args`: as for `diffrax.diffeqsolve`. `t1 < t0` integrates
+      backwards. Times are real scalars and take the precision of `y0`. Integers, booleans and half
+      precision in `y0` become the default floating dtype. (`diffeqsolve` promotes them to the dtype
+      of the times.) Python floats in `args` are traced; a Python int or bool is part of the
+      program, as in equinox.
+    - `num_steps`: the number of steps, at least 1, and not so many that a step would be shorter
+      than the rounding of a time: in float32 at most 2^24, and fewer for times far from zero.
+    - `save_every`: saves the state each time this many steps are done; must divide `num_steps`. By
+      default only the final state is saved.
     - `save_initial`: whether `t0` and the initial state are saved too, before all others, as with
       `diffrax.SaveAt(t0=True)`.
-    - `checkpoint_every`: for reverse mode with little memory. It then keeps one state in so many
-      steps and computes the steps between again, a second time. About `sqrt(num_steps)` is best,
-      and makes the memory proportional to `sqrt(num_steps)` states.
+    - `checkpoint_every`: for reverse mode with little memory. Reverse mode then keeps one state for
+      each group of this many steps, and computes the steps between a second time. About
+      `sqrt(num_steps)` is best, and makes the memory proportional to `sqrt(num_steps)` states.
     - `throw`: whether a failure is an error, as in diffrax. If not, `result` of the solution says
-      what happened, and what is wrong with a value of the arguments makes NaN. In a batch made by
-      `jax.vmap` one failure is an error for all. An error within a function that you compile is a
-      call of the host, so JAX does not keep such a program on disk. It keeps the others: with
-      `throw=False`, and all that are called from Python, where the host looks at the result.
+      what happened, and invalid values of the arguments give NaN. In a batch made by `jax.vmap` one
+      failure is an error for the whole batch. An error check within a function that you compile is
+      a call of the host, so JAX does not keep such a program on disk. It keeps programs with
+      `throw=False`, and every call from Python, where the host checks the result.
 
     **Returns:** a `diffrax.Solution`. Its `ts` has shape `(num_saves,)`, and each leaf of `ys` has
-    one more axis of that length in front; the last entry is the state at `t1`. The initial state
-    is there with `save_initial` only.
+    one more axis of that length in front; the last entry is the state at `t1`. The initial state is
+    included only with `save_initial`.
 
     **Raises:** `TypeError` or `ValueError` for arguments of wrong type or value. A runtime error if
     `y0` or a saved state has an entry that is not finite, if `y0` is off the manifold that a field
