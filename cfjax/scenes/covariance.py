@@ -62,7 +62,7 @@ class Track(NamedTuple):
 
 
 def y0(deviation: float = 0.5) -> Float[np.ndarray, "4 4"]:
-    """The covariance when the ship comes in sight, which gives its position and its speed."""
+    """The covariance when the ship comes into sight; `deviation` is that of the position."""
     return np.diag([deviation**2, deviation**2, 0.01, 0.01])
 
 
