@@ -149,7 +149,7 @@ def errors() -> list[list[str]]:
     rows = pick(load("tolerances")["rows"], equal="error")
     counts = values(rows, "systems")
     columns = ("steps", "error", "time over Tsit5's")
-    table = [["asked", "method", *(f"{what}, {systems(n)}" for n in counts for what in columns)]]
+    table = [["target error", "method", *(f"{what}, {systems(n)}" for n in counts for what in columns)]]
     for error, method in itertools.product(values(rows, "to"), values(rows, "method")):
         cells = [power(error), code(method)]
         for row in (one(rows, method=method, systems=n, to=error) for n in counts):
@@ -323,7 +323,7 @@ def operators() -> list[list[str]]:
 @table
 def krylov() -> list[list[str]]:
     rows = [row for row in load("operators")["rows"] if row["problem"] != "dense"]
-    columns = ("`OperatorSum`", "other over it")
+    columns = ("`OperatorSum`", "other / `OperatorSum`")
     head = ["", "2-norm", "other", *columns, *(f"gradient, {what}" for what in columns)]
     table = [head]
     for problem, norm in dict.fromkeys((row["problem"], row["norm"]) for row in rows):

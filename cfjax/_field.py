@@ -241,7 +241,7 @@ def combine(weights: Sequence[Weight], fields: Sequence[PyTree]) -> PyTree:
             place = jtu.keystr(path) and f" at {jtu.keystr(path)}"
             raise TypeError(
                 f"Only fields of one kind can be added, got {names}{place}. If these are the terms "
-                "of a diffrax.MultiTerm, give each a part of the state of its own."
+                "of a diffrax.MultiTerm, give each its own part of the state."
             )
         if is_field(leaves[0]):
             return type(leaves[0]).combine(weights, leaves)
@@ -347,8 +347,8 @@ def _check_coordinates(name: str, x: Any) -> None:
     if not jnp.issubdtype(getattr(x, "dtype", object), jnp.inexact):
         raise TypeError(
             f"{name} must be a floating or complex array to be combined linearly, got "
-            f"{describe(x)}. What is no coordinate belongs in a static field, "
-            "`eqx.field(static=True)`, or asks for a `combine` of the class's own."
+            f"{describe(x)}. Put what is not a coordinate into a static field, "
+            "`eqx.field(static=True)`, or override `combine`."
         )
 
 

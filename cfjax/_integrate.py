@@ -90,8 +90,8 @@ def integrate(
     dtype = time_dtype(y0)
     if num_steps > _most_steps(dtype):
         raise ValueError(
-            f"num_steps must be at most {_most_steps(dtype)} where times are {dtype}, as those of "
-            f"more steps do not differ, got {num_steps}. Make y0 float64."
+            f"num_steps must be at most {_most_steps(dtype)} for times in {dtype}, as the times of "
+            f"more steps would coincide, got {num_steps}. Make y0 float64."
         )
     t0, t1 = time_scalar("t0", t0, dtype), time_scalar("t1", t1, dtype)
     args = jtu.tree_map(lambda x: jnp.asarray(x) if isinstance(x, float | complex) else x, args)
@@ -169,9 +169,9 @@ def equal_steps(
         solver_state, fault = solver.init(term, t0, time(n + 1), y0, args), Fault.none()
     fault = fault.with_case(
         is_short,
-        "num_steps must leave each step longer than the rounding of t0 and t1, and of so many "
-        f"steps the times do not differ in {t0.dtype}. Take fewer steps, shift the times towards "
-        "zero, or make y0 float64.",
+        "num_steps must leave each step longer than the rounding of t0 and t1, and the times of so "
+        f"many steps coincide in {t0.dtype}. Take fewer steps, shift the times towards zero, or "
+        "make y0 float64.",
     )
     is_static = isinstance(num_steps, int)
     length = num_steps if is_static else jnp.where(fault.number == 0, num_steps, 0)
@@ -326,7 +326,7 @@ def check_own_tolerances(solver: Any) -> None:
             name = type(solver).__name__
             place = "diffrax." if getattr(diffrax, name, None) is type(solver) else ""
             raise ValueError(
-                "solver must have tolerances of its own, as equal steps have none to give it, got "
+                "solver must have tolerances of its own, as equal steps do not provide any, got "
                 f"{name} without. Write {place}{name}(root_finder=diffrax.VeryChord(rtol=1e-8, "
                 "atol=1e-8, norm=optimistix.rms_norm))."
             )

@@ -254,7 +254,7 @@ def _first_run(program: Callable[[], tuple]) -> tuple[PyTree, float, float, str]
 
 def _checked_settings(num_steps: Any, tolerances: Any) -> list[Any]:
     if (num_steps is None) == (tolerances is None):
-        raise ValueError("Give one of num_steps and tolerances, and not the other.")
+        raise ValueError("Give either num_steps or tolerances, not both.")
     name, given = ("num_steps", num_steps) if tolerances is None else ("tolerances", tolerances)
     if isinstance(given, np.ndarray | jax.Array) and given.ndim == 1:
         given = given.tolist()
