@@ -149,7 +149,9 @@ def errors() -> list[list[str]]:
     rows = pick(load("tolerances")["rows"], equal="error")
     counts = values(rows, "systems")
     columns = ("steps", "error", "time over Tsit5's")
-    table = [["target error", "method", *(f"{what}, {systems(n)}" for n in counts for what in columns)]]
+    table = [
+        ["target error", "method", *(f"{what}, {systems(n)}" for n in counts for what in columns)]
+    ]
     for error, method in itertools.product(values(rows, "to"), values(rows, "method")):
         cells = [power(error), code(method)]
         for row in (one(rows, method=method, systems=n, to=error) for n in counts):
