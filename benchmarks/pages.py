@@ -1,7 +1,8 @@
 """The pages' tables, measured numbers and pictures, from what the benchmarks have stored.
 
-Nothing is measured. In a page of `docs/` a table or a number stands between `<!-- table: NAME -->`
-or `<!-- number: NAME -->` and `<!-- end -->`, where NAME is that of a function below, with hyphens.
+Nothing is measured. In a page of `docs/` a table or a number is between `<!-- table: NAME -->` or
+`<!-- number: NAME -->` and `<!-- end -->`, where NAME is the name of a function below, with
+hyphens.
 """
 
 import argparse
