@@ -20,6 +20,8 @@ PAGES = sorted((HERE.parent / "docs").rglob("*.md"))
 MARKED = re.compile(r"(<!-- (table|number): ([\w-]+) -->)(.*?)(<!-- end -->)", flags=re.DOTALL)
 # Methods that the results have by their tableaus.
 SHORT = {"RKMK(Tsit5)": "RKMK5", "RKMK(Dopri8)": "RKMK8"}
+# What the pages call a way to solve.
+WAYS = {"controlled steps": "adaptive steps"}
 # Those that draw, and how fine.
 PICTURES = {
     "batch": 120,
@@ -413,7 +415,7 @@ def compiling() -> list[list[str]]:
     rows = load("compile")["rows"]
     ways, methods = values(rows, "way"), values(rows, "method")
     seconds = {way: pick(rows, method="Tsit5", way=way) for way in ways}
-    table = [["", *ways]]
+    table = [["", *(WAYS.get(way, way) for way in ways)]]
     table.append(["diffrax, Tsit5"])
     table[1] += [f"1 ({between(r['CPU seconds'][2] for r in seconds[way])} s)" for way in ways]
     for method in methods[1:]:
@@ -432,7 +434,7 @@ def first_call() -> list[list[str]]:
         base, *others = (one(rows, problem=problem, way=way, method=m) for m in methods)
         cells = [f"1 ({cell(base['CPU seconds'])} s)"]
         cells += [f"{cell(r['over Tsit5'])}; {two_digits(r['CPU seconds'][2])} s" for r in others]
-        table.append([problem, way, *cells])
+        table.append([problem, WAYS.get(way, way), *cells])
     return table
 
 
