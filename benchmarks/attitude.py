@@ -1,9 +1,10 @@
 """Time to an error for attitudes: a spacecraft, and the heavy top as a pose.
 
-Quaternion and momentum to t = 10, and the heavy top to t = 0.2, in equal steps: as many as a method
-needs for an error, alone, in a batch, and with the gradient in the start. `cfjax.integrate` with
-cfjax's methods, `diffrax.diffeqsolve` with diffrax's on the same numbers in plain space, where the
-quaternion's length drifts. All programs take turns.
+The problems are a quaternion and momentum to t = 10, and the heavy top to t = 0.2, in equal steps:
+as many as a method needs for an error, for one system, in a batch, and with the gradient with
+respect to the start. `cfjax.integrate` runs cfjax's methods, and `diffrax.diffeqsolve` runs
+diffrax's methods on the same numbers in plain space, where the quaternion's length drifts. All
+programs take turns.
 """
 
 from collections.abc import Callable, Iterator

@@ -1,10 +1,11 @@
-"""A larger system must not choke: a chain of bodies, each coupled to its neighbours.
+"""Larger systems: a chain of bodies, each coupled to its neighbours.
 
-Every body is an attitude in SO(3) with its angular momentum, each a part of the state of its own.
-Springs align neighbours, friction and a motor on the first body act. Seconds and memory to compile,
-and seconds to run, of a solve and of its gradient: CF4 with cfjax's rewriting of programs and
-without, and Tsit5 in plain space. Each case is a process of its own, with a time limit: in larger
-chains a program that ran past it does not run. The picture shows the time to compile.
+Every body is an attitude in SO(3) with its angular momentum, each a separate part of the state.
+Springs align neighbours, and friction and a motor act on the first body. It measures seconds and
+memory to compile, and seconds to run, for a solve and its gradient: CF4 with and without cfjax's
+rewriting of programs, and Tsit5 in plain space. Each case runs in its own process, with a time
+limit: a program that exceeds the limit does not run for larger chains. The picture shows the time
+to compile.
 """
 
 import argparse

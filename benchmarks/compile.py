@@ -1,8 +1,8 @@
 """Time to compile: cfjax's methods over diffrax's Tsit5 in plain space, through `diffeqsolve`.
 
-Seconds of the processor to trace, lower and compile, which other work on the machine disturbs less
-than seconds of the clock: for three problems, each with fixed steps, controlled steps, output at
-given times, and a gradient. Programs take turns with Tsit5. Then second derivatives.
+It measures processor time to trace, lower and compile, which other work on the machine disturbs
+less than wall time, for three problems, each with fixed steps, adaptive steps, output at given
+times, and a gradient. Programs take turns with Tsit5. Then it measures second derivatives.
 """
 
 import time

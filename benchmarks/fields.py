@@ -1,9 +1,9 @@
-"""Ways to write a field: a field that a user writes must be as fast as ours.
+"""Ways to write a field: a user-defined field must be as fast as those of cfjax.
 
-A heavy top whose attitude is a quaternion, moved by a class of the user's own, with its angular
-momentum. The ways differ in how the product of two quaternions is written, and in nothing else.
-Time of a step, and of the gradient of a step, of CF4 and RKMK(Tsit5), for one system and for each
-of a batch, by `cfjax.integrate` and `diffrax.diffeqsolve`. All ways take turns.
+The problem is a heavy top whose attitude is a quaternion, moved by a user-defined class, with its
+angular momentum. The ways differ only in how they write the product of two quaternions. It measures
+the time of a step, and of the gradient of a step, of CF4 and RKMK(Tsit5), for one system and for
+each of a batch, by `cfjax.integrate` and `diffrax.diffeqsolve`. All ways take turns.
 """
 
 from collections.abc import Callable, Iterator

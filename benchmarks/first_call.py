@@ -1,8 +1,8 @@
-"""What a user waits for at the first call: from the start of a process to the first result.
+"""Time of the first call: from the start of a process to the first result.
 
-A fresh process for each solve, imports included: seconds of the processor, which other work on the
-machine disturbs less, and of the clock. diffrax's Tsit5 solves the same in plain space, in a
-process that does not import cfjax. Processes take turns.
+Each solve has a fresh process, imports included. It measures processor time, which other work on
+the machine disturbs less, and wall time. diffrax's Tsit5 solves the same problem in plain space, in
+a process that does not import cfjax. Processes take turns.
 """
 
 import json

@@ -1,8 +1,9 @@
 """The gradient of a fit to data at every step: what it costs to compile and to run.
 
-Equal steps by `cfjax.integrate`, saved after each (or each fifth), and the sum of cubes of all that
-is saved; the derivative is in the start and the moments of inertia. Seconds of the processor to
-trace, lower and compile, of one run, and the time of a gradient; programs of one row take turns.
+`cfjax.integrate` makes equal steps and saves the state after each step (or each fifth step). The
+loss is the sum of cubes of all saved numbers, and the derivative is with respect to the start and
+the moments of inertia. It measures the processor time to trace, lower and compile, in one run, and
+the time of a gradient. Programs of one row take turns.
 """
 
 import time

@@ -1,6 +1,7 @@
 """What a gradient costs, over its solve: CF4 and Tsit5, alone and in a batch.
 
-In the initial value, of one number. A solve and its gradient take turns.
+The gradient of one number is with respect to the initial value. A solve and its gradient take
+turns.
 """
 
 from collections.abc import Callable, Iterator

@@ -1,8 +1,9 @@
-"""States with leading axes: a step of CF4 for each element, beside as many solves under `jax.vmap`.
+"""States with leading axes: a step of CF4 for each element, and as many solves under `jax.vmap`.
 
-Then a ferromagnet, whose spins need their neighbours, beside the same spins without any, and beside
-diffrax's Dopri5 in plain space with every spin made of length 1 after each step. All take turns.
-The errors are root mean squares at the end, against CF54 with a fifth of the step.
+Then it compares a ferromagnet, whose spins need their neighbours, with the same spins without
+neighbours, and with diffrax's Dopri5 in plain space, which normalises every spin after each step.
+All programs take turns. The errors are root mean squares at the end, with CF54 in a fifth of the
+step as the reference.
 """
 
 from collections.abc import Callable, Iterator

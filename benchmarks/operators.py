@@ -1,18 +1,18 @@
-"""The exponential of a matrix or an operator, times a vector: our flows, beside Krylov methods.
+"""The exponential of a matrix or an operator, times a vector: flows of cfjax and Krylov methods.
 
 - dense: a random Hermitian matrix, complex, of size n.
 - spins: a chain of 12 in a transverse field, as in `cfjax.scenes.annealing`, halfway.
 - diffusion and advection: differences on 1024 points, symmetric, or nearly skew but damped.
 
-The 2-norm of a step is given. `OperatorSum` knows what is fixed when the program is traced, and
+The 2-norm of a step is given. `OperatorSum` knows the operators when the program is traced, and
 `LeftMatrix` sees a matrix only when it runs. The others are the dense exponential of cfjax times
-the vector, and a method of Lanczos, without reorthogonalisation, where the operator is Hermitian,
-or of Arnoldi, as matfree has them, with the exponential of cfjax for the small matrix, which is
-faster there than one by eigenvalues. They have no tolerance: each takes the least number of
-products of a list with which it is as near as `GOAL` times the norm, found by trial. That is left
-out of the time, and is to their advantage. Six products are what a step of Tsit5 takes in plain
-space. A gradient is one in the coefficient and the state. All take turns. Without matfree there is
-no Krylov method.
+the vector, and the Lanczos method of matfree, without reorthogonalisation, if the operator is
+Hermitian, otherwise the Arnoldi method of matfree. Both use the exponential of cfjax for the small
+matrix, which is faster than an exponential by eigenvalues. They have no tolerance: each takes the
+smallest number of products from a list for which its error is at most `GOAL` times the norm, found
+by trial. The trials are left out of the time, which is to their advantage. Six products are what a
+step of Tsit5 takes in plain space. A gradient is one in the coefficient and the state. All take
+turns. Without matfree there is no Krylov method.
 """
 
 import functools

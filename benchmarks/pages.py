@@ -1,7 +1,8 @@
 """The pages' tables, measured numbers and pictures, from what the benchmarks have stored.
 
-Nothing is measured. In a page of `docs/` a table or a number stands between `<!-- table: NAME -->`
-or `<!-- number: NAME -->` and `<!-- end -->`, where NAME is that of a function below, with hyphens.
+Nothing is measured. In a page of `docs/` a table or a number is between `<!-- table: NAME -->` or
+`<!-- number: NAME -->` and `<!-- end -->`, where NAME is the name of a function below, with
+hyphens.
 """
 
 import argparse
@@ -19,6 +20,8 @@ PAGES = sorted((HERE.parent / "docs").rglob("*.md"))
 MARKED = re.compile(r"(<!-- (table|number): ([\w-]+) -->)(.*?)(<!-- end -->)", flags=re.DOTALL)
 # Methods that the results have by their tableaus.
 SHORT = {"RKMK(Tsit5)": "RKMK5", "RKMK(Dopri8)": "RKMK8"}
+# What the pages call a way to solve.
+WAYS = {"controlled steps": "adaptive steps"}
 # Those that draw, and how fine.
 PICTURES = {
     "batch": 120,
@@ -149,7 +152,9 @@ def errors() -> list[list[str]]:
     rows = pick(load("tolerances")["rows"], equal="error")
     counts = values(rows, "systems")
     columns = ("steps", "error", "time over Tsit5's")
-    table = [["asked", "method", *(f"{what}, {systems(n)}" for n in counts for what in columns)]]
+    table = [
+        ["target error", "method", *(f"{what}, {systems(n)}" for n in counts for what in columns)]
+    ]
     for error, method in itertools.product(values(rows, "to"), values(rows, "method")):
         cells = [power(error), code(method)]
         for row in (one(rows, method=method, systems=n, to=error) for n in counts):
@@ -323,7 +328,7 @@ def operators() -> list[list[str]]:
 @table
 def krylov() -> list[list[str]]:
     rows = [row for row in load("operators")["rows"] if row["problem"] != "dense"]
-    columns = ("`OperatorSum`", "other over it")
+    columns = ("`OperatorSum`", "other / `OperatorSum`")
     head = ["", "2-norm", "other", *columns, *(f"gradient, {what}" for what in columns)]
     table = [head]
     for problem, norm in dict.fromkeys((row["problem"], row["norm"]) for row in rows):
@@ -410,7 +415,7 @@ def compiling() -> list[list[str]]:
     rows = load("compile")["rows"]
     ways, methods = values(rows, "way"), values(rows, "method")
     seconds = {way: pick(rows, method="Tsit5", way=way) for way in ways}
-    table = [["", *ways]]
+    table = [["", *(WAYS.get(way, way) for way in ways)]]
     table.append(["diffrax, Tsit5"])
     table[1] += [f"1 ({between(r['CPU seconds'][2] for r in seconds[way])} s)" for way in ways]
     for method in methods[1:]:
@@ -429,7 +434,7 @@ def first_call() -> list[list[str]]:
         base, *others = (one(rows, problem=problem, way=way, method=m) for m in methods)
         cells = [f"1 ({cell(base['CPU seconds'])} s)"]
         cells += [f"{cell(r['over Tsit5'])}; {two_digits(r['CPU seconds'][2])} s" for r in others]
-        table.append([problem, way, *cells])
+        table.append([problem, WAYS.get(way, way), *cells])
     return table
 
 

@@ -1,11 +1,11 @@
 """The scenes of `benchmarks/peers.py`, each with the programs that solve it.
 
 - A spacecraft, `cfjax.scenes.spacecraft` to t = 40. The reference is exact.
-- An attitude whose angular velocity is given in time, as a matrix, to t = 10: what georax shows its
-  convergence on. The reference is SciPy's DOP853 at its smallest tolerance.
-- The equation of Kuramoto and Sivashinsky to t = 30, with the period, the start and the 128 points
-  of Kassam & Trefethen (doi:10.1137/S1064827502410633), for exponax. The reference is SciPy's
-  DOP853 again, with the same modes in NumPy: the error is that of time alone.
+- An attitude matrix whose angular velocity is given in time, to t = 10: georax shows its
+  convergence on this problem. The reference is SciPy's DOP853 at its smallest tolerance.
+- The Kuramoto-Sivashinsky equation to t = 30, with the period, the start and the 128 points of
+  Kassam & Trefethen (doi:10.1137/S1064827502410633), for exponax. The reference is SciPy's DOP853
+  again, with the same modes in NumPy: the error is that of time alone.
 """
 
 import importlib

@@ -1,10 +1,11 @@
-"""cfjax beside its peers, on scenes of theirs and ours: error, time, and what is left of the group.
+"""cfjax and its peers, on scenes of both: error, time, and distance from the group.
 
-Each program runs with several numbers of steps, or tolerances, and with what it needs for one error
-that all are to reach. There all are compared: time, and the distance of the end from the group. The
-spacecraft also runs 1000 times at once. All programs of a scene take turns.
+Each program runs with several numbers of steps, or tolerances, and with the number or tolerance
+that it needs for one error common to all. At this error the programs are compared: time, and the
+distance of the end from the group. The spacecraft also runs 1000 times at once. All programs of a
+scene take turns.
 
-A peer that is not installed is left out, and so are its rows in the stored results:
+A peer that is not installed is left out, and so are its rows in the stored results: run
 `pip install '.[peers]'` before `make benchmarks`.
 """
 

@@ -1,4 +1,4 @@
-"""Quantum systems: time to an error, beside diffrax in plain space, dynamiqs and QuTiP.
+"""Quantum systems: time to an error, compared with diffrax in plain space, dynamiqs and QuTiP.
 
 - transmon: propagators of four levels under pulses of 8 ns, with a carrier of 5 GHz, as in
   `cfjax.scenes.transmon`; one pulse, and a batch.
@@ -8,17 +8,17 @@
   the drive slow. Energies are counted from the middle, for the sake of methods in plain space.
 - annealing: the state of 12 spins, as in `cfjax.scenes.annealing`. No part is constant.
 
-Each method takes the steps, or the tolerance, with which its ends are as near as the goal: the root
-of the mean square, over a batch, of the largest entry of a propagator, or of the length of a state.
-They were found by trial, of the transmon on a batch, and the error is measured again. Where an
-error goes up and down with the number of steps, as it does where steps are as often as two levels
-beat, it is below the goal for all larger numbers too. `frame` is the frame in which the levels of
-the constant part rest, put in by hand; Magnus methods take more steps there, and are not in it.
-What ends are compared with is Magnus10 with many steps; how near DOP853 of SciPy is to it is a row.
-All take turns. QuTiP takes one system at a time. Left out are packages that are not installed;
-Dopri5 and implicit methods of dynamiqs, its Tsit5 on annealing, and all of QuTiP but vern9, which
-was ahead; and, in the large batch and for the smaller error, methods that take over three times as
-long as the best of their package.
+Each method takes the steps, or the tolerance, for which its error at the end is the goal: the root
+mean square, over a batch, of the largest entry of a propagator, or of the length of a state. These
+numbers were found by trial, for the transmon on a batch, and the error is measured again. If an
+error goes up and down with the number of steps, as it does if the steps are in time with the beat
+of two levels, it is below the goal for all larger numbers too. `frame` is the frame in which the
+levels of the constant part rest, put in by hand; Magnus methods take more steps in this frame, and
+are not run in it. The reference is Magnus10 with many steps; a row has the distance of SciPy's
+DOP853 from it. All programs take turns. QuTiP takes one system at a time. Left out are packages
+that are not installed; Dopri5 and implicit methods of dynamiqs, its Tsit5 on annealing, and all
+methods of QuTiP but vern9, which was the fastest; and, in the large batch and for the smaller
+error, methods that take over three times as long as the best of their package.
 """
 
 import functools

@@ -1,4 +1,4 @@
-"""Control of the step on every scene: what a tolerance leads to, beside Tsit5 in plain space.
+"""Adaptive steps on every scene: what a tolerance leads to, compared with Tsit5 in plain space.
 
 On each scene the method that is recommended for such fields runs with
 `diffrax.PIDController(rtol=0, atol=tolerance)`, at tolerances from 1e-4 to 1e-11, and Tsit5 on the

@@ -1,9 +1,9 @@
 """What error control costs: error against tolerance and against flows, and time to an error.
 
 The problem is the rigid body to t = 10, and every method runs with
-`diffrax.PIDController(rtol=0, atol=tolerance)`. Steps, errors and times at equal tolerance and at
-equal error, beside diffrax's solvers in plain space, in turns in one run, so that the ratios mean
-something on a busy machine. The picture shows every embedded pair.
+`diffrax.PIDController(rtol=0, atol=tolerance)`. It measures steps, errors and times at equal
+tolerance and at equal error, compared with diffrax's solvers in plain space, in turns in one run,
+so that the ratios mean something on a busy machine. The picture shows every embedded pair.
 """
 
 from collections.abc import Callable, Iterator

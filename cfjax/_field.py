@@ -22,23 +22,23 @@ Weight = float | Real[Array, ""]
 class AbstractFrozenField(eqx.Module):
     """A vector field of the frame, with coefficients frozen at one point.
 
-    A method needs two things of it (Celledoni, Marthinsen & Owren 2003, Section 2): its flow,
-    and linear combinations with other fields of the same frame. A subclass says what they are:
+    A method needs two things (Celledoni, Marthinsen & Owren 2003, Section 2): the flow of the
+    field, and linear combinations with other fields of the same frame. A subclass defines:
 
     - `flow(point)`: where the field carries `point` in unit time, shaped like `point`;
     - `tangent(point)`: the velocity of that flow at `point`, shaped like `point`;
     - `combine(weights, fields)`: by default linear in every array of the class. Override it where
       an array is structure (a spectrum, a factor) instead of a coordinate.
 
-    `flow` and `tangent` must accept the zero field. `cfjax.check_field` tells whether a class keeps
+    `flow` and `tangent` must accept the zero field. `cfjax.check_field` checks whether a class does
     all of this.
 
     The point is one array. A class that acts on several parts of the state together sets
-    `acts_on_subtree = True`: then its point, and what `flow` and `tangent` return, is the pytree
-    that stands in its place in the state.
+    `acts_on_subtree = True`. Then its point, and what `flow` and `tangent` return, is the pytree of
+    these parts, at the place of the field in the state.
 
-    A class may also work in coordinates of its own within a step, a chart, where that makes it
-    cheap. It then overrides `to_chart` and `from_chart` too.
+    A class may also work in its own coordinates within a step, a chart, if that is cheaper. It then
+    overrides `to_chart` and `from_chart` too.
     """
 
     # Whether the point that the field acts on is a pytree instead of one array.
@@ -88,11 +88,12 @@ class AbstractFrozenField(eqx.Module):
         )
 
     def increment(self, point: Any) -> Any:
-        """`flow(point) - point`, with a rounding as small as the increment; None if not offered.
+        """`flow(point) - point`, with a rounding error as small as the increment, or None.
 
-        A class that offers it gets compensated summation over the steps
-        (`_solvers/compensation.py`). Not for a field whose flow keeps signs or relative accuracy:
-        the sum of point and increment keeps absolute accuracy only.
+        A class that defines it gets compensated summation over the steps
+        (`_solvers/compensation.py`). Do not define it for a field whose flow keeps signs or
+        relative accuracy: the sum of point and increment keeps absolute accuracy only. None, the
+        default, means no compensation.
         """
         return None
 
@@ -112,10 +113,11 @@ class AbstractFrozenField(eqx.Module):
         return jtu.tree_map(lambda *leaves: _linear_combination(weights, leaves), *fields)
 
     def defect(self, point: Any) -> tuple[Real[Array, ""], str] | None:
-        """How far `point` is off the manifold that such fields act on, and what is expected of it.
+        """How far `point` is off the manifold that such fields act on, and what it must satisfy.
 
-        None, the default, if they act on every point. A solve refuses a start that is off by more
-        than the root of a unit of rounding. It asks a field whose arrays are shapes and dtypes.
+        None, the default, if the fields act on every point. A solve refuses a start that is off by
+        more than the root of a unit of rounding. It calls this method of a field whose arrays are
+        shapes and dtypes.
         """
         del point
         return None
@@ -123,10 +125,10 @@ class AbstractFrozenField(eqx.Module):
     def to_chart(self, point: Any, earlier: Sequence[Any]) -> tuple["AbstractFrozenField", Any]:
         """This field and the point where it is frozen, in the chart of the step.
 
-        A solver calls it after every evaluation. `earlier` holds the fields of this step that are
-        in the chart; at the first evaluation it is empty and `point` is the state itself. All flows
-        of the step start from the point returned then, so drift can be corrected there. By default
-        nothing changes.
+        A solver calls it after every evaluation. `earlier` has the fields of this step that are
+        already in the chart. At the first evaluation `earlier` is empty and `point` is the state
+        itself. All flows of the step start from the point that this first call returns, so it can
+        correct drift. By default nothing changes.
         """
         del earlier
         return self, point
@@ -148,9 +150,9 @@ class AbstractFrozenField(eqx.Module):
 class AbstractAlgebraElement(AbstractFrozenField):
     """A frozen field from a set that is closed under the bracket: an element of a Lie algebra.
 
-    Munthe-Kaas methods accept only what is one in the chart of a step: these, and fields whose
-    `to_chart` returns one, such as `cfjax.LowRankSkew`, which has a bracket only together with
-    the point where it is frozen.
+    Munthe-Kaas methods accept only fields that are algebra elements in the chart of a step: these
+    fields, and fields whose `to_chart` returns such an element. An example is `cfjax.LowRankSkew`,
+    which has a bracket only together with the point where it is frozen.
 
     The bracket is normalised so that `y = exp(u) p` has
     `u' = v - [u, v]/2 + [u, [u, v]]/12 - ...` for the field v at y. In terms of the tangents X_a
@@ -165,10 +167,11 @@ class AbstractAlgebraElement(AbstractFrozenField):
     def dexpinv(self, other: Any, degree: int) -> "AbstractAlgebraElement":
         """The inverse derivative of the exponential at u, `self`, of v, `other`: the u' above.
 
-        By default the series `sum_k B_k / k! ad_u^k(v)` with Bernoulli numbers B_k, up to k of
-        `degree`: so many brackets. A class whose algebra has a closed form overrides it, exact,
-        whatever the degree. The map has poles where an eigenvalue of `ad_u` is a multiple of
-        2 pi i, so for rotations at full turns; within the first of them the series converges.
+        By default this is the series `sum_k B_k / k! ad_u^k(v)` with Bernoulli numbers B_k, up to k
+        equal to `degree`, which takes as many brackets. A class whose algebra has a closed form
+        overrides it, and the result is exact whatever the degree. The map has poles where an
+        eigenvalue of `ad_u` is a multiple of 2 pi i, for rotations at full turns. The series
+        converges up to the first pole.
         """
         weights, terms, term = [1.0], [other], other
         # The series has no odd terms but the first.
@@ -210,8 +213,8 @@ def flow(field: PyTree, point: PyTree) -> PyTree:
     """Carries `point` along `field` for unit time.
 
     `field` is a pytree whose structure is a prefix of `point`'s. An array in it is a constant
-    field, whose flow is a translation; an `AbstractFrozenField` acts on the part of `point` that
-    stands in its place.
+    field, whose flow is a translation; an `AbstractFrozenField` acts on the part of `point` at the
+    same place.
     """
 
     def flow_leaf(f, p):
@@ -264,7 +267,7 @@ def combine(weights: Sequence[Weight], fields: Sequence[PyTree]) -> PyTree:
             place = jtu.keystr(path) and f" at {jtu.keystr(path)}"
             raise TypeError(
                 f"Only fields of one kind can be added, got {names}{place}. If these are the terms "
-                "of a diffrax.MultiTerm, give each a part of the state of its own."
+                "of a diffrax.MultiTerm, give each its own part of the state."
             )
         if is_field(leaves[0]):
             return type(leaves[0]).combine(moving, leaves)
@@ -370,8 +373,8 @@ def _check_coordinates(name: str, x: Any) -> None:
     if not jnp.issubdtype(getattr(x, "dtype", object), jnp.inexact):
         raise TypeError(
             f"{name} must be a floating or complex array to be combined linearly, got "
-            f"{describe(x)}. What is no coordinate belongs in a static field, "
-            "`eqx.field(static=True)`, or asks for a `combine` of the class's own."
+            f"{describe(x)}. Put what is not a coordinate into a static field, "
+            "`eqx.field(static=True)`, or override `combine`."
         )
 
 

@@ -40,35 +40,35 @@ def integrate(
 ) -> diffrax.Solution:
     """Integrates from `t0` to `t1` with `num_steps` equal steps of any diffrax solver.
 
-    A leaner loop than `diffrax.diffeqsolve` for the case that needs no more: one scan, constant
-    memory, one compilation for each shape of the arguments and each number of steps, none for new
-    values. Reverse mode keeps one state a step and computes every step again.
+    This is a leaner loop than `diffrax.diffeqsolve`, for problems that need no more: one scan,
+    constant memory, and one compilation for each shape of the arguments and each number of steps,
+    none for new values. Reverse mode keeps one state a step and computes every step again.
 
     **Arguments:**
 
-    - `term`, `solver`, `t0`, `t1`, `y0`, `args`: as for `diffrax.diffeqsolve`. `t1 < t0`
-      integrates backwards. Times are real scalars and take the precision of `y0`. Parts of `y0` in
-      integers, booleans or half precision become the default floating dtype. (`diffeqsolve`
-      promotes them to the dtype of the times.) Python floats in `args` are traced; a Python int or
-      bool is part of the program, as in equinox.
-    - `num_steps`: how many steps, at least 1, and not so many that a step would be shorter than
-      the rounding of a time: in float32 at most 2^24, and fewer for times far from zero.
-    - `save_every`: saves the state after every so many steps; must divide `num_steps`. By default
-      only the final state is saved.
+    - `term`, `solver`, `t0`, `t1`, `y0`, `args`: as for `diffrax.diffeqsolve`. `t1 < t0` integrates
+      backwards. Times are real scalars and take the precision of `y0`. Integers, booleans and half
+      precision in `y0` become the default floating dtype. (`diffeqsolve` promotes them to the dtype
+      of the times.) Python floats in `args` are traced; a Python int or bool is part of the
+      program, as in equinox.
+    - `num_steps`: the number of steps, at least 1, and not so many that a step would be shorter
+      than the rounding of a time: in float32 at most 2^24, and fewer for times far from zero.
+    - `save_every`: saves the state each time this many steps are done; must divide `num_steps`. By
+      default only the final state is saved.
     - `save_initial`: whether `t0` and the initial state are saved too, before all others, as with
       `diffrax.SaveAt(t0=True)`.
-    - `checkpoint_every`: for reverse mode with little memory. It then keeps one state in so many
-      steps and computes the steps between again, a second time. About `sqrt(num_steps)` is best,
-      and makes the memory proportional to `sqrt(num_steps)` states.
+    - `checkpoint_every`: for reverse mode with little memory. Reverse mode then keeps one state for
+      each group of this many steps, and computes the steps between a second time. About
+      `sqrt(num_steps)` is best, and makes the memory proportional to `sqrt(num_steps)` states.
     - `throw`: whether a failure is an error, as in diffrax. If not, `result` of the solution says
-      what happened, and what is wrong with a value of the arguments makes NaN. In a batch made by
-      `jax.vmap` one failure is an error for all. An error within a function that you compile is a
-      call of the host, so JAX does not keep such a program on disk. It keeps the others: with
-      `throw=False`, and all that are called from Python, where the host looks at the result.
+      what happened, and invalid values of the arguments give NaN. In a batch made by `jax.vmap` one
+      failure is an error for the whole batch. An error check within a function that you compile is
+      a call of the host, so JAX does not keep such a program on disk. It keeps programs with
+      `throw=False`, and every call from Python, where the host checks the result.
 
     **Returns:** a `diffrax.Solution`. Its `ts` has shape `(num_saves,)`, and each leaf of `ys` has
-    one more axis of that length in front; the last entry is the state at `t1`. The initial state
-    is there with `save_initial` only.
+    one more axis of that length in front; the last entry is the state at `t1`. The initial state is
+    included only with `save_initial`.
 
     **Raises:** `TypeError` or `ValueError` for arguments of wrong type or value. A runtime error if
     `y0` or a saved state has an entry that is not finite, if `y0` is off the manifold that a field
@@ -90,8 +90,8 @@ def integrate(
     dtype = time_dtype(y0)
     if num_steps > _most_steps(dtype):
         raise ValueError(
-            f"num_steps must be at most {_most_steps(dtype)} where times are {dtype}, as those of "
-            f"more steps do not differ, got {num_steps}. Make y0 float64."
+            f"num_steps must be at most {_most_steps(dtype)} for times in {dtype}, as the times of "
+            f"more steps would coincide, got {num_steps}. Make y0 float64."
         )
     t0, t1 = time_scalar("t0", t0, dtype), time_scalar("t1", t1, dtype)
     args = jtu.tree_map(lambda x: jnp.asarray(x) if isinstance(x, float | complex) else x, args)
@@ -169,9 +169,9 @@ def equal_steps(
         solver_state, fault = solver.init(term, t0, time(n + 1), y0, args), Fault.none()
     fault = fault.with_case(
         is_short,
-        "num_steps must leave each step longer than the rounding of t0 and t1, and of so many "
-        f"steps the times do not differ in {t0.dtype}. Take fewer steps, shift the times towards "
-        "zero, or make y0 float64.",
+        "num_steps must leave each step longer than the rounding of t0 and t1, and the times of so "
+        f"many steps coincide in {t0.dtype}. Take fewer steps, shift the times towards zero, or "
+        "make y0 float64.",
     )
     is_static = isinstance(num_steps, int)
     length = num_steps if is_static else jnp.where(fault.number == 0, num_steps, 0)
@@ -326,7 +326,7 @@ def check_own_tolerances(solver: Any) -> None:
             name = type(solver).__name__
             place = "diffrax." if getattr(diffrax, name, None) is type(solver) else ""
             raise ValueError(
-                "solver must have tolerances of its own, as equal steps have none to give it, got "
+                "solver must have tolerances of its own, as equal steps do not provide any, got "
                 f"{name} without. Write {place}{name}(root_finder=diffrax.VeryChord(rtol=1e-8, "
                 "atol=1e-8, norm=optimistix.rms_norm))."
             )

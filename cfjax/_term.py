@@ -31,15 +31,15 @@ class LieTerm(diffrax.AbstractTerm):
     ```
 
     What the field returns is checked against the state once, when the program is traced. A part of
-    wrong structure, shape or dtype raises a `TypeError` or `ValueError` that names its place in
-    the state. A Python scalar is taken in the state's dtype.
+    wrong structure, shape or dtype raises a `TypeError` or `ValueError` that names its place in the
+    state. A Python scalar takes the state's dtype.
 
-    Where every part is a translation this is an ordinary term, and every diffrax solver runs it.
-    With frozen fields diffrax's own solvers either refuse it (Tsit5, Dopri5 and most others) or
-    make ordinary steps in the ambient space, which leave the manifold (Euler, Heun, Midpoint,
-    Ralston, LeapfrogMidpoint, ImplicitEuler): `vf_prod` is the tangent vector there. So
-    `diffrax.BacksolveAdjoint()` works, backwards in the ambient space, where the solver of the
-    solve is a Runge-Kutta method, and so does another one given to it.
+    If every part is a translation, this is an ordinary term, and every diffrax solver accepts it.
+    With frozen fields diffrax's own solvers either refuse the term (Tsit5, Dopri5 and most others)
+    or make ordinary steps in the ambient space, which leave the manifold (Euler, Heun, Midpoint,
+    Ralston, LeapfrogMidpoint, ImplicitEuler), as `vf_prod` is the tangent vector. So
+    `diffrax.BacksolveAdjoint()` works: it integrates backwards in the ambient space, where a solver
+    of cfjax is a Runge-Kutta method. It also accepts another solver.
     """
 
     field: Callable[[Any, Any, Any], PyTree]

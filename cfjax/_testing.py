@@ -21,36 +21,37 @@ _Facts = list[tuple[str, PyTree, PyTree, Any]]
 
 
 def check_field(fields: Sequence[AbstractFrozenField], point: PyTree) -> None:
-    """Checks by numbers that fields of a class of one's own are what the methods take them for.
+    """Checks numerically that fields of a user-defined class satisfy what the methods assume.
 
-    For a test of the class. It compares, at one point:
+    Use it in a test of the class. It compares, at one point:
 
-    - `flow` and `tangent` return what is shaped like the point;
-    - the flow of the zero field is the identity, that of 0.4 of a field after 0.6 of it is that of
-      the whole, and `tangent` is its derivative at time zero;
+    - `flow` and `tangent` return values shaped like the point;
+    - the flow of the zero field is the identity, the flow of 0.6 of a field followed by that of 0.4
+      of it is the flow of the whole field, and `tangent` is the derivative of the flow at time
+      zero;
     - `combine` is linear: the tangent of a sum is the sum of the tangents;
-    - `increment`, if offered, is `flow(point) - point`; `to_chart` and `from_chart` lead back
-      to the point and to the same flow; and where `defect` says how far a point is off the
-      manifold, the flow stays on it;
+    - `increment`, if defined, is `flow(point) - point`; `to_chart` and `from_chart` lead back to
+      the point and to the same flow; and if `defect` says how far a point is off the manifold, the
+      flow stays on the manifold;
     - for algebra elements, `[a, b]` has the sign and the size that `cfjax.AbstractAlgebraElement`
       says: its tangent is `DX_a X_b - DX_b X_a`, with the tangents of a and b as functions of the
       point. This is compared for `[a, b]`, for `[b, a]` and for the bracket of `[a, b]` with the
       last field, so the bracket is antisymmetric and obeys Jacobi's identity.
 
-    All derivatives are those of JAX and none a difference quotient, so what is compared differs by
-    rounding only. The tolerance is half of the digits, relative to the point and to what is
-    compared: a mistake is far larger, and a flow that loses some digits passes.
+    All derivatives are computed by JAX and not by difference quotients, so the compared values
+    differ by rounding only. The tolerance is half of the digits, relative to the point and to the
+    compared values: a mistake is far larger, and a flow that loses some digits passes.
 
     **Arguments:**
 
     - `fields`: at least two frozen fields of one class, with coordinates of about size one and
-      without special relations, such as random ones: otherwise a mistake may cancel. Where a class
-      carries structure, such as a spectrum, all have the same.
+      without special relations, such as random ones: otherwise mistakes may cancel. If the class
+      carries structure, such as a spectrum, all fields must have the same.
     - `point`: a point on the manifold, of about size one: an array, or the part of the state that
       a class with `acts_on_subtree` acts on. float32, float64 or complex.
 
-    **Raises** `TypeError` or `ValueError` for arguments of other types; `ValueError` with
-    the first promise that is not kept, and by how much.
+    **Raises** `TypeError` or `ValueError` for arguments of other types; `ValueError` that names the
+    first check that fails, and by how much.
     """
     point = jtu.tree_map(jnp.asarray, point)
     _check_arguments(fields, point)

@@ -23,10 +23,10 @@ from .store import Store
 class BatchResult(NamedTuple):
     """What `map_batch` returns.
 
-    - `values`: what `solve` returned, each array with an axis of the batch's length in front, in
-      NumPy, or with PRNG keys.
-    - `failed`: indices of the members that failed, in order: those with an entry that is not
-      finite, and, where `solve` returns a `diffrax.Solution`, whose `result` is not successful.
+    - `values`: what `solve` returned, as NumPy arrays or arrays of PRNG keys, each with an axis of
+      the batch's length in front.
+    - `failed`: indices of the members that failed, in order: members with an entry that is not
+      finite and, if `solve` returns a `diffrax.Solution`, members whose `result` is not successful.
     """
 
     values: PyTree
@@ -54,33 +54,32 @@ def map_batch(
 
     **Arguments:**
 
-    - `solve`: a JAX function of one member. Return no more than is needed: all results are kept in
-      the host's memory. An error raised within it, as `diffrax.diffeqsolve` does on failure, stops
-      the batch; with `throw=False` there a failed member leaves the others alone.
+    - `solve`: a JAX function of one member. Return no more than you need: all results are kept in
+      the host's memory. An error raised within `solve`, as `diffrax.diffeqsolve` does on failure,
+      stops the batch; if `solve` uses `throw=False`, a failed member does not affect the others.
     - `members`: a pytree of arrays of numbers or of PRNG keys, each with the batch's axis in front.
-      They may be NumPy memory maps: only a chunk at a time goes to the devices.
+      They may be NumPy memory maps: only one chunk at a time goes to the devices.
     - `chunk_size`: how many members are solved at once, rounded up to a multiple of the number of
       devices.
     - `folder`: where finished chunks are kept, one file each, written atomically. After an
-      interruption the same call goes on where it stopped: what is there is read instead of
-      computed. A folder belongs to one batch. If it holds chunks of other members, of another
-      `chunk_size` or of another computation, the call is an error, and leaves them as they are. To
-      the computation belong all constants that `solve` captures, wherever, the versions of cfjax
-      and jax, and the kind of device, but no functions of the host, whose code jax does not see:
-      `solve` must not take values from one. What it prints does not count. A file that is damaged
-      is computed again, with a warning. `batch.json` in the folder says how to read the files
-      without this function; the page on batches shows how.
-    - `mesh`: a `jax.sharding.Mesh`, over all of whose axes each chunk is spread. With several
+      interruption the same call continues where it stopped: it reads finished chunks instead of
+      computing them. A folder belongs to one batch. If it has chunks of other members, of another
+      `chunk_size` or of another computation, the call is an error, and leaves the chunks as they
+      are. The computation includes all constants that `solve` captures, the versions of cfjax and
+      jax, and the kind of device. It does not include functions of the host, whose code jax does
+      not see, so `solve` must not take values from one. Prints are allowed. If a file is damaged,
+      its chunk is computed again, with a warning. `batch.json` in the folder says how to read the
+      files without this function; the page on batches shows how.
+    - `mesh`: a `jax.sharding.Mesh`; each chunk is spread over all of its axes. With several
       processes (`jax.distributed`) every process makes the same call and gets the whole result;
       process 0 alone reads and writes files. By default one device.
-    - `progress`: whether to show a progress bar with the time left, on a terminal. Needs `rich`,
-      and without it there is none.
+    - `progress`: whether to show a progress bar with the time left, on a terminal. Without `rich`
+      there is none.
 
-    **Raises** `TypeError` or `ValueError` if members are not arrays or differ in length, for
-    an empty batch, for `chunk_size < 1`, if `mesh` is not a `Mesh`, for a `folder` that holds
-    another batch, and for one with a `solve` that calls a function of the host, as
-    `jax.pure_callback` and progress meters do; `OSError` if the folder cannot be made or written
-    to.
+    **Raises** `TypeError` or `ValueError` if members are not arrays or differ in length, if the
+    batch is empty, if `chunk_size < 1`, if `mesh` is not a `Mesh`, if `folder` has another batch,
+    or if there is a `folder` and `solve` calls a function of the host, as `jax.pure_callback` and
+    progress meters do; `OSError` if the folder cannot be made or written to.
     """
     size = _batch_size(members)
     if not isinstance(mesh, Mesh | None):

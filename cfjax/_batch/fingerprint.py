@@ -60,7 +60,7 @@ def fingerprint(traced: Traced, lowered: Lowered, environment: dict[str, Any]) -
             raise ValueError(
                 "folder needs a solve whose values jax alone computes, got one that calls a "
                 "function of the host (jax.pure_callback, jax.experimental.io_callback, a progress "
-                "meter): a change of it would go unseen. Leave out folder or the call."
+                "meter): a change of it would go unnoticed. Leave out folder or the call."
             )
 
     @functools.cache

@@ -18,24 +18,27 @@ from .._numerics.transforms import DTYPES, AbstractTransform, TensorTransform
 class Affine(AbstractAlgebraElement):
     """The field `x' = alpha M x + b` with a fixed operator M, for stiff semilinear problems.
 
-    M is diagonal in the coefficients of a transform, with the eigenvalues `spectrum`. Its flow is
-    `exp(alpha M) x + phi_1(alpha M) b` with `phi_1(z) = (exp(z) - 1) / z`, exact however stiff M
-    is. So to solve `u' = M u + g(u)` return `Affine(1.0, g(u), spectrum, transform)`. On a grid
-    the transform is a `cfjax.TensorTransform` and u has the shape of the grid.
+    M is diagonal in the coefficients of a transform, with the eigenvalues `spectrum`. The flow of
+    the field is `exp(alpha M) x + phi_1(alpha M) b` with `phi_1(z) = (exp(z) - 1) / z`, exact
+    however stiff M is. So to solve `u' = M u + g(u)` return
+    `Affine(1.0, g(u), spectrum, transform)`. On a grid the transform is a `cfjax.TensorTransform`
+    and u has the shape of the grid.
 
-    Boundary values or fluxes other than zero are lifted: take a smooth w that has them and solve
-    for `v = u - w`, which has zeros, `v' = M v + g(v + w) + L w - w'`. Here `L w` is M applied to
-    w with its boundary values in place, so as smooth as w. Put into b as they are, divided by
-    `dx^2`, boundary values that vary in time would leave CF4 with little more than order one.
+    Subtract boundary values or fluxes other than zero: take a smooth w that has them and solve for
+    `v = u - w`, whose boundary values are zero, `v' = M v + g(v + w) + L w - w'`. Here `L w` is M
+    applied to w with its boundary values in place, so it is as smooth as w. If boundary values that
+    vary in time were put into b directly, divided by `dx^2`, the order of CF4 would drop to little
+    more than one.
 
-    Without a transform the state, and `b`, are the coefficients themselves, and a flow costs an
-    exponential, a division and a polynomial for each eigenvalue. With one they are points, and a
-    flow costs three transforms more. So a state of coefficients is cheaper: only g transforms.
+    Without a transform the state and `b` are the coefficients themselves, and a flow costs an
+    exponential, a division and a polynomial for each eigenvalue. With a transform they are points,
+    and a flow costs three transforms more. So a state of coefficients is cheaper: only g needs
+    transforms.
 
-    The coordinates are `(alpha, b)`. **The spectrum is not one**: a linear combination has the
-    spectrum of its first field, so it must not depend on time or state. It may depend on `args`,
-    and has a derivative. The bracket is `[(a, b), (a', b')] = (0, M (a b' - a' b))`: a method that
-    needs it multiplies by M, which makes it stiff.
+    The coordinates are `(alpha, b)`. **The spectrum is not a coordinate**: a linear combination has
+    the spectrum of its first field, so the spectrum must not depend on time or state. It may depend
+    on `args`, and has a derivative. The bracket is `[(a, b), (a', b')] = (0, M (a b' - a' b))`: a
+    method that needs brackets multiplies by M, which makes the method stiff.
 
     **Arguments:**
 
@@ -43,13 +46,14 @@ class Affine(AbstractAlgebraElement):
     - `b`: shaped like the state, `(n,)` or `(n, k)` or any other shape. float32, float64,
       complex64 or complex128.
     - `spectrum`: the eigenvalues, shaped like the coefficients of `b` or, if these have more axes,
-      like the first of them: with shape `(m,)` every column has the same. It has all axes that a
-      `cfjax.TensorTransform` transforms. Real, or complex where the coefficients are.
-    - `transform`: a `cfjax.AbstractTransform`, for example `cfjax.SineTransform()`, or None. One
-      of your own provides `forward(point)`, the coefficients, and `inverse(coefficients)`.
+      like their first axes: with shape `(m,)` every column has the same eigenvalues. It has all
+      axes that a `cfjax.TensorTransform` transforms. Real, or complex if the coefficients are.
+    - `transform`: a `cfjax.AbstractTransform`, for example `cfjax.SineTransform()`, or None. A
+      transform of your own provides `forward(point)`, the coefficients, and
+      `inverse(coefficients)`.
 
-    **Raises** `ValueError` for shapes that do not fit, `TypeError` for dtypes that do not, or
-    another kind of transform.
+    **Raises** `ValueError` for shapes that do not match, `TypeError` for dtypes that do not match,
+    or for another kind of transform.
 
     Source: Celledoni, Marthinsen & Owren, Commutator-free Lie group methods, FGCS 19 (2003),
     Section 3.3, doi:10.1016/S0167-739X(02)00161-9; Munthe-Kaas, High order Runge-Kutta methods on

@@ -63,10 +63,10 @@ class AbstractTwoSided(AbstractMatrix):
 class Conjugation(AbstractTwoSided):
     """The linear field `x' = a x - x a`, whose flow is `x -> exp(a) x exp(-a)`.
 
-    It acts on a square matrix, shape `(n, n)`, and keeps its eigenvalues: isospectral flows such as
-    Toda's, the Heisenberg picture, density matrices with `a = -1j * H`. (With a skew-Hermitian `a`,
-    as there, `cfjax.Congruence(a)` is the same field: a fifth cheaper, and it keeps Hermitian
-    matrices Hermitian to the last bit.)
+    It acts on a square matrix, shape `(n, n)`, and keeps its eigenvalues. Examples are isospectral
+    flows such as Toda's, the Heisenberg picture, and density matrices with `a = -1j * H`. (If `a`
+    is skew-Hermitian, as for density matrices, `cfjax.Congruence(a)` is the same field: it is a
+    fifth cheaper, and keeps Hermitian matrices Hermitian to the last bit.)
 
     With leading axes, shape `(*batch, n, n)`, each element moves on its own. An axis of 1 is
     broadcast.
@@ -97,17 +97,17 @@ class Congruence(AbstractTwoSided):
     """The affine field `x' = a x + x a^H + q`, where a^H is the conjugate transpose.
 
     Its flow is `x -> exp(a) x exp(a)^H` and the integral of `exp(s a) q exp(s a)^H` over s from 0
-    to 1. It acts on a square matrix, shape `(n, n)`: covariances of linear stochastic equations,
-    with `q` the covariance of the noise, Lyapunov's equation, density matrices, metrics. A definite
-    x stays definite, and so it does with a semidefinite `q`. If x and `q` are Hermitian, the end
-    is, to the last bit. They need not be.
+    to 1. It acts on a square matrix, shape `(n, n)`. Examples are covariances of linear stochastic
+    equations, with `q` the covariance of the noise, Lyapunov's equation, density matrices, and
+    metrics. A definite x stays definite, also with a semidefinite `q`. x and `q` need not be
+    Hermitian; if both are, the result is Hermitian to the last bit.
 
     With leading axes, shape `(*batch, n, n)`, each element moves on its own. An axis of 1 is
     broadcast.
 
     A flow costs one dense exponential and 4 products with the point, about 1.2 to 1.8 times
-    `cfjax.expm` of that size. With a source, 16 to 19 products and 3 for each squaring, 4 to 6
-    times `cfjax.expm`.
+    `cfjax.expm` of that size. With a source it costs 16 to 19 products and 3 for each squaring, 4
+    to 6 times `cfjax.expm`.
 
     **Arguments:**
 
@@ -116,8 +116,8 @@ class Congruence(AbstractTwoSided):
     - `q`: the source, with as many axes and the same precision; or None. In a sum of fields or a
       bracket None counts as zero.
 
-    **Raises** `ValueError` for a shape that is not square or does not fit, `TypeError` for another
-    dtype.
+    **Raises** `ValueError` for a shape that is not square or does not match, `TypeError` for
+    another dtype.
     """
 
     q: Inexact[Array, "*#batch n n"] | None = eqx.field(

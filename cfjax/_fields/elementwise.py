@@ -113,9 +113,9 @@ def _text(*sides: int | str) -> str:
 
 
 def elementwise(field: AbstractFrozenField, num_axes: int = 1) -> AbstractFrozenField:
-    """A field for each element of leading axes, made from one whose arrays have these axes.
+    """A field for each element of leading axes, made from one field whose arrays have these axes.
 
-    So any class of frozen fields moves arrays of points, all in one program:
+    With it any class of frozen fields moves arrays of points, all in one program:
 
     ```python
     def field(t, y, args):  # y of shape (100, 3)
@@ -127,8 +127,8 @@ def elementwise(field: AbstractFrozenField, num_axes: int = 1) -> AbstractFrozen
 
     **Arguments:**
 
-    - `field`: a frozen field, each of whose arrays has the leading axes in front, as `jax.vmap` of
-      a function that returns a field gives it.
+    - `field`: a frozen field whose arrays all have the leading axes in front, such as the result of
+      `jax.vmap` of a function that returns a field.
     - `num_axes`: how many leading axes.
 
     **Returns:** a frozen field. It is an algebra element if `field` is one.

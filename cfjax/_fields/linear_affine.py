@@ -15,10 +15,10 @@ from .matrix import AbstractMatrix, check_companion
 class LinearAffine(AbstractMatrix):
     """The affine field `x' = a x + b` with a dense matrix.
 
-    Its flow is `x -> exp(a) x + phi_1(a) b` with `phi_1(z) = (exp(z) - 1) / z`, also where `a` has
-    no inverse. It acts on a vector, shape `(n,)`: Bloch's equations with relaxation, linear systems
-    with a control, chemical kinetics. (`cfjax.Affine` takes one fixed operator that a fast
-    transform makes diagonal.)
+    Its flow is `x -> exp(a) x + phi_1(a) b` with `phi_1(z) = (exp(z) - 1) / z`, also if `a` has no
+    inverse. It acts on a vector, shape `(n,)`. Examples are Bloch's equations with relaxation,
+    linear systems with a control, and chemical kinetics. (`cfjax.Affine` is for one fixed operator
+    that a fast transform makes diagonal.)
 
     With leading axes, `a` of shape `(*batch, n, n)` and `b` of shape `(*batch, n)`, it acts on
     shape `(*batch, n)`: each element moves on its own. An axis of 1 is broadcast.
@@ -32,8 +32,8 @@ class LinearAffine(AbstractMatrix):
       a complex point of the same precision.
     - `b`: shape `(*batch, n)`, real or complex of the same precision.
 
-    **Raises** `ValueError` for a shape that is not square or does not fit, `TypeError` for another
-    dtype.
+    **Raises** `ValueError` for a shape that is not square or does not match, `TypeError` for
+    another dtype.
     """
 
     b: Inexact[Array, "*#batch n"] = eqx.field(converter=jnp.asarray)

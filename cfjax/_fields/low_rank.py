@@ -38,16 +38,16 @@ class LowRankSkew(AbstractSkew):
     """The field `x' = (g y^T - y g^T) x` at points near y, the point where it is frozen.
 
     It acts on a matrix with orthonormal columns, shape `(n, p)`, and keeps them orthonormal. The
-    point y is the one that `field(t, y, args)` was called with, so `g` alone says what the field
-    is, and sums of such fields at one point are fields of the same form.
+    point y is the one that `field(t, y, args)` was called with, so `g` alone determines the field,
+    and sums of such fields at one point are fields of the same form.
 
-    Nothing of size n x n is formed. Within a step the points and fields live in the span of its
-    first point and of all g so far, p columns each: a step of s stages costs about
-    `2 n p^2 (s + 1)(s + 2)` flops and `n p (s + 1)` numbers. Of points of up to some 2000 numbers
-    the stages are one loop, which compiles sooner and takes up to twice as many flops. There a
-    field is an algebra element, whose brackets stay in the span, so Munthe-Kaas methods accept it.
-    Outside of a step it has no bracket, as that depends on the point y. Every step starts from
-    `y (3 I - y^T y) / 2`, so that rounding does not add up.
+    No n x n matrix is formed. Within a step the points and fields stay in the span of its first
+    point and of all g so far, p columns each: a step of s stages costs about
+    `2 n p^2 (s + 1)(s + 2)` flops and `n p (s + 1)` numbers. For points of up to some 2000 numbers
+    the stages are rolled into one loop, which compiles faster and takes up to twice as many flops.
+    Within a step a field is an algebra element, whose brackets stay in the span, so Munthe-Kaas
+    methods accept it. Outside of a step it has no bracket, as the bracket depends on the point y.
+    Every step starts from `y (3 I - y^T y) / 2`, so that rounding does not add up.
 
     With leading axes, shape `(*batch, n, p)`, each element moves on its own.
 
@@ -101,10 +101,10 @@ class AbstractSkewElement(AbstractSkew, AbstractAlgebraElement):
 class BorderedSkew(AbstractSkewElement):
     """The field `x' = (gamma E^T - E gamma^T) x`, where E is the first p columns of the identity.
 
-    With the first p rows of `gamma` called L and the others B its matrix is
-    `[[L - L^T, -B^T], [B, 0]]`. It acts on a matrix with orthonormal columns, shape `(n, p)`.
-    Sums keep the form, so a flow costs `6 n p^2` flops in every commutator-free method. A bracket
-    leaves it: the result is a skew matrix on a growing span of columns.
+    If the first p rows of `gamma` are L and the others B, its matrix is
+    `[[L - L^T, -B^T], [B, 0]]`. It acts on a matrix with orthonormal columns, shape `(n, p)`. Sums
+    keep the form, so a flow costs `6 n p^2` flops in every commutator-free method. Brackets do not:
+    the result is a skew matrix on a growing span of columns.
 
     Every step starts from `y (3 I - y^T y) / 2`, so that rounding does not add up.
 

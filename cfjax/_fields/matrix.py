@@ -95,9 +95,9 @@ class AbstractOneSided(AbstractMatrix):
 class LeftMatrix(AbstractOneSided):
     """The linear field `x' = a x`, whose flow is `x -> exp(a) x`.
 
-    It acts on a vector, shape `(n,)`, or a matrix, shape `(n, k)`. Any matrix Lie algebra, real
-    or complex: with a skew `a` the flow keeps orthonormal columns, with a skew-Hermitian one it
-    keeps unitary ones, and so on.
+    It acts on a vector, shape `(n,)`, or a matrix, shape `(n, k)`. `a` may be from any matrix Lie
+    algebra, real or complex: if `a` is skew, the flow keeps columns orthonormal, if it is
+    skew-Hermitian, unitary, and so on.
 
     With leading axes, shape `(*batch, n, n)`, it acts on shapes `(*batch, n)` and `(*batch, n, k)`:
     each element moves on its own, as the links of a lattice do. An axis of 1 is broadcast, and its
@@ -107,8 +107,8 @@ class LeftMatrix(AbstractOneSided):
     product with the point. For n = 2 and 3 the exponential costs 1 product and some 70 products of
     numbers. For few columns, `16 k <= n`, it costs 10 to 25 products with the point for norms up to
     2.4 and 10 for each unit beyond, or 1.4 to 2.3 if `a` is skew-Hermitian; the norm is the largest
-    sum of absolute values in a row. What would take more than 2 n products, 3 n if `a` is complex,
-    takes the exponential.
+    sum of absolute values in a row. A flow that would take more than 2 n products, or 3 n if `a` is
+    complex, uses the exponential.
 
     **Arguments:** `a`, shape `(*batch, n, n)`, float32, float64, complex64 or complex128. A real
     `a` may act on a complex point of the same precision.
@@ -127,7 +127,7 @@ class RightMatrix(AbstractOneSided):
     """The linear field `x' = x a`, whose flow is `x -> x exp(a)`.
 
     It acts on a row, shape `(*batch, n)`, or a matrix, shape `(*batch, k, n)`. For an attitude
-    matrix this is an angular velocity in the moving frame. Otherwise as `LeftMatrix`.
+    matrix this is an angular velocity in the moving frame. Otherwise it is like `LeftMatrix`.
     """
 
     axis: ClassVar[int] = -1

@@ -40,11 +40,12 @@ _SLACK = 1e-3
 class OperatorSum(AbstractFrozenField):
     """The field `x' = sum_k c_k A_k x` with fixed operators A_k.
 
-    For controlled, driven and annealed systems, `i psi' = (H_0 + u(t) H_1) psi` and the like, up to
-    sizes at which no matrix fits. The coordinates are the coefficients alone, so a linear
-    combination of fields costs K numbers. **The operators are none**: they must be the same at
-    every time and state. They may depend on `args`, and have derivatives. There is no bracket, as
-    the commutator of two operators is another operator: this is for commutator-free methods.
+    It is for controlled, driven and annealed systems, `i psi' = (H_0 + u(t) H_1) psi` and the like,
+    up to sizes whose matrices do not fit in memory. The coordinates are the coefficients alone, so
+    a linear combination of fields costs K numbers. **The operators are not coordinates**: they must
+    be the same at every time and state. They may depend on `args`, and have derivatives. There is
+    no bracket, as the commutator of two operators is another operator, so use commutator-free
+    methods.
 
     ```python
     def field(t, y, args):
@@ -52,9 +53,9 @@ class OperatorSum(AbstractFrozenField):
     ```
 
     The flow needs products with vectors only. It is the Taylor series of the exponential or, if
-    `is_skew`, that of Chebyshev, to rounding. Arrays are added up first, which takes as long as a
-    product with each; a field of arrays alone then moves as `LeftMatrix` does, by a dense
-    exponential where that is faster.
+    `is_skew`, its Chebyshev series, to rounding. Arrays are added up first, which takes as long as
+    a product with each; a field of arrays alone then works as `LeftMatrix` does, by a dense
+    exponential if that is faster.
 
     **Arguments:**
 
@@ -62,26 +63,29 @@ class OperatorSum(AbstractFrozenField):
     - `operators`: K of these, each on vectors of size n, in any mix: an array of shape `(n, n)`; an
       array of shape `(n,)`, a diagonal; a `jax.experimental.sparse.BCOO`; a
       `lineax.AbstractLinearOperator`; a linear function of a vector. To declare a bound on the
-      2-norm of an operator, give a pair `(operator, norm)`. Functions need one, and so do lineax
-      operators but matrices and diagonals. A function is compared by `==`, so it is made outside
-      of the field; one with arrays is an `equinox.Module` or a `jax.tree_util.Partial`.
+      2-norm of an operator, give a pair `(operator, norm)`. Functions need a bound, and so do
+      lineax operators other than matrices and diagonals. A function is compared by `==`, so define
+      it outside of the field; a function with arrays is an `equinox.Module` or a
+      `jax.tree_util.Partial`.
     - `is_skew`: whether every sum that occurs is skew-Hermitian, as in Schrödinger's equation. Then
       the flow is unitary to rounding and needs fewer products.
 
-    It acts on a vector, shape `(n,)`, or on columns, shape `(n, k)`, of the dtype that products
-    and coefficients have together.
+    It acts on a vector, shape `(n,)`, or on columns, shape `(n, k)`, of the common dtype of
+    products and coefficients.
 
-    **Cost:** of a flow, some 10 to 25 products with each operator for norms up to 2.4 and 10 for
-    each unit beyond. If `is_skew`, 9 to 20, 64 for a norm of 28 and 160 for one of 112. The bound
-    on the norm is the sum of those of the operators or, of arrays, the largest sum of absolute
-    values in a row of their sum, if that is less. The 2-norm of an array that is known when the
-    program is traced is computed then; where it is not, as in `args`, declare it if the matrix is
-    large and full. Reverse mode keeps fewer than 200 vectors for each flow.
+    **Cost:** a flow takes some 10 to 25 products with each operator for norms up to 2.4 and 10 for
+    each unit beyond. If `is_skew`, it takes 9 to 20, 64 for a norm of 28 and 160 for one of 112.
+    The bound on the norm is the sum of the bounds of the operators or, for arrays, the largest sum
+    of absolute values in a row of their sum, if that is less. The 2-norm of an array that is known
+    when the program is traced is computed then; if the array is not known, as in `args`, declare
+    the norm if the matrix is large and full. Reverse mode keeps fewer than 200 vectors for each
+    flow.
 
-    **Raises** `TypeError` or `ValueError` for another number of coefficients than of operators,
-    operators that differ in shape or precision or are something else, a norm that is missing or no
-    number; and, where values are known when the program is traced, for a function that is not
-    linear, an operator that is longer than its norm, or not skew where real coefficients say so.
+    **Raises** `TypeError` or `ValueError` if the numbers of coefficients and operators differ, if
+    operators differ in shape or precision or are of another kind, or if a norm is missing or not a
+    number; and, if values are known when the program is traced, for a function that is not linear,
+    an operator whose norm exceeds its bound, or one that is not skew-Hermitian although `is_skew`
+    and real coefficients say so.
 
     Source: Al-Mohy & Higham, Computing the action of the matrix exponential, SIAM J. Sci. Comput.
     33 (2011), doi:10.1137/100788860; Tal-Ezer & Kosloff, An accurate and efficient scheme for

@@ -18,8 +18,8 @@ class QuaternionRotation(AbstractAlgebraElement):
     """The rotation of an attitude, a unit quaternion q, with angular velocity `omega`.
 
     q takes body coordinates to fixed ones, `(0, x_fixed) = q (0, x_body) / q`. With
-    `frame="fixed"`, where `omega` is given in fixed coordinates, `q' = (0, omega) q / 2`; with
-    `frame="body"` `q' = q (0, omega) / 2`. So q moves as the matrix
+    `frame="fixed"`, `omega` is given in fixed coordinates and `q' = (0, omega) q / 2`; with
+    `frame="body"`, `q' = q (0, omega) / 2`. So q moves as the matrix
     `cfjax.quaternion_to_matrix(q, order=...)` moves along `cfjax.Rotation(omega)`, or along
     `cfjax.RightMatrix` of the cross product with `omega`.
 
@@ -34,14 +34,14 @@ class QuaternionRotation(AbstractAlgebraElement):
     **Arguments:**
 
     - `omega`: shape `(*batch, 3)`, float32 or float64, in radians per unit of time.
-    - `frame`: `"body"` or `"fixed"`, where `omega` is given.
+    - `frame`: `"body"` or `"fixed"`, the frame in which `omega` is given.
     - `order`: `"wxyz"` or `"xyzw"`, how q is stored; w is its scalar part.
 
-    Neither `frame` nor `order` has a default, as a wrong guess would go unseen.
+    Neither `frame` nor `order` has a default, as a wrong guess would go unnoticed.
 
     **Raises** `ValueError` for another shape, frame or order, `TypeError` for another dtype, or
     without frame or order. Fields of different frame or order cannot be added and have no bracket:
-    `TypeError`. A solve that starts from a quaternion whose squared length is off 1 by more than
+    `TypeError`. Starting a solve from a quaternion whose squared length differs from 1 by more than
     the root of a unit of rounding is an error.
     """
 

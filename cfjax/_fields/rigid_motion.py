@@ -117,18 +117,18 @@ class AbstractMotion(AbstractAlgebraElement):
 class RigidMotion(AbstractMotion):
     """A rigid motion of space: an angular velocity `omega` and a velocity `v`.
 
-    It acts on what has one of these shapes:
+    It acts on
 
     - a pose as a homogeneous matrix, `(4, 4)`: rotation and position, and (0, 0, 0, 1) below;
     - a pose as one vector, `(7,)`: a unit quaternion (w, x, y, z), then the position. It takes the
       coordinates of the body to fixed ones. This is the layout of `jaxlie.SE3`, and the fastest;
     - a point, `(3,)`, in the fixed frame only.
 
-    With `frame="fixed"`, `omega` and `v` have fixed coordinates, and `v` is the velocity of what is
-    at the origin: `T' = X T` for the matrix `X = [[omega x, v], [0, 0]]`, and `x' = omega x x + v`
-    for positions and points. With `frame="body"` they have the coordinates of the body, and `v` is
-    the velocity of its origin: `T' = T X`. There is no default. Only motions in one frame can be
-    added.
+    With `frame="fixed"`, `omega` and `v` have fixed coordinates, and `v` is the velocity of the
+    point at the origin: `T' = X T` for the matrix `X = [[omega x, v], [0, 0]]`, and
+    `x' = omega x x + v` for positions and points. With `frame="body"` they have the coordinates of
+    the body, and `v` is the velocity of its origin: `T' = T X`. There is no default. Only motions
+    in one frame can be added.
 
     With leading axes, shape `(*batch, 3)`, each pose of shapes `(*batch, 4, 4)` and `(*batch, 7)`
     moves on its own. An axis of 1 is broadcast.
@@ -144,9 +144,8 @@ class RigidMotion(AbstractMotion):
     - `frame`: `"body"` or `"fixed"`.
 
     **Raises** `ValueError` for another shape or frame, or for points in the frame of the body;
-    `TypeError` for another dtype. A solve that starts off the manifold by more than the root of a
-    unit of rounding, in the square of the quaternion's length or in an entry of `R^T R`, is an
-    error.
+    `TypeError` for another dtype. Starting a solve off the manifold by more than the root of a unit
+    of rounding, in the square of the quaternion's length or in an entry of `R^T R`, is an error.
     """
 
     _: KW_ONLY
@@ -163,7 +162,7 @@ class RigidMotion(AbstractMotion):
 class PlanarMotion(AbstractMotion):
     """A rigid motion of the plane: an angular velocity `omega` and a velocity `v`.
 
-    It acts on what has one of these shapes:
+    It acts on
 
     - a pose as a homogeneous matrix, `(3, 3)`: rotation and position, and (0, 0, 1) below;
     - a pose as one vector, `(4,)`: cosine and sine of its angle, then the position: the layout of
@@ -176,7 +175,7 @@ class PlanarMotion(AbstractMotion):
     - `v`: shape `(*batch, 2)`, in lengths per unit of time.
     - `frame`: `"body"` or `"fixed"`.
 
-    Otherwise as `cfjax.RigidMotion`.
+    Otherwise it is like `cfjax.RigidMotion`.
     """
 
     _: KW_ONLY

@@ -14,9 +14,10 @@ from .elementwise import check_other, check_point, each
 class Rotation(AbstractAlgebraElement):
     """The rotation of space with angular velocity `omega`: `x' = omega x x` (cross product).
 
-    It acts on a vector, shape `(3,)`, and on every column of a matrix, shape `(3, k)`: with
-    k = 3 on attitude matrices in SO(3), with `omega` in the fixed frame. (`cfjax.RightMatrix` takes
-    it in the body's frame; unit quaternions with `cfjax.QuaternionRotation` are faster.)
+    It acts on a vector, shape `(3,)`, and on every column of a matrix, shape `(3, k)`. With k = 3
+    it acts on attitude matrices in SO(3), with `omega` in the fixed frame. (`cfjax.RightMatrix`
+    takes the angular velocity in the body's frame; unit quaternions with `cfjax.QuaternionRotation`
+    are faster.)
 
     With leading axes, shape `(*batch, 3)`, it acts on shapes `(*batch, 3)` and `(*batch, 3, k)`:
     each element moves on its own, as the spins of a lattice do. An axis of 1 is broadcast, so

@@ -19,23 +19,24 @@ class SphereRotation(AbstractFrozenField):
     """The field `x' = (g y^T - y g^T) x` at points near y, the point where it is frozen.
 
     It acts on unit vectors, shape `(n,)` with any n >= 1, and keeps their length. At y itself it is
-    `g - y (y @ g)`, the part of g that is tangent to the sphere. So `g` is any velocity, and minus
-    the gradient of a function of y gives its gradient flow on the sphere. The point y is the one
-    that `field(t, y, args)` was called with.
+    `g - y (y @ g)`, the part of g that is tangent to the sphere. So `g` may be any velocity, and
+    minus the gradient of a function of y gives the gradient flow of the function on the sphere. The
+    point y is the one that `field(t, y, args)` was called with.
 
-    Nothing of size n x n is formed. A flow turns the plane of y and g, and a sum of s fields the
-    span of their 2s vectors, both in coordinates of the step, as with `cfjax.LowRankSkew`: a step
-    of s stages costs about `2 n (s + 1)(s + 2)` flops. There a field is an algebra element, so
-    Munthe-Kaas methods accept it; outside of a step it has no bracket. Every step starts from
-    `y (3 - y @ y) / 2`, so that rounding does not add up. For n = 3 a field is, within a step, the
-    `cfjax.Rotation` with angular velocity `y x g` (cross product), alone 20 times as fast.
+    No n x n matrix is formed. A flow turns the plane of y and g, and the flow of a sum of s fields
+    turns the span of their 2s vectors, both in coordinates of the step, as with
+    `cfjax.LowRankSkew`: a step of s stages costs about `2 n (s + 1)(s + 2)` flops. Within a step a
+    field is an algebra element, so Munthe-Kaas methods accept it; outside of a step it has no
+    bracket. Every step starts from `y (3 - y @ y) / 2`, so that rounding does not add up. For n = 3
+    a field is, within a step, the `cfjax.Rotation` with angular velocity `y x g` (cross product),
+    which by itself is 20 times as fast.
 
     With leading axes, shape `(*batch, n)`, each vector moves on its own. An axis of 1 is broadcast.
 
     **Arguments:** `g`, shape `(*batch, n)`, float32 or float64.
 
-    **Raises** `ValueError` for another shape, `TypeError` for another dtype. A solve that starts
-    from a vector whose length is off 1 by more than the root of a unit of rounding is an error.
+    **Raises** `ValueError` for another shape, `TypeError` for another dtype. Starting a solve from
+    a vector whose length differs from 1 by more than the root of a unit of rounding is an error.
     Outside of a solve a length that is off by 0.05 gives NaN.
     """
 

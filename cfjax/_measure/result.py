@@ -17,20 +17,20 @@ if TYPE_CHECKING:
 class WorkPrecision(NamedTuple):
     """What each method costs and how far it is off: one row for each method and setting.
 
-    NaN stands for what is not known. Rows of runs that failed have NaN as `error` and `seconds`.
+    NaN stands for unknown values. Rows of runs that failed have NaN as `error` and `seconds`.
 
     **Fields:**
 
     - `method`: the method's name.
-    - `tolerance`: of an adaptive run, otherwise NaN.
+    - `tolerance`: the tolerance of an adaptive run, otherwise NaN.
     - `error`: the distance of the final state from the reference.
     - `num_steps`, `num_rejected`: attempted steps, and those among them that were rejected.
-    - `num_evaluations`: evaluations of the field, in all attempted steps. NaN for implicit
-      methods, where steps differ.
+    - `num_evaluations`: evaluations of the field, in all attempted steps. NaN for implicit methods,
+      whose steps differ.
     - `num_flows`: flows of frozen fields in all attempted steps. A state of several parts moves in
       one flow; a translation does not count.
-    - `flops`: floating-point operations of all attempted steps, as traced. NaN where a step has an
-      operation without a rule. The step size controller's own are not in it.
+    - `flops`: floating-point operations of all attempted steps, as traced, without those of the
+      step size controller. NaN if a step has an operation without a rule.
     - `compile_seconds`: time to trace and compile the solve. One program serves all settings of a
       method.
     - `seconds`: the time of every repeated run, without the first. Its minimum is the figure to
@@ -67,12 +67,12 @@ class WorkPrecision(NamedTuple):
     def plot(self, figure: "matplotlib.figure.Figure | None" = None) -> "matplotlib.figure.Figure":
         """The chart: error against time, and beside it against flops. Needs `cfjax[paper]`.
 
-        A mark is the fastest run; its bar reaches to the upper quartile. Where no flops are known
-        of any method, the second panel shows evaluations of the field. Draws into `figure` if there
-        is one.
+        A mark is the fastest run; its bar reaches to the upper quartile. If the flops of no method
+        are known, the second panel shows evaluations of the field. Draws into `figure` if it is
+        given.
 
         **Raises** `ModuleNotFoundError` without matplotlib and rich, and `TypeError` if `figure` is
-        none.
+        not a matplotlib figure.
         """
         with paper_extra():
             from matplotlib.figure import FigureBase
@@ -106,7 +106,7 @@ class WorkPrecision(NamedTuple):
     def table(self) -> "rich.table.Table":
         """The table for a terminal, with the notes below. Needs `cfjax[paper]`.
 
-        Beside the fastest run stands how much longer the upper quartile took.
+        The table shows the fastest run, and beside it how much longer the upper quartile took.
 
         **Raises** `ModuleNotFoundError` without rich.
         """

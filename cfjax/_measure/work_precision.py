@@ -68,36 +68,36 @@ def work_precision(
 ) -> WorkPrecision:
     """Measures what an error costs with each method.
 
-    Either with equal steps, those of `cfjax.integrate`, for each of `num_steps`, or with adaptive
-    steps, `diffrax.diffeqsolve` for each of `tolerances`. Compiles a program for each method, which
-    takes seconds, then runs all of them in turns, so that what else the machine does falls on all
-    alike.
+    It measures either equal steps, by `cfjax.integrate` for each of `num_steps`, or adaptive steps,
+    by `diffrax.diffeqsolve` for each of `tolerances`. It compiles a program for each method, which
+    takes seconds, then runs the programs in turns, so that other work on the machine affects all of
+    them alike.
 
     **Arguments:**
 
     - `term`, `t0`, `t1`, `y0`, `args`: the problem, as for `cfjax.integrate`.
-    - `methods`: by name, a diffrax solver, or a pair of a term of its own and a solver: diffrax's
+    - `methods`: a dict by name of diffrax solvers, or of pairs of a term and a solver: diffrax's
       own solvers take `diffrax.ODETerm` of the ambient field.
     - `reference`: the state at `t1` that counts as exact; shaped like `y0`.
-    - `num_steps`, `tolerances`: one of the two.
-    - `controller`: makes the step size controller of a tolerance, which is a traced array. By
-      default the absolute error is controlled, with `rtol=0`: a relative one depends on the frame.
+    - `num_steps`, `tolerances`: give one of the two.
+    - `controller`: a function that makes the step size controller from a tolerance, which is a
+      traced array. By default it controls the absolute error, with `rtol=0`, as a relative error
+      depends on the frame.
     - `dt0`: the first of the adaptive steps; by default a hundredth of the interval.
     - `max_steps`: a run that takes more adaptive steps has failed.
-    - `error`: the error of a final state, given it and the reference; by default the 2-norm of the
-      difference.
-    - `repeats`, `budget`: times are measured so many times, or until so many seconds have passed.
-      Every program runs once in any case, and once more to warm up.
+    - `error`: a function of a final state and the reference that returns the error; by default the
+      2-norm of the difference.
+    - `repeats`, `budget`: the number of times that each run is measured, or the number of seconds
+      until measuring stops. Every program runs at least once, and once more to warm up.
     - `progress`: whether to show what is being compiled and measured in progress bars, on a
-      terminal. Needs `rich`, and without it there are none. Or a `rich.progress.Progress` that
-      gets the bars.
+      terminal. Without `rich` there are none. Or a `rich.progress.Progress` that gets the bars.
 
     **Returns:** a `cfjax.WorkPrecision`. A run that fails (infinity or NaN, or too many steps) has
-    a row of its own there, with NaN as its error and the reason as its note.
+    its own row, with NaN as its error and the reason as its note.
 
     **Raises:** `TypeError` or `ValueError` for arguments of wrong type or value, for example a
-    solver without an error estimate where there are tolerances. What a method raises when it is
-    traced, with its name added.
+    solver without an error estimate if there are tolerances. An error that a method raises when it
+    is traced is raised again, with the name of the method added.
     """
     settings = _checked_settings(num_steps, tolerances)
     is_adaptive = tolerances is not None
@@ -254,7 +254,7 @@ def _first_run(program: Callable[[], tuple]) -> tuple[PyTree, float, float, str]
 
 def _checked_settings(num_steps: Any, tolerances: Any) -> list[Any]:
     if (num_steps is None) == (tolerances is None):
-        raise ValueError("Give one of num_steps and tolerances, and not the other.")
+        raise ValueError("Give either num_steps or tolerances, not both.")
     name, given = ("num_steps", num_steps) if tolerances is None else ("tolerances", tolerances)
     if isinstance(given, np.ndarray | jax.Array) and given.ndim == 1:
         given = given.tolist()

@@ -75,8 +75,8 @@ Defects: TypeAlias = list[tuple[Fraction, float]]
 def order(tableau: Tableau) -> int:
     """The order of a commutator-free method, at least 1 as every tableau is consistent.
 
-    Exact tableaus are decided exactly. With floats, it is the order that a method may have of
-    which these are the rounded coefficients; see `_defects`.
+    For exact tableaus the result is exact. Floats are taken as rounded coefficients, and the result
+    is the order that the unrounded method may have; see `_defects`.
 
     **Raises:** `TypeError` if `tableau` is not a `Tableau`.
     """

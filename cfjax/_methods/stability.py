@@ -12,11 +12,11 @@ Number = int | float | complex | Inexact[np.ndarray, "..."]
 
 
 def stability_function(tableau: Tableau, z: Number, w: Number) -> Complex[np.ndarray, "..."]:
-    """By what factor a step multiplies the solution of `u' = (lambda + omega) u`.
+    """The factor by which a step multiplies the solution of `u' = (lambda + omega) u`.
 
-    `lambda` is in the exact flow and `omega` explicit, as in the paper's heat problem: the field
-    frozen at p is the affine `u -> lambda u + omega p`. A step of size h is stable where the
-    absolute value is at most 1. For `z = 0` this is the stability polynomial of the classical
+    `lambda` is in the exact flow and `omega` is explicit, as in the paper's heat problem: the field
+    frozen at p is the affine `u -> lambda u + omega p`. A step of size h is stable if the absolute
+    value of the factor is at most 1. For `z = 0` this is the stability polynomial of the classical
     Runge-Kutta method, and for `w = 0` the exact `exp(z)`.
 
     **Arguments:** `z = h lambda` and `w = h omega`, complex numbers or arrays that broadcast.

@@ -34,18 +34,18 @@ class Tableau:
     `beta[j][k]` is the same for the end point.
 
     **Arguments:** nested sequences (lists, tuples, arrays) of int, `Fraction` or float. A row may
-    leave out trailing zeros. They are stored as nested tuples: every row with one entry for each
-    stage, rows of zeros left out (the flow of zero is the identity), integers as `Fraction`.
+    leave out trailing zeros. A tableau stores them as nested tuples: every row with one entry for
+    each stage, rows of zeros left out (the flow of zero is the identity), integers as `Fraction`.
 
     A tableau is compared and hashed by value, so it can be static in a jitted function.
 
-    Two more products are optional. Both may use one more field, `F_s = h f(t + h, y_1)`, which
-    the next step starts with (first same as last).
+    Two more products are optional. Both may use one more field, `F_s = h f(t + h, y_1)`, with which
+    the next step starts (first same as last).
 
     - `embedded[j][k]`: another end point, of an order lower by one, to estimate the error.
-    - `continuous_extension[j][i][k]`: the solution at `t + theta h` has for flow j and field F_k
-      the sum over i of these times `theta^(i+1)` as its coefficient, which is `beta`'s at
-      theta = 1.
+    - `continuous_extension[j][i][k]`: for the solution at `t + theta h`, the coefficient of field
+      F_k in flow j is the sum over i of these numbers times `theta^(i+1)`. At theta = 1 it equals
+      that of `beta`.
 
     **Raises:** `TypeError` where the nesting or a coefficient's type is wrong; `ValueError` where
     a row is too long, the method is implicit, a coefficient is not finite, the rows of `beta` or

@@ -20,8 +20,8 @@ def quaternion_to_matrix(
 ) -> Float[Array, "*batch 3 3"]:
     """The rotation matrix of a quaternion: with `x_fixed = matrix @ x_body` for an attitude.
 
-    The matrix is that of `q / |q|`, as a solver of linear spaces lets the length of q drift. So the
-    derivative along q is zero. q and -q give one matrix.
+    It is the matrix of `q / |q|`, as a solver of linear spaces lets the length of q drift. So the
+    derivative along q is zero. q and -q give the same matrix.
 
     **Arguments:** `q`, shape `(*batch, 4)`, float32 or float64; `order`, `"wxyz"` or `"xyzw"`, how
     q is stored, where w is its scalar part.
@@ -29,8 +29,8 @@ def quaternion_to_matrix(
     **Returns:** shape `(*batch, 3, 3)`.
 
     **Raises** `ValueError` for another shape or order, `TypeError` for another dtype. A squared
-    length that is off 1 by more than 0.1, as that of zero, is an error; within a step of a small
-    system it gives NaN. Divide such a q by its length.
+    length that differs from 1 by more than 0.1 (q = 0 is such a case) is an error; within a step of
+    a small system it gives NaN. Divide such a q by its length.
     """
     (w, x, y, z), c = _quaternion(q, order)
     rows = [
@@ -50,7 +50,7 @@ def quaternion_rotate(
     """A vector turned by a quaternion: `(0, x)` becomes `q (0, x) / q`.
 
     An attitude turns body coordinates into fixed ones, and its conjugate does the reverse. The
-    length of x stays, also where that of q has drifted, as in `quaternion_to_matrix`.
+    length of x stays the same even if the length of q has drifted, as in `quaternion_to_matrix`.
 
     **Arguments:** `q`, shape `(*batch, 4)`, float32 or float64; `x`, shape `(*batch, 3)` and of the
     same dtype, with as many axes; an axis of 1 is broadcast. `order` as in `quaternion_to_matrix`.
@@ -82,8 +82,8 @@ def quaternion_from_matrix(
     """The unit quaternion of a rotation matrix, with a scalar part that is not negative.
 
     Exact to rounding for every rotation. Its derivatives are exact too, for changes of the matrix
-    that keep it orthogonal. Only at half turns, where the scalar part is zero and q jumps to -q, is
-    there none; what is returned there is that of one side.
+    that keep it orthogonal. Only at half turns, where the scalar part is zero and q jumps to -q,
+    there is no derivative; cfjax returns the derivative from one side.
 
     **Arguments:** `matrix`, shape `(*batch, 3, 3)`, float32 or float64; `order` as in
     `quaternion_to_matrix`.
@@ -91,10 +91,10 @@ def quaternion_from_matrix(
     **Returns:** shape `(*batch, 4)`, of length 1 to rounding.
 
     **Raises** `ValueError` for another shape or order, `TypeError` for another dtype. A matrix that
-    is not orthogonal, by more than 1e-6 (float32: 3.5e-4) in an entry of
-    `matrix.T @ matrix`, or has determinant -1 is an error; not so within a step of a small system.
-    A solver of linear spaces lets it drift. There are several rotations near it then, of which the
-    nearest is `u @ vh` for `u, _, vh = jnp.linalg.svd(matrix)`.
+    is not orthogonal, by more than 1e-6 (float32: 3.5e-4) in an entry of `matrix.T @ matrix`, or
+    has determinant -1 is an error, except within a step of a small system. A solver of linear
+    spaces lets the matrix drift. The nearest rotation is then `u @ vh` for
+    `u, _, vh = jnp.linalg.svd(matrix)`.
 
     Source: Shepperd, Quaternion from rotation matrix, J. Guid. Control 1 (1978),
     doi:10.2514/3.55767b.

@@ -118,10 +118,10 @@ def expm(a: Inexact[Array | np.ndarray, "n n"]) -> Inexact[Array, "n n"]:
     `jax.vmap` every matrix is scaled by its own norm, and the products are those of the largest. A
     derivative of any order works, forward and reverse.
 
-    **Accuracy:** a backward error of a few units in the last place of the scaled matrix, doubled
-    by every squaring at worst. exp(0) = I holds exactly, and so does its derivative. s may be up to
-    52 (23): beyond, no digit of the answer would be right, and it is NaN. An overflow of exp(a) or
-    of a² gives inf or NaN, an entry that is not finite gives NaN.
+    **Accuracy:** a backward error of a few units in the last place of the scaled matrix, doubled by
+    every squaring at worst. exp(0) = I holds exactly, and so does its derivative. s may be up to 52
+    (23 in single precision): beyond this no digit of the result would be right, and it is NaN. An
+    overflow of exp(a) or of a² gives inf or NaN, an entry that is not finite gives NaN.
 
     **Raises:** `ValueError` if `a` is not a square matrix, `TypeError` for another dtype.
 

@@ -22,8 +22,8 @@ def stumpff(n: int, s: Float[Array | np.ndarray, "*batch"]) -> Float[Array, "*ba
     `s c_{n+2} = 1/n! - c_n`. They are entire functions of s, with the derivatives
     `c_n' = (n c_{n+2} - c_{n+1}) / 2`. So every derivative is exact, at zero too.
 
-    Flows of rotations and rigid motions are made of them: with a the matrix of a cross product with
-    w and `s = w @ w`, `exp(a) = I + c_1 a + c_2 a^2` and `phi_1(a) = I + c_2 a + c_3 a^2`.
+    They give the flows of rotations and rigid motions: if a is the matrix of the cross product with
+    w, and `s = w @ w`, then `exp(a) = I + c_1 a + c_2 a^2` and `phi_1(a) = I + c_2 a + c_3 a^2`.
 
     The error is a few units of rounding of x: absolute in `x c_1` and `x^2 c_2`, relative for
     small x. So an x beyond 2^45 (2^16 in float32), which rounding leaves uncertain by a hundredth,
@@ -33,7 +33,7 @@ def stumpff(n: int, s: Float[Array | np.ndarray, "*batch"]) -> Float[Array, "*ba
 
     **Returns:** an array like `s`.
 
-    **Raises** `TypeError` if `n` is not an int or `s` of another dtype, `ValueError` if `n` is
+    **Raises** `TypeError` if `n` is not an int or `s` has another dtype, `ValueError` if `n` is
     negative.
 
     Source: Stiefel & Scheifele, Linear and Regular Celestial Mechanics (1971), Section 11.

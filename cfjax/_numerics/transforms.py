@@ -21,9 +21,9 @@ _MAX_DENSE = 160
 class AbstractTransform(eqx.Module):
     """An invertible linear map between points and the coefficients in which M is diagonal.
 
-    A transform of your own provides both methods, `forward` and `inverse`, each the inverse of the
-    other, for every dtype that it is used with. Further axes are columns. For grids there is
-    `cfjax.TensorTransform`, which calls them axis by axis. Use `jax.vmap` for batches.
+    A transform of your own provides the methods `forward` and `inverse`, each the inverse of the
+    other, for every dtype with which it is used. Further axes are columns. For grids use
+    `cfjax.TensorTransform`, which applies transforms axis by axis, and for batches `jax.vmap`.
     """
 
     @abc.abstractmethod
@@ -38,9 +38,9 @@ class AbstractTransform(eqx.Module):
 class SineTransform(AbstractTransform):
     """The orthonormal discrete sine transform (DST-I), which is its own inverse.
 
-    For zero boundary values, at the points `x_j = j dx`, `j = 1..n`, `(n + 1) dx` the length of
-    the interval. It diagonalises the second difference `u_{j-1} - 2 u_j + u_{j+1}`: coefficient
-    `k = 1..n` has the eigenvalue `-4 sin(k pi / (2 (n + 1)))^2`.
+    It is for zero boundary values, at the points `x_j = j dx`, `j = 1..n`, with `(n + 1) dx` the
+    length of the interval. It diagonalises the second difference `u_{j-1} - 2 u_j + u_{j+1}`:
+    coefficient `k = 1..n` has the eigenvalue `-4 sin(k pi / (2 (n + 1)))^2`.
 
     Costs a real FFT of length `n + 1`, twice that for even n, or a product with a dense matrix for
     n up to 160. Fast lengths `n + 1` are products of small primes.
@@ -61,9 +61,9 @@ class SineTransform(AbstractTransform):
 class CosineTransform(AbstractTransform):
     """The orthonormal discrete cosine transform (DCT-II), with its inverse (DCT-III).
 
-    For zero boundary fluxes, at the centres of cells `x_j = (j + 1/2) dx`, `j = 0..n-1`, `n dx`
-    the length of the interval. It diagonalises the second difference whose first and last rows are
-    `u_1 - u_0` and `u_{n-2} - u_{n-1}`: coefficient `k = 0..n-1` has the eigenvalue
+    It is for zero boundary fluxes, at the centres of cells `x_j = (j + 1/2) dx`, `j = 0..n-1`, with
+    `n dx` the length of the interval. It diagonalises the second difference whose first and last
+    rows are `u_1 - u_0` and `u_{n-2} - u_{n-1}`: coefficient `k = 0..n-1` has the eigenvalue
     `-4 sin(k pi / (2 n))^2`.
 
     Costs a real FFT of length `2 n`, or a product with a dense matrix for n up to 160.
@@ -85,8 +85,8 @@ class CosineTransform(AbstractTransform):
 class FourierTransform(AbstractTransform):
     """The unitary discrete Fourier transform of complex points, for periodic problems.
 
-    At the points `x_j = j dx`, `j = 0..n-1`, `n dx` the period. It diagonalises every periodic
-    difference operator with constant coefficients, and spectral derivatives: coefficient
+    The points are `x_j = j dx`, `j = 0..n-1`, with `n dx` the period. It diagonalises every
+    periodic difference operator with constant coefficients, and spectral derivatives: coefficient
     `k = 0..n-1` belongs to `exp(2 pi i j k / n)`. The second difference has the eigenvalues
     `-4 sin(k pi / n)^2`. Costs a complex FFT of length `n`.
 
@@ -116,10 +116,11 @@ class FourierTransform(AbstractTransform):
 class RealFourierTransform(AbstractTransform):
     """The unitary discrete Fourier transform of real points: coefficients `k = 0..n//2` alone.
 
-    Otherwise as `FourierTransform`. Costs a real FFT of length `n`. A difference operator of
-    odd order must have the eigenvalue zero at `k = n/2`, n even: no real point has another.
+    Otherwise it is like `FourierTransform`. Costs a real FFT of length `n`. A difference operator
+    of odd order must have the eigenvalue zero at `k = n/2`, if n is even: for real points no other
+    value is possible.
 
-    **Arguments:** `n`, the number of points, which the coefficients do not tell.
+    **Arguments:** `n`, the number of points, which the coefficients do not determine.
 
     **Raises** `ValueError` if `n` is not a positive integer, or an array has another length,
     `TypeError` for complex points.
@@ -162,30 +163,32 @@ class TensorTransform(AbstractTransform):
     """The tensor product of transforms, the k-th along axis k, for problems on a grid.
 
     So `TensorTransform((SineTransform(), CosineTransform()))` is for points of shape `(nx, ny)`
-    with zero boundary values in x and zero boundary fluxes in y. Further axes are columns. None
-    in place of a transform leaves its axis as it is, for example the species of a reaction.
+    with zero boundary values in x and zero boundary fluxes in y. Further axes are columns. None in
+    place of a transform leaves its axis as it is, for example the axis of the species of a
+    reaction.
 
-    An operator that is a sum of one for each axis has the sums of their eigenvalues, in the shape
-    of the coefficients. So the Laplacian above, by second differences, has
+    If an operator is a sum of operators, one for each axis, its eigenvalues are the sums of their
+    eigenvalues, in the shape of the coefficients. So the Laplacian in this example, by second
+    differences, has
 
         np.add.outer(
             SineTransform().second_difference(nx) / dx**2,
             CosineTransform().second_difference(ny) / dy**2,
         )
 
-    Periodic axes of real points take one `RealFourierTransform`, with `n//2 + 1` coefficients
-    along its axis, and `FourierTransform` for the others. A difference of odd order must have the
+    Periodic axes of real points take one `RealFourierTransform`, with `n//2 + 1` coefficients along
+    its axis, and `FourierTransform` for the others. A difference of odd order must have the
     eigenvalue zero at `k = n/2` along each of them. Any axis may have any kind, as transforms of
     different axes commute: `forward` applies `RealFourierTransform` after those that keep real
-    points real and before `FourierTransform`, and `inverse` turns the order round.
+    points real and before `FourierTransform`, and `inverse` reverses the order.
 
-    Costs for each axis its transform, of as many columns as there are other entries.
+    Each axis costs its transform, with as many columns as there are other entries.
 
     **Arguments:** `transforms`, a sequence of `cfjax.AbstractTransform` or None, each of which
     transforms one axis.
 
     **Raises** `TypeError` if they are anything else, `ValueError` if more than one of them is a
-    `RealFourierTransform`, or an array has fewer axes.
+    `RealFourierTransform`, or if an array has fewer axes.
     """
 
     transforms: tuple[AbstractTransform | None, ...]

@@ -27,20 +27,21 @@ from .stages import rolled
 class AbstractCommutatorFree(AbstractChartSolver):
     """Flows of linear combinations of frozen fields, and no commutator.
 
-    Where the tableau has an embedded method, its end point is compared with the step's: the error
-    estimate is `y1 - embedded`. With `estimate="algebra"` it is the velocity at `y1` of the
-    difference of the two, flow by flow added up: a linear combination of the stages' fields, which
-    costs no flow. That is blind, whatever the commutators do, where these cancel: for fields that
-    do not depend on the state and are linear in time, as in the Landau-Zener problem.
+    If the tableau has an embedded method, the error estimate is `y1 - embedded`, the difference of
+    the end points of both methods. With `estimate="algebra"` the fields of all flows are added up
+    for each method, and the estimate is the velocity at `y1` of the difference of the two sums.
+    This is a linear combination of the stages' fields, which costs no flow. For fields that do not
+    depend on the state and are linear in time, as in the Landau-Zener problem, these sums cancel,
+    so this estimate does not see the error that the commutators make.
 
-    Constant steps do not need it, but small systems take up to twice as long with it on CPU.
-    `estimate=None` switches it off. (`cfjax.integrate` does.)
+    Constant steps do not need an estimate, and small systems take up to twice as long with it on
+    CPU. `estimate=None` switches it off. (`cfjax.integrate` does so.)
 
     A class whose tableau has an embedded method is a `diffrax.AbstractAdaptiveSolver`.
 
-    `unroll` says how the stages of a step are compiled, as `scan_kind` does in diffrax: one by one
-    (True), or as one loop where the fields allow it (False), which is a shorter program. None, the
-    default, takes what measures best.
+    `unroll` says how the stages of a step are compiled, like `scan_kind` in diffrax: unrolled
+    (True), or rolled into one loop if the fields allow it (False), which is a shorter program.
+    None, the default, picks what measures best.
 
     **Raises** `ValueError` for another `estimate` or `unroll`.
     """
@@ -183,15 +184,14 @@ class CommutatorFree(
 ):
     """The commutator-free method of a `cfjax.Tableau`.
 
-    One step costs `tableau.num_evaluations` evaluations of the field and `tableau.num_flows`
-    flows. Its order is `cfjax.order(tableau)`. With an embedded method in the tableau there is an
-    error estimate, which costs `tableau.num_embedded_flows` more. Dense output is by the tableau's
-    continuous extension, or by one that the order conditions decide, of order one below the
-    method's but at most 4: for that a step evaluates the field at its end where the stages do not
-    suffice.
+    One step costs `tableau.num_evaluations` evaluations of the field and `tableau.num_flows` flows.
+    Its order is `cfjax.order(tableau)`. If the tableau has an embedded method, there is an error
+    estimate, which costs `tableau.num_embedded_flows` more. Dense output uses the tableau's
+    continuous extension, or one derived from the order conditions, of order one below the method's
+    but at most 4: for this a step evaluates the field at its end if the stages do not suffice.
 
-    It is a `diffrax.AbstractAdaptiveSolver` for every tableau, as a class cannot tell. diffrax
-    looks for the estimate itself, and refuses adaptive steps without one.
+    It is a `diffrax.AbstractAdaptiveSolver` for every tableau, as its class does not depend on the
+    tableau. diffrax checks for the estimate itself, and refuses adaptive steps without one.
 
     **Raises** `TypeError` if `tableau` is not a `cfjax.Tableau`.
     """
@@ -214,7 +214,7 @@ class CF2(
 ):
     """The midpoint rule. Order 2, 2 evaluations, 2 flows. Dense output of order 2.
 
-    The estimate, with a step of `LieEuler`, costs 1 flow more.
+    The estimate compares with a step of `LieEuler` and costs 1 flow more.
     """
 
     tableau: ClassVar[Tableau] = _tableau.CF2
@@ -240,13 +240,13 @@ class CF4(
 ):
     """Celledoni, Marthinsen & Owren's method of order 4: 4 evaluations, 5 flows.
 
-    In a linear space this is the classical Runge-Kutta method. It is the choice for
-    most fields but attitudes and poses, see `RKMK8`, and those that do not depend on y, `Magnus6`.
+    In a linear space this is the classical Runge-Kutta method. It is the choice for most fields
+    except attitudes and poses (see `RKMK8`) and fields that do not depend on y (see `Magnus6`).
 
-    The estimate costs 1 flow more. Its embedded method of order 3 is first same as last. That tells
-    from how the field changes with the state, and sees nothing of how it changes with time. So
-    where it is small it is replaced by the distance of the last stage from the end, times its ratio
-    to the way from the start. Dense output of order 3.
+    The estimate costs 1 flow more. Its embedded method of order 3 is first same as last. It sees
+    how the field changes with the state, but not how the field changes with time. So a small
+    estimate is replaced by the distance of the last stage from the end, times the ratio of this
+    distance to the distance from the start. Dense output of order 3.
 
     Source: Commutator-free Lie group methods, FGCS 19 (2003), equation (7),
     doi:10.1016/S0167-739X(02)00161-9.
@@ -274,14 +274,15 @@ class CF54(
 ):
     """Order 5 with an embedded method of order 4: 7 evaluations, 9 flows, 2 more for the estimate.
 
-    Stable for undamped oscillations only up to 0.86 (decay: 3.95), so for these take `CF43` at
-    large steps. Dense output of order 4, which uses the field at the end of the step.
+    It is stable for undamped oscillations only up to 0.86 (decay: 3.95), so use `CF43` for
+    oscillations in large steps. Dense output of order 4, which uses the field at the end of the
+    step.
 
-    Not for fields that hold strong dissipation: one flow goes backwards in time by 0.24 of the
-    step, so for `Affine` a step overflows once its length times the largest eigenvalue of M exceeds
-    3000 (370 in float32). Error control rejects such a step, and loose tolerances meet more of them
-    than tight ones. There take `CF4` or `CF43`, whose flows go forwards: no commutator-free method
-    of an order above 4 has positive weights.
+    Do not use it for strong dissipation: one flow goes backwards in time by 0.24 of the step, so
+    for `Affine` a step overflows once its length times the largest eigenvalue of M exceeds 3000
+    (370 in float32). Error control rejects such a step, more often at loose tolerances than at
+    tight ones. For strong dissipation use `CF4` or `CF43`, whose flows go forwards: no
+    commutator-free method of an order above 4 has positive weights.
 
     Source: derived for this package from the order conditions; see `cfjax.order`. Weights:
     Hofstätter & Koch, Numer. Math. 141 (2019), arXiv:1709.08473.
@@ -296,7 +297,7 @@ class CG3(
     """Crouch & Grossman's method of order 3: 3 evaluations, 6 flows of single fields.
 
     The estimate, with an embedded method of order 2, costs 3 flows more. Dense output of order 2.
-    Flows go backwards in time too: not for fields that hold strong dissipation, see `CF54`.
+    Some flows go backwards in time, so do not use it for strong dissipation: see `CF54`.
 
     Source: Crouch & Grossman, J. Nonlinear Sci. 3 (1993), doi:10.1007/BF02429858; coefficients of
     Owren & Marthinsen, BIT 39 (1999), doi:10.1023/A:1022325426017.
@@ -309,7 +310,7 @@ class CG4(AbstractCommutatorFree, diffrax.AbstractStratonovichSolver):
     """A Crouch-Grossman method of order 4: 5 evaluations, 15 flows of single fields.
 
     Dense output of order 3.
-    Flows go backwards in time too: not for fields that hold strong dissipation, see `CF54`.
+    Some flows go backwards in time, so do not use it for strong dissipation: see `CF54`.
 
     Source: Jackiewicz, Marthinsen & Owren, Adv. Comput. Math. 13 (2000),
     doi:10.1023/A:1016645730465.
@@ -322,7 +323,7 @@ class CG5(AbstractCommutatorFree, diffrax.AbstractStratonovichSolver):
     """A Crouch-Grossman method of order 5: 9 evaluations, 43 flows of single fields.
 
     Dense output of order 4, which uses the field at the end of the step.
-    Flows go backwards in time too: not for fields that hold strong dissipation, see `CF54`.
+    Some flows go backwards in time, so do not use it for strong dissipation: see `CF54`.
 
     Source: Jackiewicz, Marthinsen & Owren, Adv. Comput. Math. 13 (2000),
     doi:10.1023/A:1016645730465.

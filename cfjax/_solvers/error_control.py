@@ -17,11 +17,12 @@ from .._term import LieTerm
 class ErrorNorm(eqx.Module):
     """The norm of a state whose parts have different scales: for `diffrax.PIDController(norm=...)`.
 
-    The root of the mean, over the parts, of the mean square of each part divided by its scale. A
-    part of many entries weighs no more than one of few. Rotating a part changes nothing.
+    It is the root of the mean, over the parts, of the mean square of each part divided by its
+    scale. A part with many entries weighs no more than a part with few. Rotating a part does not
+    change the norm.
 
-    With `rtol=0` a step is accepted when its error has a norm below `atol`: so `atol` is relative
-    to the scales. A positive `rtol` is taken entry by entry, and depends on the frame.
+    With `rtol=0` a step is accepted if the norm of its error is below `atol`, so `atol` is relative
+    to the scales. A positive `rtol` applies entry by entry, and depends on the frame.
 
     **Arguments:** `scales`, a pytree of positive real scalars whose structure is a prefix of the
     state's: one for each part, in its unit.
@@ -79,12 +80,12 @@ def starting_step(
 ) -> Real[Array, ""]:
     """A first step for `diffrax.diffeqsolve(..., dt0=...)`, whose own choice is always 0.01.
 
-    From the velocity v at the start and its rate of change r along a small flow, the step h whose
-    error, taken as `h |v| (h r)^order`, is `atol / 100`. It costs 2 evaluations and 1 flow.
+    The velocity v at the start and its rate of change r along a small flow determine the step h:
+    its error, estimated as `h |v| (h r)^order`, is `atol / 100`. It costs 2 evaluations and 1 flow.
 
-    The small flow moves the state by a hundredth of its own size. A state at or near zero has none:
-    then its size is taken as the geometric mean of `atol` and of how far v leads until `t1`. A
-    state that starts at rest moves for a hundredth of the interval.
+    The small flow moves the state by a hundredth of its size. For a state at or near zero the size
+    is the geometric mean of `atol` and the distance that v covers until `t1`. If the state starts
+    at rest, the small flow lasts a hundredth of the interval.
 
     **Arguments:** `term`, `solver`, `t0`, `t1`, `y0`, `args` as for `diffrax.diffeqsolve`; the
     solver's order is used. `atol`, positive, and `norm` as for `diffrax.PIDController`, with
@@ -93,9 +94,9 @@ def starting_step(
     **Returns:** a scalar with the sign of `t1 - t0`, at most as long. It scales with the unit of
     time, and does not change with the unit of the state and `atol`.
 
-    **Raises** `TypeError` if the term is not a `cfjax.LieTerm` or `diffrax.ODETerm`, the solver no
-    instance of a diffrax solver, or `t0`, `t1` or `atol` no real scalar; a runtime error if `atol`
-    is not positive.
+    **Raises** `TypeError` if the term is not a `cfjax.LieTerm` or `diffrax.ODETerm`, if the solver
+    is not an instance of a diffrax solver, or if `t0`, `t1` or `atol` is not a real scalar; a
+    runtime error if `atol` is not positive.
 
     Source: the algorithm of Hairer, Norsett & Wanner, Solving Ordinary Differential Equations I,
     Section II.4, with an error and a small flow that scale with the unit of time.

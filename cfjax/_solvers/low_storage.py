@@ -29,9 +29,9 @@ _LARGE = 4096
 class AbstractLowStorage(AbstractCommutatorFree, diffrax.AbstractStratonovichSolver):
     """`d <- a[i] d + h f(t + c[i] h, Y)`, `Y <- exp(b[i] d) Y` for every stage i, with a[0] = 0.
 
-    That takes two copies of the state's size, the point and the sum of fields that moves it.
-    Fields in coordinates of a step (`LowRankSkew`) need the memory of all stages all the same, and
-    so does output within a step.
+    It keeps two copies of the state, the point and the sum of fields that moves it. Fields in
+    coordinates of a step (`LowRankSkew`) and output within a step still need the memory of all
+    stages.
     """
 
     a: ClassVar[Row]
@@ -199,7 +199,7 @@ class Luscher3(AbstractLowStorage, diffrax.AbstractAdaptiveSolver):
 class YRK135(AbstractLowStorage):
     """Order 5, 13 evaluations, 13 flows. Dense output of order 4.
 
-    Flows go backwards in time too: not for fields that hold strong dissipation, see `CF54`.
+    Some flows go backwards in time, so do not use it for strong dissipation: see `CF54`.
 
     Source: Yan (2017); Bazavov, BIT 62 (2022), doi:10.1007/s10543-021-00892-x.
     """
@@ -238,8 +238,8 @@ class YRK135(AbstractLowStorage):
 
 
 class CFEES25(AbstractLowStorage, diffrax.AbstractAdaptiveSolver):
-    """Order 2, 3 evaluations, 3 flows; a step back undoes it to order 5. The estimate, of order 1,
-    costs 1 flow more, and one more copy of the state. Dense output of order 2.
+    """Order 2, 3 evaluations, 3 flows; a backward step undoes a step to order 5. The estimate, of
+    order 1, costs 1 flow more, and one more copy of the state. Dense output of order 2.
 
     Source: Shmelev, Thompson & Salvi, arXiv:2509.20599 (2025).
     """
@@ -252,8 +252,8 @@ class CFEES25(AbstractLowStorage, diffrax.AbstractAdaptiveSolver):
 
 
 class CFEES27(AbstractLowStorage):
-    """Order 2, 4 evaluations, 4 flows; a step back undoes it to order 7. Dense output of order
-    2.
+    """Order 2, 4 evaluations, 4 flows; a backward step undoes a step to order 7. Dense output of
+    order 2.
 
     Source: Shmelev, Thompson & Salvi, arXiv:2509.20599 (2025).
     """

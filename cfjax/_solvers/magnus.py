@@ -26,18 +26,20 @@ class AbstractMagnus(AbstractChartSolver):
 
     For `y' = A(t) y`, and any other field whose coordinates depend on t but not on y.
 
-    Where the method has an embedded one, the end of that is compared with the step's: the error
-    estimate is `y1 - embedded`. Constant steps do not need it:
-    `estimate=None` switches it off. (`cfjax.integrate` does.)
+    If the method has an embedded method, the error estimate is `y1 - embedded`, the difference of
+    the end points of both. Constant steps do not need it: `estimate=None` switches it off.
+    (`cfjax.integrate` does so.)
 
-    `unroll` says whether the flows stand one by one in the program (True) or in a loop (False);
-    None, the default, takes what measures best.
+    `unroll` says whether the flows are unrolled in the program (True) or rolled into a loop
+    (False); None, the default, picks what measures best.
 
-    Where the nodes have both ends of the step, its last evaluation is the first one of the next.
+    If the nodes include both ends of the step, the last evaluation of a step is the first one of
+    the next.
 
-    **Raises** `TypeError` when the program is traced if the field depends on the state, be it that
-    it is frozen there as `cfjax.LowRankSkew` is, or gives the state to a function of the host that
-    `jax.vmap` does not take; `ValueError` for another `estimate` or `unroll`.
+    **Raises** `TypeError` when the program is traced if the field depends on the state, including a
+    field that is frozen at the state, such as `cfjax.LowRankSkew`, and a field that gives the state
+    to a function of the host that `jax.vmap` does not take; `ValueError` for another `estimate` or
+    `unroll`.
     """
 
     is_of_state: ClassVar[bool] = False
@@ -136,7 +138,7 @@ def _depends_on_state(solver: str, place: str, part: Any) -> str:
 class Magnus2(AbstractMagnus):
     """Order 2, for fields that do not depend on y: 1 evaluation, 1 flow.
 
-    The exponential midpoint rule. Dense output of order 1. No estimate:
+    This is the exponential midpoint rule. Dense output of order 1. It has no estimate, but
     `cfjax.Richardson(cfjax.Magnus2())` has one.
     """
 
@@ -148,8 +150,8 @@ class Magnus4(AbstractMagnus, diffrax.AbstractAdaptiveSolver):
 
     All flows go forwards in time. So this is the method for fields with strong dissipation: beyond
     order 4 some flow of every method goes backwards. The estimate, with an embedded method of order
-    2, costs 1 flow more and asks for small steps: `cfjax.Richardson(cfjax.Magnus4())` takes fewer.
-    Dense output of order 3.
+    2, costs 1 flow more and leads to small steps: `cfjax.Richardson(cfjax.Magnus4())` takes fewer
+    steps. Dense output of order 3.
 
     Source: Alvermann & Fehske, High-order commutator-free exponential time-propagation of driven
     quantum systems, J. Comput. Phys. 230 (2011), doi:10.1016/j.jcp.2011.04.006. The embedded method
@@ -162,7 +164,7 @@ class Magnus4(AbstractMagnus, diffrax.AbstractAdaptiveSolver):
 class Magnus4Lobatto(AbstractMagnus, diffrax.AbstractAdaptiveSolver):
     """Order 4, for fields that do not depend on y: 2 evaluations, 2 flows.
 
-    Up to rounding it has the numbers of `CF4` on such fields, which takes 4 evaluations and 5
+    On such fields it gives the same result as `CF4` up to rounding, which takes 4 evaluations and 5
     flows. The estimate, with the midpoint rule, costs 1 flow more. Dense output of order 3.
     `Magnus4` has an error constant 50 times smaller for one evaluation and one flow more.
     """
@@ -174,7 +176,7 @@ class Magnus6(AbstractMagnus, diffrax.AbstractAdaptiveSolver):
     """Order 6, for fields that do not depend on y: 4 evaluations, 5 flows and 2 for the estimate.
 
     The embedded method has order 4. Dense output of order 5. One flow goes backwards in time, by
-    0.09 of the step: not for fields that hold strong dissipation, see `CF54`.
+    0.09 of the step, so do not use it for strong dissipation: see `CF54`.
 
     Source: derived for this package from the order conditions.
     """
@@ -186,7 +188,7 @@ class Magnus8(AbstractMagnus, diffrax.AbstractAdaptiveSolver):
     """Order 8, for fields that do not depend on y: 6 evaluations, 8 flows and 5 for the estimate.
 
     The embedded method is `Magnus6` on these nodes. Dense output of order 7. Two flows go backwards
-    in time, each by 0.44 of the step: not for fields that hold strong dissipation, see `CF54`.
+    in time, each by 0.44 of the step, so do not use it for strong dissipation: see `CF54`.
 
     Source: Hofstätter, arXiv:1902.11256. The nodes, seven of Lobatto's, and the estimate were
     chosen for this package.
@@ -199,10 +201,11 @@ class Magnus10(AbstractMagnus, diffrax.AbstractAdaptiveSolver):
     """Order 10, for fields that do not depend on y: 8 evaluations, 16 flows and 5 for the estimate.
 
     The embedded method is `Magnus6` on these nodes. Dense output of order 9. Some flows go
-    backwards in time, by up to 0.31 of the step: not for fields that hold strong dissipation, see
+    backwards in time, by up to 0.31 of the step, so do not use it for strong dissipation: see
     `CF54`.
 
-    Output within a step has a rounding of some 1e-12, a hundred times that of the step's end.
+    Output within a step has a rounding error of some 1e-12, a hundred times that of the end of the
+    step.
 
     Source: `CF10` of Hofstätter's TimeDependentLinearODESystems.jl. The nodes, nine of Lobatto's,
     and the estimate were chosen for this package.

@@ -36,13 +36,14 @@ _RungeKutta = tuple[tuple[tuple[float, ...], ...], tuple[float, ...]]
 class AbstractMuntheKaas(AbstractChartSolver, diffrax.AbstractStratonovichSolver):
     """The step `exp(v) y0` with v in the Lie algebra. Fields without a bracket are refused.
 
-    An embedded method is another element of the algebra. The error estimate is the velocity at the
-    end of the step of the difference of the two, which costs no flow, or with `estimate="group"`
-    that of the end points, for 1 flow more. `estimate=None` switches it off.
+    An embedded method gives another element of the algebra. The error estimate is the velocity of
+    the difference of both elements at the end of the step, which costs no flow. With
+    `estimate="group"` it is the difference of the end points, for 1 flow more. `estimate=None`
+    switches it off.
 
-    `unroll` says how the stages of a step are compiled, as `scan_kind` does in diffrax: one by one
-    (True), or as one loop where the fields allow it (False), which is a shorter program. None, the
-    default, takes what measures best.
+    `unroll` says how the stages of a step are compiled, like `scan_kind` in diffrax: unrolled
+    (True), or rolled into one loop if the fields allow it (False), which is a shorter program.
+    None, the default, picks what measures best.
 
     **Raises** `ValueError` for another `estimate` or `unroll`.
     """
@@ -177,12 +178,12 @@ class RKMK(AbstractMuntheKaas, diffrax.AbstractAdaptiveSolver):
 
     Each stage but the first takes the inverse derivative of the exponential, `dexpinv` of the
     field: a closed form for `Rotation`, `QuaternionRotation`, `RigidMotion` and `PlanarMotion`,
-    otherwise a series. That of a method of order q has up to q - 2 commutators, q - 3 if q is odd
-    and above 3. A step must not make full turns, where the exponential cannot be inverted.
+    otherwise a series. The series of a method of order q has up to q - 2 commutators, or q - 3 if q
+    is odd and above 3. A step must not make a full turn, where the exponential cannot be inverted.
 
     The estimate comes at no extra cost, unless the tableau is first same as last: then it needs the
-    field at the end of the step, which is the next one's first. Dense output of order q - 1: from
-    the stages alone, with 4 evaluations more for that of `diffrax.Dopri8`.
+    field at the end of the step, which is the first field of the next step. Dense output has order
+    q - 1 and uses the stages alone; for `diffrax.Dopri8` it takes 4 evaluations more.
 
     **Arguments:** `tableau`, a `diffrax.ButcherTableau`, for example `diffrax.Dopri5.tableau`;
     `estimate`, `"algebra"`, `"group"` or None, and `unroll`, as in the other methods.
@@ -306,9 +307,10 @@ class RKMK(AbstractMuntheKaas, diffrax.AbstractAdaptiveSolver):
 class RKMK5(RKMK):
     """Munthe-Kaas method of order 5 of Tsitouras' pair 5(4): 6 evaluations, 6 flows.
 
-    `RKMK(diffrax.Tsit5.tableau)`: without commutators for a field whose `dexpinv` is a closed form,
-    otherwise with 10. The estimate takes no flow, but the field at the end of the step, which is
-    the next one's first, and for it 2 commutators. Dense output of order 4.
+    This is `RKMK(diffrax.Tsit5.tableau)`, without commutators for a field whose `dexpinv` is a
+    closed form, otherwise with 10. The estimate takes no flow, but needs the field at the end of
+    the step, which is the first field of the next step, and 2 commutators for this field. Dense
+    output of order 4.
 
     Source: Tsitouras, Runge-Kutta pairs of order 5(4) satisfying only the first column simplifying
     assumption, Comput. Math. Appl. 62 (2011), doi:10.1016/j.camwa.2011.06.002.
@@ -326,9 +328,9 @@ class RKMK5(RKMK):
 class RKMK8(RKMK):
     """Munthe-Kaas method of order 8 of Dormand and Prince's pair 8(7): 13 evaluations, 13 flows.
 
-    `RKMK(diffrax.Dopri8.tableau)`, for fields whose `dexpinv` is a closed form: of others it takes
-    72 commutators a step. The estimate comes at no extra cost. Dense output of order 7, for 4
-    evaluations and flows more.
+    This is `RKMK(diffrax.Dopri8.tableau)`, for fields whose `dexpinv` is a closed form: with other
+    fields it takes 72 commutators a step. The estimate comes at no extra cost. Dense output of
+    order 7, for 4 evaluations and flows more.
 
     Source: Prince & Dormand, High order embedded Runge-Kutta formulae, J. Comput. Appl. Math. 7
     (1981), doi:10.1016/0771-050X(81)90010-3.

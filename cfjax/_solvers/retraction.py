@@ -26,10 +26,10 @@ class CayleyRK4(AbstractChartSolver, diffrax.AbstractStratonovichSolver):
 
     Order 4, 4 evaluations. Dense output of order 3. The step from Q solves for the tangent vector V
     at Q, from V = 0, with `Y = cay(a) Q`, `a = [g, -Q] [Q, g]^T`, `g = V - Q (Q^T V) / 2` and
-    `cay(a) = (I - a / 2)^-1 (I + a / 2)`. Of the field it takes only the velocity at a point. Where
-    the state is in a linear space, this is the classical Runge-Kutta method.
+    `cay(a) = (I - a / 2)^-1 (I + a / 2)`. It uses only the velocity of the field at a point. If the
+    state is in a linear space, this is the classical Runge-Kutta method.
 
-    **Cost:** solves of sizes 2p and p, and products of size `n p^2`. Nothing of size n x n.
+    **Cost:** solves of sizes 2p and p, and products of size `n p^2`. No n x n matrix is formed.
 
     **Raises** `TypeError` for frozen fields other than `cfjax.LowRankSkew`, `cfjax.BorderedSkew`
     and `cfjax.SphereRotation`, whose points have orthonormal columns. A step so long that an

@@ -17,38 +17,38 @@ from .._control_term import is_driven
 class Richardson(diffrax.AbstractAdaptiveSolver, diffrax.AbstractWrappedSolver):
     """Any solver with an error estimate, by step doubling (Richardson extrapolation).
 
-    Every step is made twice: as one step, to `y1`, and as two halves, to `y2`. For a solver of
+    Every step is made twice: as one step, to `y1`, and as two half steps, to `y2`. For a solver of
     order p the error of `y2` is `e = (y1 - y2) / (2^p - 1)`, up to terms of higher order. The
-    solver goes on from `y2`, whose error it estimates; with `as_in_paper` from `y1`, see there. The
-    difference is taken in the ambient space: it is not a tangent vector, but on a manifold too it
-    is of order `h^(p+1)`.
+    solver continues from `y2`, whose error it estimates, or from `y1` with `as_in_paper` (see
+    below). The difference is taken in the ambient space: it is not a tangent vector, but is of
+    order `h^(p+1)` on a manifold too.
 
-    A tolerance for `e` would be one for each step, and tighter tolerances take more steps: the
-    error at the end over the tolerance would grow like `tol^(-1/(p+1))`. So the estimate is that
-    of the error which such steps add up to over the solution's own unit of time, in which one
-    step would have an error as large as the state. There are `(|y| / |e|)^(1/(p+1))` steps in it,
-    and the estimate is `e` times that many, or `e` if that is less than one. It is of order `h^p`,
-    as is the error at the end, which is then proportional to the tolerance. The norms are
-    Euclidean, of one array of the state at a time, so the estimate depends on no frame and no unit.
-    Far from its origin a state takes somewhat shorter steps than it needs: tenfold |y| is
-    `10^(1/(p+1))` times the estimate.
+    A tolerance for `e` would bound the error of each step, and tighter tolerances take more steps,
+    so the error at the end over the tolerance would grow like `tol^(-1/(p+1))`. So the estimate is
+    the error that such steps add up to over the solution's own unit of time, in which a single step
+    would have an error as large as the state. This unit has `(|y| / |e|)^(1/(p+1))` steps, and the
+    estimate is `e` times that many, or `e` if that is less than one. The estimate is of order
+    `h^p`, like the error at the end, which is then proportional to the tolerance. The norms are
+    Euclidean, of one array of the state at a time, so the estimate does not depend on frames or
+    units. A state far from its origin takes somewhat shorter steps than it needs: ten times |y|
+    gives `10^(1/(p+1))` times the estimate.
 
-    It makes adaptive steps with `diffrax.PIDController`; on compact groups use `rtol=0`. The error
-    at the end is a number of times the tolerance that depends on the problem and on how long it
-    is: for the free rigid body to t = 10 it is 3.6 to 5.5 with `CF4` at tolerances from 1e-3 to
-    1e-11.
+    It makes adaptive steps with `diffrax.PIDController`; on compact groups use `rtol=0`. The ratio
+    of the error at the end to the tolerance depends on the problem and on the length of the
+    interval: for the free rigid body to t = 10 it is 3.6 to 5.5 with `CF4` at tolerances from 1e-3
+    to 1e-11.
 
-    Costs three steps of the solver. Its first evaluation is shared, if XLA sees it.
+    A step costs three steps of the solver. The first evaluation is shared, if XLA recognises it.
 
     **Arguments:**
 
     - `solver`: a diffrax solver for ordinary differential equations, of known order. An implicit
       one solves its equations with the controller's tolerances.
-    - `as_in_paper`: whether to go on from `y1` with `e` itself, as the paper does, for its tables.
-      The estimate is then that of a point which the solver does not take: the error of a step is
-      `2^p` times as large.
+    - `as_in_paper`: whether to continue from `y1` with `e` itself as the estimate, as the paper
+      does for its tables. The estimate is then the error of a point that the solver does not use:
+      the error of a step is `2^p` times as large.
 
-    With `as_in_paper` the paper's controller is, but for one point,
+    With `as_in_paper` the paper's controller is, with one difference,
 
     ```python
     diffrax.PIDController(
@@ -57,9 +57,9 @@ class Richardson(diffrax.AbstractAdaptiveSolver, diffrax.AbstractWrappedSolver):
     ```
 
     with `max_norm` the maximum norm of the grid values. It is `h_new = 0.9 (tol / err)^(1/(p+1)) h`
-    (printed upside down in the paper), and a step is kept where `err <= tol`. The point: after a
+    (printed upside down in the paper), and a step is kept if `err <= tol`. The difference: after a
     step that was kept, diffrax never shrinks the next one. So a solver at the limit of its
-    stability has one step in eight rejected, where the paper's has hardly any.
+    stability has one step in eight rejected, and hardly any with the paper's controller.
 
     Output between steps is that of `solver` in the two half steps, or in the whole one if
     `as_in_paper`.

@@ -369,7 +369,7 @@ def _like(first: PyTree, value: PyTree) -> PyTree:
         raise TypeError(
             "The field must return frozen fields of one structure, shape and dtype at all stages "
             f"of a step, got {describe(first)} and {describe(value)}. With unroll=True the solver "
-            "takes others too."
+            "accepts other fields too."
         )
     # Only a weak type may be left over.
     return jtu.tree_map(lambda v, f: jnp.asarray(v, f.dtype), value, first)

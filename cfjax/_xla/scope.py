@@ -16,11 +16,12 @@ _is_on = jax.make_user_context(os.environ.get("CFJAX_REWRITE", "1") != "0")
 
 
 def rewriting(on: bool) -> contextlib.AbstractContextManager:
-    """Within, steps of small systems are rewritten for XLA, or not.
+    """Switches the rewriting of small systems for XLA on or off within a `with` block.
 
-    They are by default, which makes them several times faster on CPU. Without, XLA gets every
-    program as it was traced: to debug one, or where the rewriting does not pay. The values agree to
-    rounding. The environment variable `CFJAX_REWRITE=0` does the same for a whole process.
+    It is on by default, which makes steps several times faster on CPU. Without it XLA gets every
+    program as it was traced: switch it off to debug a program, or where rewriting does not pay. The
+    values agree to rounding. The environment variable `CFJAX_REWRITE=0` switches it off for a whole
+    process.
 
     ```python
     with cfjax.rewriting(False):

@@ -2,12 +2,13 @@
 
 `i psi' = H(t) psi` with `H = -(1 - s) sum_j X_j - s (sum_j Z_j Z_(j+1) + field sum_j Z_j)`, where s
 rises from 0 to 1 over the ramp. The chain is open and starts in the ground state of the transverse
-field. If the ramp is slow against the smallest gap on the way, it ends in that of the Ising
-chain, with all spins up. Energies are in units of the coupling, times in units of its inverse.
+field. If the ramp is slow compared with the smallest gap on the way, the state ends in the ground
+state of the Ising chain, with all spins up. Energies are in units of the coupling, times in units
+of its inverse.
 
 A state has shape `(2^n,)`, with the first spin as the highest bit; a bit of 0 is up. No matrix is
-formed: the X_j flip axes of a view, and the rest is a diagonal. Frozen, the field is a sum of two
-fixed operators, and the state keeps its norm.
+formed: the X_j flip axes of a view, and the other terms are a diagonal. Frozen, the field is a sum
+of two fixed operators, and the state keeps its norm.
 
 Source: Kadowaki & Nishimori, Quantum annealing in the transverse Ising model, Phys. Rev. E 58
 (1998), doi:10.1103/PhysRevE.58.5355.

@@ -1,24 +1,27 @@
 """What a radar knows of a ship: the covariance of a Kalman filter in continuous time.
 
-The ship sails in circles around the radar. Its state, shape `(4,)`, is how far position and
-velocity are off the plan. Water resists motion along the keel little and across it strongly, so
-`A = [[0, I], [0, -D]]` with a D that turns with the ship; waves push at random, with a density of
-`noise` in each direction of the acceleration, which gives Q. The radar measures range well and
-bearing badly. That is information on the position at a rate of `S = C^T R^-1 C`, which turns with
-the ship, too. The covariance P of the state, shape `(4, 4)`, obeys Riccati's equation,
+The ship sails in circles around the radar. Its state, shape `(4,)`, is the deviation of position
+and velocity from the plan. Water resists motion along the keel little and motion across it
+strongly, so `A = [[0, I], [0, -D]]` with a D that turns with the ship. Waves push the ship at
+random, with a density of `noise` in each direction of the acceleration, which gives Q. The radar
+measures range well and bearing badly. Its measurements give information on the position at a rate
+of `S = C^T R^-1 C`, which turns with the ship too. The covariance P of the state, shape `(4, 4)`,
+obeys Riccati's equation,
 
 `P' = A P + P A^T + Q - P S P`,
 
-and Lyapunov's, with S = 0, where an island hides the ship. All quantities are dimensionless.
+and Lyapunov's equation, with S = 0, while an island hides the ship. All quantities are
+dimensionless.
 
 Frozen, the field is a congruence with the source Q, `P' = a P + P a^T + Q` with `a = A - P S / 2`.
-Its flow keeps P positive definite, whatever `a` is: `exp(a) P exp(a)^T` is definite, and so is the
-integral over such with Q. A method keeps it, with steps of any size, if each of its exponentials
-has weights whose sum, which multiplies Q, is not negative: `CF3` and `CF4`, but not `CF54`.
+Its flow keeps P positive definite, whatever `a` is: `exp(a) P exp(a)^T` is definite, and the
+integral of such terms with Q is semidefinite. A method keeps P definite, with steps of any size, if
+the weights of each of its exponentials have a sum, which multiplies Q, that is not negative: `CF3`
+and `CF4` do, but not `CF54`.
 
 Joseph's form of the equation, `a = A - P S` with the source `Q + P S P`, is the linearisation and
-more accurate in long steps, but only `LieEuler` and `CF2` are safe with it: others weigh sources of
-several stages, P S P among them, with both signs.
+is more accurate in long steps, but only `LieEuler` and `CF2` are safe with it: other methods weight
+the sources of several stages, including P S P, with both signs.
 
 Source: Kalman & Bucy, New results in linear filtering and prediction theory, J. Basic Eng. 83
 (1961), doi:10.1115/1.3658902.
@@ -59,7 +62,7 @@ class Track(NamedTuple):
 
 
 def y0(deviation: float = 0.5) -> Float[np.ndarray, "4 4"]:
-    """What is known when the ship comes in sight: its position as well as that, and its speed."""
+    """The covariance when the ship comes into sight; `deviation` is that of the position."""
     return np.diag([deviation**2, deviation**2, 0.01, 0.01])
 
 
@@ -85,9 +88,9 @@ def reference(
 ) -> Float[np.ndarray, "*times 4 4"]:
     """The exact covariance at times `t` in NumPy's float64.
 
-    In axes that turn with the ship nothing depends on time. There `P = Y X^-1`, where X and Y are
-    moved by the exponential of the Hamiltonian matrix `[[-A^T, S], [Q, A]]` from I and P: in pieces
-    so short that X stays well conditioned.
+    In axes that turn with the ship nothing depends on time. In these axes `P = Y X^-1`, where the
+    exponential of the Hamiltonian matrix `[[-A^T, S], [Q, A]]` moves X and Y from I and P, in
+    pieces so short that X stays well conditioned.
     """
     from scipy.linalg import expm
 

@@ -3,8 +3,8 @@
 `u_t = (mu(x) u_x)_x` on [-1, 1] with `u(-1, t) = u(1, t) = 0`, `u(x, 0) = 1 - |x|` and
 `mu(x) = 1 - x^2`, by central differences on N intervals of width dx. All quantities are
 dimensionless. The state y has the N - 1 orthonormal sine coefficients of the grid values
-u_1..u_{N-1}, so its 2-norm is theirs. The frozen field keeps the part with constant diffusivity,
-which the sine transform diagonalises, and freezes the rest.
+u_1..u_{N-1}, so both have the same 2-norm. The frozen field keeps the part with constant
+diffusivity, which the sine transform diagonalises, and freezes the rest.
 
 Source: Celledoni, Marthinsen & Owren, Commutator-free Lie group methods, FGCS 19 (2003),
 Section 3.3, doi:10.1016/S0167-739X(02)00161-9.
@@ -93,8 +93,8 @@ def reference(
 ) -> Float[np.ndarray, "*times n"]:
     """The exact grid values of the semidiscrete system at times `t`, in NumPy's float64.
 
-    By the eigenvectors of its symmetric matrix. The error is that of the eigenvalues, a few units
-    of rounding of the largest, times t.
+    It is computed by the eigenvectors of the symmetric matrix of the system. The error is that of
+    the eigenvalues, a few units of rounding of the largest, times t.
     """
     from scipy.linalg import eigh_tridiagonal
 

@@ -7,12 +7,12 @@ momentum about that point, r and m in the fixed frame:
 
 where c is the centre of mass in the body. The third axis points upwards. Units are kg, m and s.
 
-Frozen, the field is one motion of the body, with the angular velocity omega and the velocity
+The frozen field is one motion of the body, with the angular velocity omega and the velocity
 `cross(omega, c)` of its centre of mass. Such motions leave the fixed point where it is, so there is
-no constraint that could drift. The momentum has a translation: its part about the vertical does not
-change in any method. Energy is kept to the method's order.
+no constraint that could drift. The momentum moves by a translation: no method changes its part
+about the vertical. Energy is kept to the order of the method.
 
-The numbers are those of a benchmark of multibody dynamics: a disc on a rod, which spins fast.
+The numbers are from a benchmark of multibody dynamics: a disc on a rod, which spins fast.
 
 Source: Brüls & Cardona, On the use of Lie group time integrators in multibody dynamics, J. Comput.
 Nonlinear Dyn. 5 (2010), doi:10.1115/1.4001370.
@@ -130,7 +130,7 @@ def vertical_momentum(y: State) -> Float[Array | np.ndarray, "*times"]:
 
 
 def pivot(y: State, args: Top) -> Float[Array | np.ndarray, "*times 3"]:
-    """Where the pose has that point of the body that is to be held at zero."""
+    """Where the pose puts the point of the body that should stay at zero."""
     q, x = y["pose"][..., :4], y["pose"][..., 4:]
     center = jnp.broadcast_to(jnp.asarray(args.center, q.dtype), x.shape)
     return x - quaternion_rotate(q, center, order="wxyz")
@@ -139,8 +139,8 @@ def pivot(y: State, args: Top) -> Float[Array | np.ndarray, "*times 3"]:
 def reference(t: float, start: State | None = None, args: Top = benchmark) -> State:
     """The state at time `t`, by SciPy's DOP853 in plain space, with a tolerance of 1e-13.
 
-    It has the momentum in the body's frame, where `m' = cross(m, omega) + torque`, and the centre
-    of mass from the attitude. The error for the benchmark is about 2e-12.
+    The reference uses the momentum in the body's frame, where `m' = cross(m, omega) + torque`, and
+    takes the centre of mass from the attitude. The error for the benchmark is about 2e-12.
     """
     from scipy.integrate import solve_ivp
 
@@ -163,9 +163,9 @@ def reference(t: float, start: State | None = None, args: Top = benchmark) -> St
 
 
 def error(y: State, exact: State) -> float:
-    """The distance of two states, that of momenta as a part of their length.
+    """The distance of two states, relative to their length for momenta.
 
-    The quaternion and minus it are the same attitude.
+    The quaternions q and -q are the same attitude.
     """
     pose, m = np.asarray(y["pose"]), np.asarray(y["m"])
     turned = min(np.linalg.norm(pose[:4] - s * exact["pose"][:4]) for s in (1, -1))
@@ -213,7 +213,8 @@ def chart(**options: Any) -> WorkPrecision:
 def picture() -> "Figure":
     """Tops of one spin, and the paths of their axes on the sphere, from dark to bright.
 
-    An axis that starts backwards goes in loops, from rest it has cusps, and forwards it is a wave.
+    The path of an axis that starts backwards has loops, from rest it has cusps, and forwards it is
+    a wave.
     """
     from matplotlib.figure import Figure
     from mpl_toolkits.mplot3d.art3d import Line3DCollection, Poly3DCollection

@@ -1,12 +1,13 @@
 """The Landau-Zener problem: two levels that are swept through each other.
 
 `i psi' = H(t) psi`, `H(t) = [[rate t, 2 coupling], [2 coupling, -rate t]] / 2`, with ħ = 1. Without
-the coupling the levels would cross at t = 0; with it they avoid each other by twice that. Swept
-slowly the state follows its level, and fast it stays what it is: from minus to plus infinity it
-stays with the probability `exp(-2 pi coupling^2 / rate)`.
+the coupling the levels would cross at t = 0; with it they stay apart by at least twice the
+coupling. In a slow sweep the state follows its level, and in a fast sweep the state does not
+change: from minus to plus infinity it stays the same with the probability
+`exp(-2 pi coupling^2 / rate)`.
 
-The field depends on t but not on y, and linearly. Frozen, it is a skew-Hermitian matrix, whose flow
-keeps the norm.
+The field depends on t but not on y, and it is linear in t. The frozen field is a skew-Hermitian
+matrix, whose flow keeps the norm.
 
 Source: Zener, Non-adiabatic crossing of energy levels, Proc. R. Soc. A 137 (1932),
 doi:10.1098/rspa.1932.0165.
@@ -65,12 +66,12 @@ def velocity(t: Any, y: Complex[Array, "2 *columns"], args: Sweep) -> Complex[Ar
 
 
 def staying(y: Complex[Array | np.ndarray, "*times 2"]) -> Float[Array, "*times"]:
-    """The probability to find the state of the start."""
+    """The probability of finding the initial state."""
     return jnp.square(jnp.abs(y[..., 0]))
 
 
 def limit(args: Sweep) -> Any:
-    """The probability to stay, from minus to plus infinity."""
+    """The probability of staying in the initial state, from minus to plus infinity."""
     return jnp.exp(-2 * jnp.pi * args.coupling**2 / args.rate)
 
 
@@ -85,8 +86,8 @@ def reference(
 ) -> Complex[np.ndarray, "2"]:
     """The state at time `t` of a start at `t_start`, in NumPy's complex128.
 
-    By its Taylor series, in steps within which no phase grows by more than about one. The error is
-    some roundings for every step.
+    It is computed by a Taylor series, in steps within which no phase grows by more than about one.
+    The error is a few units of rounding for every step.
     """
     y = y0() if start is None else np.asarray(start)
     longest = max(abs(t), abs(t_start)) * abs(args.rate) / 2 + abs(args.coupling)

@@ -64,10 +64,11 @@ def reference(
 ) -> Float[np.ndarray, "*times 3"]:
     """The exact solution at times `t`, in NumPy's float64.
 
-    Jacobi elliptic functions: the body turns about the axis of largest inertia, the first one,
-    where y_1 > 0 keeps its sign. So `inertia` must fall, and `y0` be on that side of the middle
-    axis: `y0 @ y0 >= inertia[1] * (y0 / inertia) @ y0`. The error is below 1e-14 for `|t| <= 100`
-    and the default start. Source: Landau & Lifshitz, Mechanics, Section 37.
+    It uses Jacobi elliptic functions: the body turns about the axis of largest inertia, the first
+    one, where y_1 > 0 keeps its sign. So the entries of `inertia` must be in falling order, and
+    `y0` must be on that side of the middle axis: `y0 @ y0 >= inertia[1] * (y0 / inertia) @ y0`. The
+    error is below 1e-14 for `|t| <= 100` and the default start. Source: Landau & Lifshitz,
+    Mechanics, Section 37.
     """
     # Not at import: few who import the package need it.
     from scipy.special import ellipj, ellipkinc
@@ -120,7 +121,8 @@ def chart(**options: Any) -> WorkPrecision:
 def picture() -> "Figure":
     """The paths of the momentum on its sphere, and the energy, which methods keep to their order.
 
-    About the axes of least and of largest inertia the body turns stably, about the middle one not.
+    The body turns stably about the axes of least and of largest inertia, but not about the middle
+    one.
     """
     from matplotlib.figure import Figure
 

@@ -5,8 +5,8 @@ the axis of middle inertia, about which no body turns stably: it tumbles over an
 racket theorem). Without torque the momentum in the fixed frame and the energy are constant. All
 quantities are dimensionless.
 
-Frozen, the field rotates the quaternion, and moves the momentum as a rigid motion moves a point:
-its length changes by the torque alone.
+The frozen field rotates the quaternion, and moves the momentum as a rigid motion moves a point, so
+only the torque changes its length.
 
 Source: Landau & Lifshitz, Mechanics, Sections 35 to 37.
 """
@@ -93,8 +93,9 @@ def fixed_momentum(y: State) -> Float[Array, "*times 3"]:
 def reference(t: float | Float[np.ndarray, "*times"]) -> State:
     """The exact free motion from `y0()` at times `t`, in NumPy's float64.
 
-    The momentum in the body is made of Jacobi's elliptic functions. The axes of the body follow
-    from it but for an angle about the fixed momentum, which is an integral, by Gauss's rule.
+    Jacobi's elliptic functions give the momentum in the body. The momentum determines the axes of
+    the body except for an angle about the fixed momentum, which is an integral, computed by Gauss's
+    rule.
     """
     start = np.asarray(y0()["m"])
     times = np.asarray(t, float)

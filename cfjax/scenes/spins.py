@@ -30,7 +30,7 @@ Spins = Float[Array | np.ndarray, "*sides 3"]
 
 
 class Magnet(NamedTuple):
-    """What the energy is made of, and how fast it falls."""
+    """The terms of the energy, and the damping."""
 
     exchange: Any = 1.0
     anisotropy: Any = 0.2
@@ -72,8 +72,9 @@ def macrospin(
 ) -> Float[np.ndarray, "*times 3"]:
     """The exact motion of a single spin in an applied field along z, without anisotropy.
 
-    It turns about the field and falls towards it: with h' = h / (1 + damping^2) the azimuth grows
-    by `h' t`, and `tan(theta / 2)` falls by `exp(-damping h' t)`. In NumPy's float64.
+    The spin turns about the field and falls towards it: with h' = h / (1 + damping^2) the azimuth
+    grows by `h' t`, and `tan(theta / 2)` falls by the factor `exp(-damping h' t)`. Computed in
+    NumPy's float64.
     """
     rate = args.applied[2] / (1 + args.damping**2) * np.asarray(t, float)
     # tan(theta / 2), from the smaller of the two sides.

@@ -92,8 +92,8 @@ def second(t: Any, y: Float[Array, "n p"], args: Any = None) -> BorderedSkew:
 def reference(problem: str, n: int, p: int = 4) -> Float[np.ndarray, "n p"]:
     """`Y(1)` of the problem, "first" or "second", in NumPy's float64.
 
-    DOP853 on the equation in the space of all matrices, at the tightest tolerance SciPy takes. The
-    error is about 1e-13. Takes some tenths of a second for n = 1000.
+    It is computed by DOP853 in the space of all matrices, at the tightest tolerance that SciPy
+    accepts. The error is about 1e-13. It takes some tenths of a second for n = 1000.
     """
     # Not at import: few who import the package need it.
     from scipy.integrate import solve_ivp

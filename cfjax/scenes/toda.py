@@ -2,12 +2,12 @@
 
 With the energy `sum p_k^2 / 2 + sum exp(q_k - q_(k+1))` and free ends, take the symmetric
 tridiagonal matrix L with `-p_k / 2` on the diagonal and `exp((q_k - q_(k+1)) / 2) / 2` beside it.
-Then `L' = B L - L B`, where B is the part of L above the diagonal less that below. The eigenvalues
-of L do not change. As time goes on the particles part, and L becomes diagonal, with its eigenvalues
-in falling order. All quantities are dimensionless.
+Then `L' = B L - L B`, where B is the part of L above the diagonal minus the part below. The
+eigenvalues of L do not change. As time goes on the particles move apart, and L becomes diagonal,
+with its eigenvalues in falling order. All quantities are dimensionless.
 
-The equation moves any symmetric matrix like that. Frozen, it is a conjugation, which keeps the
-eigenvalues. A method leaves the tridiagonal matrices by its error.
+The equation moves any symmetric matrix in this way. The frozen field is a conjugation, which keeps
+the eigenvalues. The solution leaves the tridiagonal matrices by the error of the method.
 
 Source: Flaschka, The Toda lattice. II. Existence of integrals, Phys. Rev. B 9 (1974),
 doi:10.1103/PhysRevB.9.1924; Calvo, Iserles & Zanna, Numerical solution of isospectral flows, Math.
@@ -46,7 +46,7 @@ momenta = np.array([2.0, 1.0, 0.2, -0.8, -1.8])
 
 
 def y0() -> Float[np.ndarray, "5 5"]:
-    """The matrix of five particles that run into each other."""
+    """The matrix of five particles that collide."""
     return matrix(positions, momenta)
 
 
@@ -75,9 +75,9 @@ def energy(y: Float[Array | np.ndarray, "*times n n"]) -> Float[Array, "*times"]
 def reference(t: float, start: Float[np.ndarray, "n n"] | None = None) -> Float[np.ndarray, "n n"]:
     """The exact solution at time `t`, in NumPy's float64.
 
-    With the factors `exp(t L) = Q R` of the start it is `Q^T L Q`. It is taken in pieces in which
-    the exponential has a condition of at most e: of the whole, small columns would be rounding. The
-    error is some units of rounding for every piece.
+    With the factors `exp(t L) = Q R` of the start it is `Q^T L Q`. The time is split into pieces in
+    which the condition number of the exponential is at most e: over the whole time, small columns
+    would be lost to rounding. The error is a few units of rounding for every piece.
     """
     y = y0() if start is None else start
     values = np.linalg.eigvalsh(y)
@@ -95,9 +95,10 @@ def reference(t: float, start: Float[np.ndarray, "n n"] | None = None) -> Float[
 def particles(
     y: Float[Array | np.ndarray, "*times n n"], center: float | Float[np.ndarray, "*times"]
 ) -> Float[np.ndarray, "*times n"]:
-    """The positions of the particles, from where their centre of mass is.
+    """The positions of the particles, relative to their centre of mass.
 
-    Beyond a distance of about 50 the numbers beside the diagonal drown in the method's error.
+    Beyond a distance of about 50 the numbers beside the diagonal are smaller than the error of the
+    method.
     """
     beside = np.diagonal(np.asarray(y), 1, -2, -1)
     q = np.cumsum(-2 * np.log(2 * np.abs(beside)), axis=-1)
@@ -136,7 +137,7 @@ def chart(**options: Any) -> WorkPrecision:
 
 
 def picture() -> "Figure":
-    """Where particles go that run into each other, and the matrix that becomes diagonal."""
+    """The paths of particles that collide, and the matrix that becomes diagonal."""
     from matplotlib.figure import Figure
 
     n, end = 100, 14.0

@@ -11,12 +11,13 @@ lowest levels, within an envelope of two parts:
 `in_phase(t) = sum_k x_k (1 - cos(2 pi k t / duration))`,
 `quadrature(t) = sum_k y_k sin(2 pi k t / duration)`, both in rad/ns, with k = 1, 2, ..
 
-So the pulse begins and ends with zero. It is to swap the two lowest levels. What makes that hard is
-the third level, whose distance from the second is nearly the same: a short pulse reaches it too. A
-quadrature in proportion to the slope of the in-phase part mends most of it.
+So the pulse begins and ends at zero. It should swap the two lowest levels. The third level makes
+this hard, as its distance from the second is nearly the same: a short pulse reaches it too. A
+quadrature proportional to the slope of the in-phase part corrects most of this loss.
 
-The field depends on t but not on y. Frozen, it is a skew-Hermitian matrix, whose flow keeps a
-propagator unitary and a state's norm. Nothing is averaged: the drive has its fast oscillation.
+The field depends on t but not on y. The frozen field is a skew-Hermitian matrix, whose flow keeps a
+propagator unitary and the norm of a state. Nothing is averaged: the drive keeps its fast
+oscillation.
 
 Source: Motzoi, Gambetta, Rebentrost & Wilhelm, Simple pulses for elimination of leakage in weakly
 nonlinear qubits, Phys. Rev. Lett. 103 (2009), doi:10.1103/PhysRevLett.103.110501.
@@ -114,7 +115,8 @@ def envelope(t: Any, args: Pulse) -> tuple[Float[Array, "*times"], Float[Array, 
 def infidelity(y: Complex[Array | np.ndarray, "levels levels"], args: Pulse) -> Float[Array, ""]:
     """One less the mean fidelity of a propagator as a swap, over all states of two levels.
 
-    In the frame that turns with the drive. What has gone to higher levels counts as lost.
+    It is computed in the frame that turns with the drive. Population in higher levels counts as
+    lost.
 
     Source: Pedersen, Moller & Molmer, Fidelity of quantum operations, Phys. Lett. A 367 (2007),
     doi:10.1016/j.physleta.2007.02.069.
@@ -129,7 +131,8 @@ def infidelity(y: Complex[Array | np.ndarray, "levels levels"], args: Pulse) -> 
 def reference(args: Pulse, levels: int = 4) -> Complex[np.ndarray, "levels levels"]:
     """The propagator at the end, by SciPy's DOP853 with a tolerance of 1e-13.
 
-    In a frame in which the levels rest, so that steps are longer and none of this file's is used.
+    It is solved in a frame in which the levels rest, so that steps are longer and no code of this
+    file is used.
     """
     from scipy.integrate import solve_ivp
 

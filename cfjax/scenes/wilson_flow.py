@@ -1,9 +1,9 @@
 """The Wilson flow of lattice gauge theory: SU(3) links that move down the gradient of the action.
 
-`V' = Z(V) V` for each link, where Z is the traceless skew-Hermitian part of minus the link times
+Each link obeys `V' = Z(V) V`, where Z is the traceless skew-Hermitian part of minus the link times
 the sum of its staples. The action, which counts every plaquette once,
-`S = sum_x sum_(mu < nu) Re tr(1 - P_mu_nu(x))`, never rises: the fields become smooth. Times are in
-squares of the lattice spacing. Frozen, the field is a left action on each link.
+`S = sum_x sum_(mu < nu) Re tr(1 - P_mu_nu(x))`, never rises, and the fields become smooth. Times
+are in squares of the lattice spacing. The frozen field is a left action on each link.
 
 A state has shape `(d, *sides, 3, 3)`: a periodic lattice of d axes with the links of each.
 

@@ -1,8 +1,8 @@
 """Euler's equations of an ideal fluid on the sphere, with vorticity as a Hermitian matrix.
 
 On the sphere `w_t = -{psi, w}`, where w is the vorticity and psi the stream function, with
-`laplacian psi = w`. Here spin matrices S_1, S_2, S_3 of size N take the place of the coordinates,
-matrices W and P that of w and psi, and a commutator that of the bracket:
+`laplacian psi = w`. Here spin matrices S_1, S_2, S_3 of size N replace the coordinates, matrices W
+and P replace w and psi, and a commutator replaces the bracket:
 
 `W' = 1j / h (P W - W P)`, with `-sum_k [S_k, [S_k, P]] = W` and `h = 2 / sqrt(N^2 - 1)`.
 
@@ -10,9 +10,9 @@ The Laplacian has the right eigenvalues -l (l + 1) for l = 1 .. N - 1, and its e
 matrices for the spherical harmonics. The coordinates themselves are `h S_k`. The radius is one, and
 energies are means over the sphere. All quantities are dimensionless.
 
-Frozen, the field is a conjugation by a unitary matrix. So all eigenvalues of W are kept to
-rounding, N quantities that stand for the areas where the vorticity has this or that value. Energy
-and angular momentum are kept to the method's order.
+The frozen field is a conjugation by a unitary matrix. So all N eigenvalues of W are kept to
+rounding. They stand for the areas on which the vorticity has each value. Energy and angular
+momentum are kept to the order of the method.
 
 Source: Hoppe & Yau, Some properties of matrix harmonics on S^2, Commun. Math. Phys. 195 (1998),
 67-77; Zeitlin, Self-consistent finite-mode approximations for the hydrodynamics of an

@@ -470,8 +470,8 @@ def test_progress_is_reported():
 @pytest.mark.parametrize(
     "change, message",
     [
-        (dict(num_steps=None), "one of num_steps and tolerances"),
-        (dict(tolerances=[1e-3]), "one of num_steps and tolerances"),
+        (dict(num_steps=None), "either num_steps or tolerances"),
+        (dict(tolerances=[1e-3]), "either num_steps or tolerances"),
         (dict(num_steps=[]), "at least one entry"),
         (dict(num_steps=[0]), "num_steps must be an integer of at least 1"),
         (dict(num_steps=None, tolerances=[0.0]), "tolerances must be positive"),
