@@ -111,6 +111,12 @@ def checked(field: PyTree, y: PyTree) -> PyTree:
 
     **Raises** `TypeError` or `ValueError` that names the part of the state.
     """
+    if field is None:
+        raise ValueError(
+            "The field of a term must return one field for each part of the state, got None. Has "
+            "its function a return? A part at rest is None where the state has parts, and zero "
+            "otherwise."
+        )
     is_part = lambda x: x is None or is_field(x)  # noqa: E731
     parts, treedef = jtu.tree_flatten_with_path(field, is_leaf=is_part)
     try:

@@ -108,7 +108,7 @@ DEFECTS = [
         "methods/test_magnus.py",
     ),
     Defect(
-        "_solvers/magnus.py",
+        "_solvers/dependence.py",
         "to_chart(frozen, y, ())[0]",
         "frozen",
         "a Magnus method that takes fields frozen at the state",

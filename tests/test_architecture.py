@@ -23,6 +23,8 @@ ROWS = [
     {"_field"},
     # Its term for diffrax; functions of arrays.
     {"_term", "_numerics"},
+    # A term that a path drives.
+    {"_control_term"},
     # Fields, and coefficients of methods.
     {"_fields", "_methods"},
     {"_solvers"},

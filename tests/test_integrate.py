@@ -718,7 +718,7 @@ def test_a_solver_that_is_none(solver):
         (lambda t, y, args: y.astype(jnp.float32), r"f32\[3\].*f64\[3\]"),
         (lambda t, y, args: {"a": y}, "prefix of the state"),
         (lambda t, y, args: cfjax.LeftMatrix(jnp.eye(4)), r"LeftMatrix.*f64\[3\]"),
-        (lambda t, y, args: None, "structure"),
+        (lambda t, y, args: None, "got None"),
         (lambda t, y, args: "y", "frozen field"),
     ],
 )

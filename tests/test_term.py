@@ -61,8 +61,7 @@ PAIR = {"q": V3, "p": (V3, V3)}
         ({"q": V3, "r": (V3, V3)}, PAIR, "prefix"),
         ({"q": V3, "p": [V3, V3]}, PAIR, "prefix"),
         ({"q": V3, "p": (V3, V3, V3)}, PAIR, "prefix"),
-        ({"q": V3, "p": None}, PAIR, "prefix"),
-        (None, V3, "prefix"),
+        (None, V3, "got None"),
         ([1.0, 2.0, 3.0], V3, "prefix"),
         # Translations.
         ({"q": V3, "p": (V3, V3[:2])}, PAIR, r"y\['p'\]\[1\]"),

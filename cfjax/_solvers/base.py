@@ -151,21 +151,11 @@ class AbstractChartSolver(AbstractLieSolver):
         return y1, error, dense_info, solver_state, result
 
     def _step(self, terms, t0, t1, y0, args, solver_state, made_jump):
-        compensation, first = solver_state.compensation, solver_state.first
-        if solver_state.zero is not None:
-            # Of a weak type, if the time is.
-            t0 = jnp.where(solver_state.zero == 0, t0, jnp.nan)
-        if first is not None and made_jump is not False:
-            first = select(made_jump, lambda: terms.vf(t0, y0, args), first)
+        compensation = solver_state.compensation
+        t0, first = begun(solver_state, t0, lambda t0: terms.vf(t0, y0, args), made_jump)
 
         def evaluate(c: float | Real[Array, ""], y: PyTree) -> PyTree:
-            # The end of the step exactly, not up to rounding: the field may jump there.
-            if isinstance(c, float):
-                t = t1 if c == 1 else t0 + c * (t1 - t0)
-            else:
-                c = jnp.asarray(c, jnp.result_type(t0))
-                t = jnp.where(c == 1, t1, t0 + c * (t1 - t0))
-            return materialised_in_rows(terms.vf(t, y, args))
+            return materialised_in_rows(terms.vf(time_at(c, t0, t1), y, args))
 
         def stepped(y0):
             control = control_of(terms, t0, t1)
@@ -192,11 +182,9 @@ class AbstractChartSolver(AbstractLieSolver):
                 last = values[-1]
             return (end, last), (error, step.path)
 
-        (end, last), (error, path) = scalarised(stepped, y0)
+        y1, (error, path), state, result = ended(solver_state, stepped, y0)
         path = self.extended(path, lambda c, y: product(terms, evaluate(c, y), terms.contr(t0, t1)))
-        y1, compensation = added(y0, end, compensation)
-        state = State(compensation, last, solver_state.zero)
-        return y1, error, dict(path=path), state, result_of(y1)
+        return y1, error, dict(path=path), state, result
 
 
 class Step(eqx.Module):
@@ -219,6 +207,24 @@ def control_of(terms: diffrax.AbstractTerm, t0: Any, t1: Any, **kwargs: Any) -> 
     return lax.optimization_barrier(control) if is_alone else control
 
 
+def by_turns(
+    body: Callable[[PyTree, Any], tuple[PyTree, PyTree]], carry: PyTree, turns: Sequence[Any]
+) -> tuple[PyTree, list[PyTree]]:
+    """What `jax.lax.scan` makes of some turns, with the outputs of each; two or more in one loop.
+
+    Not where the step is rewritten for XLA, which a loop within it would prevent.
+    """
+    outputs = []
+    if is_rewritten() or len(turns) == 1:
+        for turn in turns:
+            carry, output = body(carry, turn)
+            outputs.append(output)
+        return carry, outputs
+    many = jtu.tree_map(lambda *xs: jnp.asarray(xs), *turns)
+    carry, stacked = lax.scan(body, carry, many)
+    return carry, [jtu.tree_map(lambda x: x[k], stacked) for k in range(len(turns))]  # noqa: B023
+
+
 def check_choice(name: str, value: Any, *choices: Any) -> None:
     """Raises `ValueError` unless the value is one of the choices."""
     if not any(value is x or (isinstance(x, str) and value == x) for x in choices):
@@ -238,10 +244,40 @@ def result_of(y: PyTree) -> diffrax.RESULTS:
     return diffrax.RESULTS.where(is_finite(y), diffrax.RESULTS.successful, nonfinite)
 
 
-def select(made_jump: Any, anew: Callable[[], PyTree], kept: PyTree) -> PyTree:
+def time_at(c: float | Real[Array, ""], t0: Any, t1: Any) -> Any:
+    """The time at a part c of the step, at its end exactly: the field may jump there."""
+    if isinstance(c, float):
+        return t1 if c == 1 else t0 + c * (t1 - t0)
+    c = jnp.asarray(c, jnp.result_type(t0))
+    return jnp.where(c == 1, t1, t0 + c * (t1 - t0))
+
+
+def begun(
+    solver_state: "State", t0: Any, evaluate: Callable[[Any], PyTree], made_jump: Any
+) -> tuple[Any, PyTree]:
+    """The time of a step, NaN if the start was wrong, and the field there if that is known."""
+    first = solver_state.first
+    if solver_state.zero is not None:
+        # Of a weak type, if the time is.
+        t0 = jnp.where(solver_state.zero == 0, t0, jnp.nan)
+    if first is None or made_jump is False:
+        return t0, first
     if made_jump is True:
-        return anew()
-    return lax.cond(made_jump, anew, lambda: kept)
+        return t0, evaluate(t0)
+    return t0, lax.cond(made_jump, evaluate, lambda _: first, t0)
+
+
+def ended(
+    solver_state: "State", stepped: Callable[[PyTree], Any], y0: PyTree
+) -> tuple[PyTree, Any, "State", diffrax.RESULTS]:
+    """The state after a step, what else the step makes, the solver's state, and the result.
+
+    `stepped(y0)` is a pair of pairs: of the end, an increment where the state is a compensated sum,
+    with the field that the next step begins with or None; and of what else there is.
+    """
+    (end, first), rest = scalarised(stepped, y0)
+    y1, compensation = added(y0, end, solver_state.compensation)
+    return y1, rest, State(compensation, first, solver_state.zero), result_of(y1)
 
 
 class State(eqx.Module):

@@ -6,6 +6,7 @@ normal of variance h/12 and independent of W. So a method is rows of numbers (a,
 """
 
 import abc
+import itertools
 from collections.abc import Sequence
 from math import sqrt
 from typing import Any, ClassVar, NamedTuple
@@ -15,12 +16,10 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 import jax.tree_util as jtu
-from jax import lax
 from jaxtyping import PyTree
 
 from .._term import product
-from .._xla import is_rewritten
-from .base import AbstractChartSolver, AbstractLieSolver, control_of, result_of
+from .base import AbstractChartSolver, AbstractLieSolver, by_turns, control_of, result_of, time_at
 from .commutator_free import CF4, LieEuler
 from .dense import Path
 from .dependence import depending_on_state
@@ -103,32 +102,24 @@ class AbstractPieces(AbstractLieSolver, diffrax.AbstractStratonovichSolver):
     def step(self, terms, t0, t1, y0, args, solver_state, made_jump):
         control = control_of(terms, t0, t1, use_levy=True)
         is_constant = _is_constant(terms, t0, t1, y0, args)
-        ends = [sum(a for a, *_ in self.rows[:k]) for k in range(len(self.rows))]
-        pieces = [_Piece(*row, start) for row, start in zip(self.rows, ends, strict=True)]
-        solvers = [self.solver_of(piece, is_constant) for piece in pieces]
+        before = itertools.accumulate((a for a, *_ in self.rows), initial=0.0)
+        pieces = [_Piece(*row, start) for row, start in zip(self.rows, before, strict=False)]
 
-        def follow(solver: AbstractChartSolver, piece: _Piece, y: PyTree, state: PyTree) -> Any:
-            start, end = (
-                # The ends of the step exactly, not up to rounding.
-                jnp.where(jnp.equal(c, 1), t1, t0 + jnp.asarray(c, jnp.result_type(t0)) * (t1 - t0))
-                for c in (piece.start, piece.start + piece.time)
-            )
-            y, _, dense_info, state, _ = solver.step(
-                _along(terms, control, piece), start, end, y, args, state, False
-            )
-            return (y, state), dense_info["path"]
+        def kind(piece: _Piece) -> tuple[AbstractChartSolver, bool]:
+            return self.solver_of(piece, is_constant), piece.time > 0
 
-        carry = y0, solver_state
-        if is_rewritten() or any(x != solvers[0] for x in solvers) or not all(ends[1:]):
-            paths = []
-            for solver, piece in zip(solvers, pieces, strict=True):
-                carry, path = follow(solver, piece, *carry)
-                paths.append(path)
-        else:
-            # A program of half the length.
-            rows = _Piece(*map(jnp.asarray, zip(*pieces, strict=True)))
-            carry, many = lax.scan(lambda carry, x: follow(solvers[0], x, *carry), carry, rows)
-            paths = [jtu.tree_map(lambda x: x[k], many) for k in range(len(pieces))]  # noqa: B023
+        carry, paths = (y0, solver_state), []
+        for (solver, _), alike in itertools.groupby(pieces, kind):
+
+            def follow(carry: Any, piece: _Piece, solver: AbstractChartSolver = solver) -> Any:
+                y, state = carry
+                start, end = (time_at(c, t0, t1) for c in (piece.start, piece.start + piece.time))
+                along = _along(terms, control, piece)
+                y, _, dense_info, state, _ = solver.step(along, start, end, y, args, state, False)
+                return (y, state), dense_info["path"]
+
+            carry, more = by_turns(follow, carry, list(alike))
+            paths += more
         y1, state = carry
         return y1, None, dict(paths=paths), state, result_of(y1)
 

@@ -1,5 +1,6 @@
 """Splitting: flows of the terms of a sum by turns, each of which is exact."""
 
+import itertools
 from collections.abc import Sequence
 from typing import Any, ClassVar, NamedTuple
 
@@ -8,25 +9,25 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 import jax.tree_util as jtu
-from jax import lax
 from jaxtyping import Array, PyTree
 
 from .._control_term import is_driven
 from .._field import Rest, combine, from_chart, is_field, to_chart
 from .._methods.splitting import BLANES_MOAN_4, BLANES_MOAN_6, STRANG, splitting_order
 from .._term import product
-from .._xla import scalarised
 from .base import (
     AbstractLieSolver,
     State,
+    begun,
+    by_turns,
     control_of,
+    ended,
     fault_of_start,
-    result_of,
-    select,
     shared_end,
+    time_at,
 )
 from .chart import carried
-from .compensation import added, at, no_compensation, with_sums
+from .compensation import at, no_compensation, with_sums
 from .dependence import depending_on_time
 
 
@@ -37,8 +38,8 @@ class _Replay(diffrax.AbstractLocalInterpolation):
     t1: Any
     start: PyTree
     first: PyTree
-    # Along the first axis those of all pairs of stages.
-    later: tuple[PyTree, ...]
+    # Those of each pair of stages.
+    later: list[tuple[PyTree, ...]]
 
     def evaluate(self, t0: Any, t1: Any = None, left: bool = True) -> PyTree:
         """The solution at time `t0`, or what is added to it from `t0` to `t1`."""
@@ -51,13 +52,10 @@ class _Replay(diffrax.AbstractLocalInterpolation):
             # A solve from a time to the same time makes no step, and asks for its end.
             theta = (t0 - self.t0) / jnp.where(length == 0, 1, length)
 
-        def turn(y: PyTree, fields: tuple[PyTree, ...]) -> tuple[PyTree, None]:
-            for field in fields:
-                y = _flow(combine((theta,), (field,)), y)
-            return y, None
-
-        y, _ = turn(self.start, (self.first,))
-        return lax.scan(turn, y, self.later)[0]
+        y = self.start
+        for field in (self.first, *itertools.chain(*self.later)):
+            y = _flow(combine((theta,), (field,)), y)
+        return y
 
 
 def _flow(field: PyTree, y: PyTree) -> PyTree:
@@ -109,21 +107,13 @@ class AbstractSplitting(AbstractLieSolver, diffrax.AbstractStratonovichSolver):
         return State(_no_compensation(found, y0), first, None), fault
 
     def step(self, terms, t0, t1, y0, args, solver_state, made_jump):
-        parts, controls = terms.terms, control_of(terms, t0, t1)
-        first, compensation = solver_state.first, solver_state.compensation
-        if solver_state.zero is not None:
-            # Of a weak type, if the time is.
-            t0 = jnp.where(solver_state.zero == 0, t0, jnp.nan)
-        if made_jump is not False:
-            first = select(made_jump, lambda: parts[0].vf(t0, y0, args), first)
-
-        def time(c: Any) -> Array:
-            c = jnp.asarray(c, jnp.result_type(t0))
-            return jnp.where(c == 1, t1, t0 + c * (t1 - t0))
+        parts, compensation = terms.terms, solver_state.compensation
+        t0, known = begun(solver_state, t0, lambda t0: parts[0].vf(t0, y0, args), made_jump)
+        controls = control_of(terms, t0, t1)
 
         def stepped(y0: PyTree) -> Any:
             def value(k: int, c: Any, z: PyTree) -> PyTree:
-                return parts[k].vf(time(c), at(y0, z, compensation), args)
+                return parts[k].vf(time_at(c, t0, t1), at(y0, z, compensation), args)
 
             def apply_flow(k: int, value: PyTree, s: Any, z: PyTree) -> tuple[PyTree, PyTree]:
                 field = product(parts[k], value, _scaled(s, controls[k]))
@@ -143,21 +133,13 @@ class AbstractSplitting(AbstractLieSolver, diffrax.AbstractStratonovichSolver):
                 return (z, new), (*fields, field)
 
             start = with_sums(lambda c, y: y if c is None else jnp.zeros_like(y), compensation, y0)
-            field, z = apply_flow(0, first, self.stages[0], start)
-            pairs = _pairs(self.stages)
-            if len(pairs) == 1:
-                carry, later = pair((z, first), pairs[0])
-                later = jtu.tree_map(lambda x: jnp.asarray(x)[None], later)
-            else:
-                many = _Pair(*map(jnp.asarray, zip(*pairs, strict=True)))
-                carry, later = lax.scan(pair, (z, first), many)
-            return carry, (field, later)
+            field, z = apply_flow(0, known, self.stages[0], start)
+            (z, first), later = by_turns(pair, (z, known), _pairs(self.stages))
+            end, _ = shared_end(compensation, z, None, is_followed=True)
+            return (end, first), (field, later)
 
-        (end, first), (field, later) = scalarised(stepped, y0)
-        end, _ = shared_end(compensation, end, None, is_followed=True)
-        y1, compensation = added(y0, end, compensation)
-        state = State(compensation, first, solver_state.zero)
-        return y1, None, dict(start=y0, first=field, later=later), state, result_of(y1)
+        y1, (field, later), state, result = ended(solver_state, stepped, y0)
+        return y1, None, dict(start=y0, first=field, later=later), state, result
 
 
 class Splitting(AbstractSplitting):
