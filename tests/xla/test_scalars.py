@@ -426,6 +426,19 @@ def test_jacobians_and_hessians(n):
         np.testing.assert_allclose(got, hessian, rtol=0, atol=1e-13)
 
 
+@pytest.mark.parametrize("fun", [jnp.sqrt, jnp.log, lambda y: 1 / y])
+@pytest.mark.parametrize("first", [jax.jacfwd, jax.jacrev])
+def test_entries_without_use_are_not_singular_in_second_derivatives(fun, first):
+    """A root of all entries, of which one is used: the others must be what they are, not zero."""
+    y = jnp.asarray([0.4, 0.9, 1.6])
+    f = lambda y: jnp.concatenate([fun(y)[1:2], y])  # noqa: E731
+    got = jax.jit(jax.jacfwd(first(whole(f))))(y)
+    want = np.zeros((4, 3, 3))
+    want[0, 1, 1] = jax.grad(jax.grad(fun))(0.9)
+    # One operation of size 3.
+    np.testing.assert_allclose(got, want, rtol=1e-15)
+
+
 def test_custom_vmap_rule_is_kept():
     fun = lambda y: odd_vmap(y) + y  # noqa: E731
     batch = jnp.stack([jnp.asarray(Y), jnp.asarray(W)])
