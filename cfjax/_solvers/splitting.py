@@ -97,14 +97,18 @@ class AbstractSplitting(AbstractLieSolver, diffrax.AbstractStratonovichSolver):
                 "while it acts: take another one as the last, or add one that returns None."
             )
 
-        def fields(y0: PyTree) -> list[PyTree]:
+        def at_start(y0: PyTree) -> tuple[list[PyTree], PyTree]:
             parts = zip(terms.terms, control, strict=True)
-            return [product(term, term.vf(t0, y0, args), x) for term, x in parts]
+            fields = [product(term, term.vf(t0, y0, args), x) for term, x in parts]
+            return fields, _no_compensation(fields, y0)
 
-        found = eqx.filter_eval_shape(fields, y0)
+        fields, compensation = eqx.filter_eval_shape(at_start, y0)
+        # Like the state, which may be spread over a mesh.
+        compensation = with_sums(
+            lambda c, y: None if c is None else jnp.zeros_like(y), compensation, y0
+        )
         first = terms.terms[0].vf(t0, y0, args)
-        fault = fault_of_start(t0, t1, found, y0)
-        return State(_no_compensation(found, y0), first, None), fault
+        return State(compensation, first, None), fault_of_start(t0, t1, fields, y0)
 
     def step(self, terms, t0, t1, y0, args, solver_state, made_jump):
         parts, compensation = terms.terms, solver_state.compensation
