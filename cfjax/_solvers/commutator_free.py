@@ -202,9 +202,21 @@ class CommutatorFree(
         if not isinstance(self.tableau, Tableau):
             raise TypeError(f"tableau must be a cfjax.Tableau, got {self.tableau!r}.")
 
+    def for_terms(self, terms):
+        if is_driven(terms) and self.order(terms) < 2:
+            raise TypeError(
+                "CommutatorFree takes noise in the sense of Stratonovich, for which its tableau "
+                "must have order 2 or more. Of order 1 is cfjax.LieEuler, in the sense of Itô."
+            )
+        return super().for_terms(terms)
+
 
 class LieEuler(AbstractCommutatorFree, diffrax.AbstractItoSolver):
-    """The exponential Euler step. Order 1, 1 evaluation, 1 flow. Dense output of order 1."""
+    """The exponential Euler step. Order 1, 1 evaluation, 1 flow. Dense output of order 1.
+
+    Noise is in the sense of Itô in the frame: the coefficients of the fields are taken before the
+    increment. In a linear space that is Itô's equation.
+    """
 
     tableau: ClassVar[Tableau] = _tableau.LIE_EULER
 
