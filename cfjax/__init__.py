@@ -99,6 +99,7 @@ if TYPE_CHECKING:
     from ._solvers.splitting import Splitting as Splitting
     from ._solvers.splitting import Strang as Strang
     from ._testing import check_field as check_field
+    from ._testing import check_terms as check_terms
 
 __version__ = "0.2.0"
 
@@ -106,7 +107,7 @@ __version__ = "0.2.0"
 # coefficients takes longer than all the rest of this import.
 _NAMES_LATER = {
     "_fields.affine": ("Affine",),
-    "_testing": ("check_field",),
+    "_testing": ("check_field", "check_terms"),
     "_fields.conjugation": ("Congruence", "Conjugation"),
     "_fields.linear_affine": ("LinearAffine",),
     "_fields.low_rank": ("BorderedSkew", "LowRankSkew"),

@@ -1,9 +1,10 @@
-"""Whether frozen fields keep what `AbstractFrozenField` promises, by numbers."""
+"""Whether frozen fields, and terms of a sum, are what the methods assume, by numbers."""
 
 from collections.abc import Sequence
 from operator import itemgetter
 from typing import Any
 
+import diffrax
 import equinox as eqx
 import jax
 import jax.numpy as jnp
@@ -12,8 +13,17 @@ import numpy as np
 from jax import lax
 from jaxtyping import PyTree
 
-from ._field import AbstractAlgebraElement, AbstractFrozenField, combine, describe, flow
-from ._term import checked_part
+from ._control_term import is_driven
+from ._field import (
+    AbstractAlgebraElement,
+    AbstractFrozenField,
+    combine,
+    describe,
+    flow,
+    from_chart,
+    to_chart,
+)
+from ._term import checked_part, product
 
 # What is compared: the text of the promise, what was found, what is expected, and a size whose
 # rounding the difference may have.
@@ -72,6 +82,49 @@ def check_field(fields: Sequence[AbstractFrozenField], point: PyTree) -> None:
     _compare(name, _of_sum(fields, entered, start), unit)
     if all(isinstance(field, AbstractAlgebraElement) for field in entered):
         _compare(name, _of_bracket(entered, start), unit)
+
+
+def check_terms(term: diffrax.MultiTerm, t: Any, y: PyTree, args: PyTree = None) -> None:
+    """Checks numerically that the terms of a sum have exact flows, as `cfjax.Splitting` assumes.
+
+    The frozen field of a term must not change along its own flow. Otherwise a splitting has order
+    1, and no error says so. A force that depends on positions and moves momenta is such a field,
+    and so is the rotation of a body about *one* of its principal axes: `Rotation(-m / inertia)`
+    about all three is not.
+
+    For each term the flow in one unit of time is compared with that in two halves, between which
+    the field is evaluated again. The tolerance is half of the digits, relative to how far the state
+    moves. Terms that a path drives, such as noise, are not checked.
+
+    **Arguments:** `term`, a `diffrax.MultiTerm`; `t`, `y` and `args` as the fields get them, with a
+    state that is not special, such as a random one.
+
+    **Raises** `TypeError` if `term` is not a `diffrax.MultiTerm`; `ValueError` that names the first
+    term whose field changes along its flow, and by how much.
+    """
+    if not isinstance(term, diffrax.MultiTerm):
+        raise TypeError(f"term must be a diffrax.MultiTerm, got {term!r}.")
+    y = jtu.tree_map(jnp.asarray, y)
+    unit = float(np.sqrt(max(jnp.finfo(leaf.dtype).eps for leaf in jtu.tree_leaves(y))))
+    for k, part in enumerate(term.terms):
+        if is_driven(part):
+            continue
+        whole = _carried(part, t, y, args, 1.0)
+        halves = _carried(part, t, _carried(part, t, y, args, 0.5), args, 0.5)
+        way, off = (float(_size(jtu.tree_map(jnp.subtract, whole, x))) for x in (y, halves))
+        if not off <= unit * way:
+            raise ValueError(
+                f"The field of terms[{k}] must not change along its own flow, and its flow in one "
+                f"unit of time is off by {off:.1g}, where it moves the state by {way:.1g}. Split "
+                "it into terms that do not change what they depend on."
+            )
+
+
+def _carried(term: Any, t: Any, y: PyTree, args: PyTree, time: float) -> PyTree:
+    """Where the frozen field at `y` carries it in some time."""
+    control = jtu.tree_map(lambda x: time * x, term.contr(t, t + 1.0))
+    field, point = to_chart(product(term, term.vf(t, y, args), control), y, ())
+    return from_chart(field, flow(field, point))
 
 
 def _check_arguments(fields: Any, point: PyTree) -> None:

@@ -2,6 +2,7 @@
 
 from typing import Any
 
+import diffrax
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -258,3 +259,55 @@ def test_an_annotated_acts_on_subtree_is_named():
 def test_wrong_arguments(no_shape_hook, fields, point, error, message):
     with pytest.raises(error, match=message):
         cfjax.check_field(fields, point)
+
+
+# Splittings.
+
+PAIR = {"q": jnp.asarray([0.3, -0.5, 0.8]), "p": jnp.asarray([0.7, 0.2, -0.4])}
+INERTIA = jnp.asarray([1.0, 2.0, 3.0])
+
+
+def kick(t, y, args):
+    return {"q": None, "p": -args * jnp.sin(y["q"])}
+
+
+def drift(t, y, args):
+    return {"q": cfjax.Rotation(y["p"]), "p": None}
+
+
+def tumble(axes):
+    return lambda t, y, args: {"q": None, "p": cfjax.Rotation(-axes * y["p"] / INERTIA)}
+
+
+def sum_of(*fields):
+    return diffrax.MultiTerm(*map(cfjax.LieTerm, fields))
+
+
+def test_terms_with_exact_flows_pass():
+    about_one_axis = tumble(jnp.asarray([1.0, 0.0, 0.0]))
+    noise = diffrax.UnsafeBrownianPath((3,), jax.random.key(0))
+    bath = cfjax.LieControlTerm(lambda t, y, args, dw: {"q": None, "p": dw}, noise)
+    terms = sum_of(kick, drift, about_one_axis).terms
+    cfjax.check_terms(diffrax.MultiTerm(*terms, bath), 0.0, PAIR, 2.0)
+    # Frozen in a chart of its own, and on leading axes.
+    sphere = lambda t, y, args: cfjax.SphereRotation(0 * y)  # noqa: E731
+    cfjax.check_terms(sum_of(sphere, sphere), 0.0, PAIR["q"] / jnp.linalg.norm(PAIR["q"]))
+
+
+@pytest.mark.parametrize(
+    "fields, place",
+    [
+        ((kick, tumble(jnp.ones(3))), 1),
+        ((lambda t, y, args: {"q": None, "p": -y["p"]}, drift), 0),
+        # Both parts at once.
+        ((lambda t, y, args: {"q": y["p"], "p": -y["q"]}, kick), 0),
+    ],
+)
+def test_terms_that_change_along_their_flow_are_named(fields, place):
+    with pytest.raises(ValueError, match=rf"terms\[{place}\] must not change along its own flow"):
+        cfjax.check_terms(sum_of(*fields), 0.0, PAIR, 2.0)
+
+
+def test_a_term_that_is_no_sum(no_shape_hook):
+    with pytest.raises(TypeError, match=r"must be a diffrax\.MultiTerm"):
+        cfjax.check_terms(cfjax.LieTerm(drift), 0.0, PAIR)

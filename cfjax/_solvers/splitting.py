@@ -151,8 +151,8 @@ class Splitting(AbstractSplitting):
 
     Each term has a frozen field that does not change along its own flow, such as a force, which
     moves momenta alone. So its flow is exact, and where the term is Hamiltonian, the step is
-    symplectic. All symmetric methods are reversible. (`cfjax.check_field` does not see whether a
-    field changes along its flow; where it does, the order is 1.)
+    symplectic. All symmetric methods are reversible. `cfjax.check_terms` checks that the fields do
+    not change.
 
     ```python
     term = diffrax.MultiTerm(cfjax.LieTerm(kick), cfjax.LieTerm(drift))
