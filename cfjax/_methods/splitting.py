@@ -51,6 +51,37 @@ BLANES_MOAN_6 = stages(
 )
 
 
+def _palindrome(*first: float) -> tuple[float, ...]:
+    """A symmetric composition with sum 1, from the first half without the middle."""
+    return (*first, 1 - 2 * sum(first), *reversed(first))
+
+
+# Parts of a step, by the order of the composition of a symmetric method of order 2: Suzuki, Phys.
+# Lett. A 146 (1990), doi:10.1016/0375-9601(90)90962-N; Sofroniou & Spaletta, Optim. Methods Softw.
+# 20 (2005), doi:10.1080/10556780500140664; Kahan & Li, Math. Comp. 66 (1997),
+# doi:10.1090/S0025-5718-97-00873-9.
+COMPOSITIONS = {
+    4: _palindrome(*[1 / (4 - 4 ** (1 / 3))] * 2),
+    6: _palindrome(
+        0.21375583945878254555518066964857,
+        0.18329381407425713911385974425217,
+        0.17692819473098943794898811709929,
+        -0.44329082681170215849622829626258,
+        0.11728560432865935385403585669136,
+    ),
+    8: _palindrome(
+        0.13020248308889008088,
+        0.56116298177510838456,
+        -0.38947496264484728641,
+        0.15884190655515560090,
+        -0.39590389413323757734,
+        0.18453964097831570709,
+        0.25837438768632204729,
+        0.29501172360931029887,
+    ),
+}
+
+
 @lru_cache
 def splitting_order(stages: Sequence[float]) -> int:
     """The order of a splitting method, of which all words in two letters are compared.

@@ -50,6 +50,11 @@ class AbstractLieSolver(diffrax.AbstractSolver):
     # What diffrax asks a solver for first.
     term_compatible_contr_kwargs = _OfInstances(lambda self: {})
 
+    @property
+    def is_symmetric(self) -> bool:
+        """Whether a step backwards in time undoes one forwards, but for rounding."""
+        return False
+
     def strong_order(self, terms) -> float:
         """That of any noise. It is 1 if the noise commutes."""
         return 0.5
@@ -210,18 +215,23 @@ def control_of(terms: diffrax.AbstractTerm, t0: Any, t1: Any, **kwargs: Any) -> 
 def by_turns(
     body: Callable[[PyTree, Any], tuple[PyTree, PyTree]], carry: PyTree, turns: Sequence[Any]
 ) -> tuple[PyTree, list[PyTree]]:
-    """What `jax.lax.scan` makes of some turns, with the outputs of each; two or more in one loop.
+    """What `jax.lax.scan` makes of some turns, with the outputs of each; most in one loop.
 
-    Not where the step is rewritten for XLA, which a loop within it would prevent.
+    A step that is rewritten for XLA must not have a loop within. So two turns are unrolled there;
+    more would be too long, and then each turn is rewritten instead.
     """
-    outputs = []
-    if is_rewritten() or len(turns) == 1:
+    if len(turns) == 1 or (len(turns) == 2 and is_rewritten()):
+        outputs = []
         for turn in turns:
             carry, output = body(carry, turn)
             outputs.append(output)
         return carry, outputs
+
+    def once(carry: PyTree, turn: Any) -> Any:
+        return scalarised(lambda carry: body(carry, turn), carry)
+
     many = jtu.tree_map(lambda *xs: jnp.asarray(xs), *turns)
-    carry, stacked = lax.scan(body, carry, many)
+    carry, stacked = lax.scan(once, carry, many)
     return carry, [jtu.tree_map(lambda x: x[k], stacked) for k in range(len(turns))]  # noqa: B023
 
 

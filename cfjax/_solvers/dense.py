@@ -1,6 +1,6 @@
 """Output within a step, on the manifold."""
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from functools import lru_cache
 from typing import Any
 
@@ -35,11 +35,40 @@ class Interpolation(diffrax.AbstractLocalInterpolation):
         if t1 is not None:
             start, end = self.evaluate(t0), self.evaluate(t1)
             return jtu.tree_map(jnp.subtract, end, start)
-        with jax.numpy_dtype_promotion("standard"):
-            length = jnp.asarray(self.t1 - self.t0)
-            # A solve from a time to the same time makes no step, and asks for its end.
-            theta = (t0 - self.t0) / jnp.where(length == 0, 1, length)
-        return self.path.point(theta)
+        return self.path.point(part_of_step(self, t0))
+
+
+class Pieces(diffrax.AbstractLocalInterpolation):
+    """The outputs of several steps that one is made of, each for the same part of its time.
+
+    Each of `parts` is for times from 0 to 1.
+    """
+
+    t0: Any
+    t1: Any
+    parts: Sequence[diffrax.AbstractLocalInterpolation]
+
+    def evaluate(self, t0: Any, t1: Any = None, left: bool = True) -> PyTree:
+        """The solution at time `t0`, or what is added to it from `t0` to `t1`."""
+        del left
+        if t1 is not None:
+            start, end = self.evaluate(t0), self.evaluate(t1)
+            return jtu.tree_map(jnp.subtract, end, start)
+        theta = part_of_step(self, t0) * len(self.parts)
+        point = self.parts[0].evaluate(jnp.minimum(theta, 1))
+        for k, part in enumerate(self.parts[1:], 1):
+            is_last = k == len(self.parts) - 1
+            later = part.evaluate(theta - k if is_last else jnp.clip(theta - k, 0, 1))
+            point = jtu.tree_map(lambda a, b: jnp.where(theta > k, b, a), point, later)  # noqa: B023
+        return point
+
+
+def part_of_step(step: Any, t: Any) -> Real[Array, ""]:
+    """The part of a step at a time."""
+    with jax.numpy_dtype_promotion("standard"):
+        length = jnp.asarray(step.t1 - step.t0)
+        # A solve from a time to the same time makes no step, and asks for its end.
+        return (t - step.t0) / jnp.where(length == 0, 1, length)
 
 
 class Path(eqx.Module):

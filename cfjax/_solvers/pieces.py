@@ -7,13 +7,11 @@ normal of variance h/12 and independent of W. So a method is rows of numbers (a,
 
 import abc
 import itertools
-from collections.abc import Sequence
 from math import sqrt
 from typing import Any, ClassVar, NamedTuple
 
 import diffrax
 import equinox as eqx
-import jax
 import jax.numpy as jnp
 import jax.tree_util as jtu
 from jaxtyping import PyTree
@@ -21,7 +19,7 @@ from jaxtyping import PyTree
 from .._term import product
 from .base import AbstractChartSolver, AbstractLieSolver, by_turns, control_of, result_of, time_at
 from .commutator_free import CF4, LieEuler
-from .dense import Path
+from .dense import Pieces
 from .dependence import depending_on_state
 
 
@@ -32,31 +30,6 @@ class _Piece(NamedTuple):
     increment: Any
     area: Any
     start: Any = 0.0
-
-
-class _Interpolation(diffrax.AbstractLocalInterpolation):
-    """The output of the pieces one after the other."""
-
-    t0: Any
-    t1: Any
-    paths: Sequence[Path]
-
-    def evaluate(self, t0: Any, t1: Any = None, left: bool = True) -> PyTree:
-        """The solution at time `t0`, or what is added to it from `t0` to `t1`."""
-        del left
-        if t1 is not None:
-            start, end = self.evaluate(t0), self.evaluate(t1)
-            return jtu.tree_map(jnp.subtract, end, start)
-        with jax.numpy_dtype_promotion("standard"):
-            length = jnp.asarray(self.t1 - self.t0)
-            # A solve from a time to the same time makes no step, and asks for its end.
-            theta = (t0 - self.t0) / jnp.where(length == 0, 1, length) * len(self.paths)
-        point = self.paths[0].point(jnp.minimum(theta, 1))
-        for k, path in enumerate(self.paths[1:], 1):
-            is_last = k == len(self.paths) - 1
-            later = path.point(theta - k if is_last else jnp.clip(theta - k, 0, 1))
-            point = jtu.tree_map(lambda a, b: jnp.where(theta > k, b, a), point, later)  # noqa: B023
-        return point
 
 
 class AbstractPieces(AbstractLieSolver, diffrax.AbstractStratonovichSolver):
@@ -70,7 +43,7 @@ class AbstractPieces(AbstractLieSolver, diffrax.AbstractStratonovichSolver):
     # Their times, increments and areas.
     rows: eqx.AbstractClassVar[tuple[tuple[float, float, float], ...]]
 
-    interpolation_cls: ClassVar[Any] = _Interpolation
+    interpolation_cls: ClassVar[Any] = Pieces
 
     def __check_init__(self):
         _check_solver("solver", self.solver)
@@ -108,7 +81,7 @@ class AbstractPieces(AbstractLieSolver, diffrax.AbstractStratonovichSolver):
         def kind(piece: _Piece) -> tuple[AbstractChartSolver, bool]:
             return self.solver_of(piece, is_constant), piece.time > 0
 
-        carry, paths = (y0, solver_state), []
+        carry, parts = (y0, solver_state), []
         for (solver, _), alike in itertools.groupby(pieces, kind):
 
             def follow(carry: Any, piece: _Piece, solver: AbstractChartSolver = solver) -> Any:
@@ -116,12 +89,12 @@ class AbstractPieces(AbstractLieSolver, diffrax.AbstractStratonovichSolver):
                 start, end = (time_at(c, t0, t1) for c in (piece.start, piece.start + piece.time))
                 along = _along(terms, control, piece)
                 y, _, dense_info, state, _ = solver.step(along, start, end, y, args, state, False)
-                return (y, state), dense_info["path"]
+                return (y, state), solver.interpolation_cls(t0=0.0, t1=1.0, **dense_info)
 
             carry, more = by_turns(follow, carry, list(alike))
-            paths += more
+            parts += more
         y1, state = carry
-        return y1, None, dict(paths=paths), state, result_of(y1)
+        return y1, None, dict(parts=parts), state, result_of(y1)
 
 
 class WeakOrder2(AbstractPieces):

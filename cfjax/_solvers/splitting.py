@@ -28,6 +28,7 @@ from .base import (
 )
 from .chart import carried
 from .compensation import at, no_compensation, with_sums
+from .dense import part_of_step
 from .dependence import depending_on_time
 
 
@@ -47,11 +48,7 @@ class _Replay(diffrax.AbstractLocalInterpolation):
         if t1 is not None:
             start, end = self.evaluate(t0), self.evaluate(t1)
             return jtu.tree_map(jnp.subtract, end, start)
-        with jax.numpy_dtype_promotion("standard"):
-            length = jnp.asarray(self.t1 - self.t0)
-            # A solve from a time to the same time makes no step, and asks for its end.
-            theta = (t0 - self.t0) / jnp.where(length == 0, 1, length)
-
+        theta = part_of_step(self, t0)
         y = self.start
         for field in (self.first, *itertools.chain(*self.later)):
             y = _flow(combine((theta,), (field,)), y)
@@ -70,6 +67,10 @@ class AbstractSplitting(AbstractLieSolver, diffrax.AbstractStratonovichSolver):
 
     term_structure: ClassVar = diffrax.MultiTerm
     interpolation_cls: ClassVar[Any] = _Replay
+
+    @property
+    def is_symmetric(self):
+        return tuple(self.stages) == tuple(reversed(self.stages))
 
     def order(self, terms):
         return splitting_order(self.stages)
