@@ -111,7 +111,7 @@ def checked(field: PyTree, y: PyTree) -> PyTree:
 
     **Raises** `TypeError` or `ValueError` that names the part of the state.
     """
-    if field is None:
+    if field is None and y is not None:
         raise ValueError(
             "The field of a term must return one field for each part of the state, got None. Has "
             "its function a return? A part at rest is None where the state has parts, and zero "
