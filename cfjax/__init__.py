@@ -71,6 +71,7 @@ if TYPE_CHECKING:
     from ._numerics.transforms import SineTransform as SineTransform
     from ._numerics.transforms import TensorTransform as TensorTransform
     from ._solvers.composition import Composition as Composition
+    from ._solvers.implicit_midpoint import ImplicitMidpoint as ImplicitMidpoint
     from ._solvers.low_storage import BWRRK33 as BWRRK33
     from ._solvers.low_storage import BWRRK53 as BWRRK53
     from ._solvers.low_storage import CFEES25 as CFEES25
@@ -127,6 +128,7 @@ _NAMES_LATER = {
         "TensorTransform",
     ),
     "_solvers.composition": ("Composition",),
+    "_solvers.implicit_midpoint": ("ImplicitMidpoint",),
     "_solvers.low_storage": (
         "BWRRK33",
         "BWRRK53",

@@ -97,6 +97,15 @@ class AbstractFrozenField(eqx.Module):
         """
         return None
 
+    def mean(self, point: Any) -> Any:
+        """The mean of the flow from `point` over unit time, for `cfjax.ImplicitMidpoint`.
+
+        By default the point in the middle of the flow, from which it differs by a quarter of a
+        percent of the square of the length of the flow. With the mean itself that method keeps more
+        invariants.
+        """
+        return type(self).combine((0.5,), (self,)).flow(point)
+
     @classmethod
     def combine(cls, weights: Sequence[Weight], fields: Sequence[Any]) -> Any:
         """The field `sum_i weights[i] * fields[i]`. Weights are real scalars.
@@ -196,6 +205,9 @@ class Rest(AbstractAlgebraElement):
 
     def tangent(self, point: PyTree) -> PyTree:
         return jtu.tree_map(jnp.zeros_like, point)
+
+    def mean(self, point: PyTree) -> PyTree:
+        return point
 
     def increment(self, point: PyTree) -> PyTree:
         # Another term may make a compensated sum of this part.

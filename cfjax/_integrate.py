@@ -162,7 +162,7 @@ def equal_steps(
             result = diffrax.RESULTS.where(is_first, step_result, result)
         return (n + 1, y, solver_state, result)
 
-    is_ours = isinstance(solver, AbstractLieSolver)
+    is_ours = isinstance(solver, AbstractLieSolver) and solver.shows_failure
     if hasattr(solver, "start"):
         solver_state, fault = cast(Any, solver).start(term, t0, time(n + 1), y0, args)
     else:

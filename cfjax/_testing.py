@@ -197,6 +197,18 @@ def _of_flow(given: Any, field: Any, first: Any, start: Any, point: PyTree) -> _
             _size((here, end)),
         ),
     ]
+    if type(given).mean is not AbstractFrozenField.mean:
+        # To ten digits for a field of size one.
+        nodes, parts = np.polynomial.legendre.leggauss(8)
+        whole = lax.map(
+            lambda t: type(given).combine((t,), (given,)).flow(point),
+            jnp.asarray((nodes + 1) / 2, times.dtype),
+        )
+        expected = jtu.tree_map(
+            lambda y: jnp.tensordot(jnp.asarray(parts / 2, y.dtype), y, axes=1), whole
+        )
+        promise = "mean must be the mean of the flow"
+        facts.append((promise, given.mean(point), expected, _size((point, expected))))
     if increment is not None:
         expected = jtu.tree_map(jnp.subtract, given.flow(point), point)
         promise = "increment must be flow(point) - point"

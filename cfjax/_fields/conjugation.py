@@ -10,7 +10,7 @@ from jax import lax
 from jaxtyping import Array, Bool, Inexact
 
 from .._field import Weight
-from .._numerics.expm import expm_parts
+from .._numerics.expm import expm, expm_parts
 from .._numerics.expm_both import expm_both_parts
 from .._numerics.expm_source import expm_parts_with_source
 from .._numerics.matmul import promoted, small_product
@@ -38,6 +38,9 @@ class AbstractTwoSided(AbstractMatrix):
     def tangent(self, point: Inexact[Array, "*batch n n"]) -> Inexact[Array, "*batch n n"]:
         return self._each(lambda field, x: field.velocity(x), point)
 
+    def mean(self, point: Inexact[Array, "*batch n n"]) -> Inexact[Array, "*batch n n"]:
+        return self._each(lambda field, x: field.average(x), point)
+
     def bracket(self, other: Any) -> "AbstractTwoSided":
         check_other(self, other)
         return each(lambda x, y: x.commutator(y), self._num_axes)(self, other)
@@ -45,6 +48,10 @@ class AbstractTwoSided(AbstractMatrix):
     @abc.abstractmethod
     def move(self, x: Inexact[Array, "n n"]) -> tuple[Inexact[Array, ""], Inexact[Array, "n n"]]:
         """`w, z` with `w x + z` the point that x moves to, for a field without leading axes."""
+
+    @abc.abstractmethod
+    def average(self, x: Inexact[Array, "n n"]) -> Inexact[Array, "n n"]:
+        """`mean`, for a field without leading axes."""
 
     @abc.abstractmethod
     def velocity(self, x: Inexact[Array, "n n"]) -> Inexact[Array, "n n"]:
@@ -85,6 +92,13 @@ class Conjugation(AbstractTwoSided):
         a = _minus_identity(self.a, jnp.trace(self.a) / self.a.shape[0])
         weight, plus, minus = expm_both_parts(a)
         return _from_both_sides(weight, (a, plus), x, (-a, minus))
+
+    def average(self, x: Inexact[Array, "n n"]) -> Inexact[Array, "n n"]:
+        # exp([[a, x], [0, a]]) has the integral of exp((1 - s) a) x exp(s a) above the diagonal.
+        a = _minus_identity(self.a, jnp.trace(self.a) / self.a.shape[0])
+        a, x = promoted(a, x)
+        whole = expm(jnp.block([[a, x], [jnp.zeros_like(x), a]]))
+        return _times(whole[: len(x), len(x) :], expm(-a))
 
     def velocity(self, x: Inexact[Array, "n n"]) -> Inexact[Array, "n n"]:
         return _commutator(self.a, x)
@@ -146,6 +160,11 @@ class Congruence(AbstractTwoSided):
         weight, moved = _from_both_sides(weight, (a, rest), x, adjoint)
         moved = jnp.add(*promoted(moved, source))
         return weight, _without_skew_part(moved, is_hermitian)
+
+    def average(self, x: Inexact[Array, "n n"]) -> Inexact[Array, "n n"]:
+        if self.q is not None:
+            return Congruence(self.a / 2, self.q / 2).flow(x)
+        return Congruence(self.a, x).flow(jnp.zeros_like(x))
 
     def velocity(self, x: Inexact[Array, "n n"]) -> Inexact[Array, "n n"]:
         v = _linear_part(self.a, x)

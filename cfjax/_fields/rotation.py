@@ -7,7 +7,7 @@ import jax.numpy as jnp
 from jaxtyping import Array, Float
 
 from .._field import AbstractAlgebraElement
-from .._numerics.rotate import cross_product, dexpinv, increment, rotate
+from .._numerics.rotate import cross_product, dexpinv, increment, mean, rotate
 from .elementwise import check_other, check_point, each
 
 
@@ -51,6 +51,10 @@ class Rotation(AbstractAlgebraElement):
     def tangent(self, point: Float[Array, "..."]) -> Float[Array, "..."]:
         self._check_point(point)
         return each(cross_product, self._num_axes)(self.omega, point)
+
+    def mean(self, point: Float[Array, "..."]) -> Float[Array, "..."]:
+        self._check_point(point)
+        return each(mean, self._num_axes)(self.omega, point)
 
     def bracket(self, other: Any) -> "Rotation":
         return self._with(cross_product, other)

@@ -3,7 +3,7 @@
 import jax
 from jaxtyping import Array, Float
 
-from .stumpff import dexpinv_times, stumpff_1_to_3_apart
+from .stumpff import dexpinv_times, stumpff, stumpff_1_to_3_apart
 from .vectors import cross, dot, entries, pack
 
 
@@ -29,6 +29,16 @@ def increment(a: Float[Array, "3"], x: Float[Array, "3 *k"]) -> Float[Array, "3 
     once = cross(axis, entries(x))
     exponential = stumpff_1_to_3_apart(dot(axis, axis))
     return pack(exponential.increment(once, cross(axis, once)), sums=True)
+
+
+@jax.jit
+def mean(a: Float[Array, "3"], x: Float[Array, "3 *k"]) -> Float[Array, "3 *k"]:
+    """The mean of `rotate(s a, x)` over s from 0 to 1, `x + c_2 a*x + c_3 a*(a*x)`."""
+    axis, xs = entries(a), entries(x)
+    once = cross(axis, xs)
+    c2, c3 = (stumpff(n, dot(axis, axis)) for n in (2, 3))
+    parts = zip(xs, once, cross(axis, once), strict=True)
+    return pack([x + (c2 * v + c3 * w) for x, v, w in parts], sums=True)
 
 
 @jax.jit

@@ -55,6 +55,11 @@ class AbstractLieSolver(diffrax.AbstractSolver):
         """Whether a step backwards in time undoes one forwards, but for rounding."""
         return False
 
+    @property
+    def shows_failure(self) -> bool:
+        """Whether a step that fails ends in what is not finite, so that its result says no more."""
+        return True
+
     def strong_order(self, terms) -> float:
         """That of any noise. It is 1 if the noise commutes."""
         return 0.5

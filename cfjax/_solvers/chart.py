@@ -3,11 +3,12 @@
 from collections.abc import Callable, Sequence
 from typing import Any
 
+import jax
 import jax.numpy as jnp
 import jax.tree_util as jtu
 from jaxtyping import Array, PyTree, Real
 
-from .._field import flow, from_chart, is_field, to_chart
+from .._field import Rest, flow, from_chart, is_field, to_chart
 from .._xla import materialised_if_long, materialised_in_rows, materialised_together
 from .compensation import at, with_sums
 
@@ -114,3 +115,22 @@ def carried(field: PyTree, point: PyTree) -> PyTree:
         point,
         is_leaf=is_field,
     )
+
+
+def flow_at(field: PyTree, y: PyTree) -> PyTree:
+    """Where a field that is frozen at the state y carries it."""
+    field, point = to_chart(field, y, ())
+    return from_chart(field, carried(field, point))
+
+
+def moved(field: PyTree, z: PyTree, y0: PyTree, compensation: PyTree) -> PyTree:
+    """Where a field carries a state, of which compensated sums are increments from y0."""
+
+    def part(f: Any, z: PyTree, c: PyTree, y0: PyTree) -> PyTree:
+        if not is_field(f):
+            return z + f
+        if isinstance(f, Rest):
+            return z
+        return z + f.increment(y0 + z) if isinstance(c, jax.Array) else flow_at(f, z)
+
+    return jtu.tree_map(part, field, z, compensation, y0, is_leaf=is_field)

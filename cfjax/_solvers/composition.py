@@ -3,11 +3,13 @@
 import itertools
 from typing import Any, ClassVar, NamedTuple
 
+import diffrax
 import equinox as eqx
+from jax import lax
 
 from .._control_term import is_driven
 from .._methods.splitting import COMPOSITIONS
-from .base import AbstractLieSolver, by_turns, result_of, time_at
+from .base import AbstractLieSolver, State, by_turns, result_of, time_at
 from .dense import Pieces
 
 
@@ -29,8 +31,8 @@ class Composition(AbstractLieSolver):
     cfjax.integrate(term, cfjax.Composition(cfjax.Strang(), 6), 0.0, 100.0, y0, num_steps=1000)
     ```
 
-    **Arguments:** `solver`, a symmetric one: `cfjax.Strang`, or another splitting whose stages are
-    a palindrome. `order`, 4, 6 or 8.
+    **Arguments:** `solver`, a symmetric one: `cfjax.Strang`, another splitting whose stages
+    are a palindrome, or `cfjax.ImplicitMidpoint`. `order`, 4, 6 or 8.
 
     **Raises** `TypeError` for another solver, `ValueError` for another order; when traced
     `TypeError` for terms that a path drives.
@@ -62,6 +64,10 @@ class Composition(AbstractLieSolver):
     def is_symmetric(self):
         return True
 
+    @property
+    def shows_failure(self):
+        return self.solver.shows_failure
+
     def order(self, terms):
         return self.composition_order
 
@@ -76,16 +82,28 @@ class Composition(AbstractLieSolver):
         return self.solver.start(terms, t0, t1, y0, args)
 
     def step(self, terms, t0, t1, y0, args, solver_state, made_jump):
+        if made_jump is not False:
+            first = lax.cond(
+                made_jump,
+                lambda: self.solver.start(terms, t0, t1, y0, args)[0].first,
+                lambda: solver_state.first,
+            )
+            solver_state = State(solver_state.compensation, first, solver_state.zero)
         ends = [0.0, *itertools.accumulate(COMPOSITIONS[self.composition_order][:-1]), 1.0]
 
         def follow(carry: Any, turn: _Turn) -> Any:
-            y, state, made_jump = carry
+            y, state, result = carry
             start, end = (time_at(c, t0, t1) for c in turn)
-            y, _, dense_info, state, _ = self.solver.step(
-                terms, start, end, y, args, state, made_jump
+            y, _, dense_info, state, new = self.solver.step(
+                terms, start, end, y, args, state, False
             )
-            return (y, state, False), self.solver.interpolation_cls(t0=0.0, t1=1.0, **dense_info)
+            if not self.shows_failure:
+                result = diffrax.RESULTS.where(diffrax.is_okay(result), new, result)
+            part = self.solver.interpolation_cls(t0=0.0, t1=1.0, **dense_info)
+            return (y, state, result), part
 
         turns = list(itertools.starmap(_Turn, itertools.pairwise(ends)))
-        (y1, state, _), parts = by_turns(follow, (y0, solver_state, made_jump), turns)
-        return y1, None, dict(parts=parts), state, result_of(y1)
+        carry = y0, solver_state, diffrax.RESULTS.successful
+        (y1, state, result), parts = by_turns(follow, carry, turns)
+        result = result_of(y1) if self.shows_failure else result
+        return y1, None, dict(parts=parts), state, result
