@@ -143,6 +143,10 @@ MISTAKES = {
         dict(flow=lambda self, point: point + self.a * point + self.b),
         r"flow of 0\.4 of a field after 0\.6 of it must be that of the whole field",
     ),
+    "the middle of the flow": (
+        dict(mean=lambda self, point: type(self)(self.a / 2, self.b / 2).flow(point)),
+        r"mean must be the mean of the flow",
+    ),
     "not at rest": (
         dict(flow=lambda self, point: Line.flow(self, point) + 1e-3),
         r"flow of the zero field must be the identity, but",
@@ -263,7 +267,7 @@ def test_wrong_arguments(no_shape_hook, fields, point, error, message):
 
 # Splittings.
 
-PAIR = {"q": jnp.asarray([0.3, -0.5, 0.8]), "p": jnp.asarray([0.7, 0.2, -0.4])}
+BODY = {"q": jnp.asarray([0.3, -0.5, 0.8]), "p": jnp.asarray([0.7, 0.2, -0.4])}
 INERTIA = jnp.asarray([1.0, 2.0, 3.0])
 
 
@@ -288,10 +292,10 @@ def test_terms_with_exact_flows_pass():
     noise = diffrax.UnsafeBrownianPath((3,), jax.random.key(0))
     bath = cfjax.LieControlTerm(lambda t, y, args, dw: {"q": None, "p": dw}, noise)
     terms = sum_of(kick, drift, about_one_axis).terms
-    cfjax.check_terms(diffrax.MultiTerm(*terms, bath), 0.0, PAIR, 2.0)
+    cfjax.check_terms(diffrax.MultiTerm(*terms, bath), 0.0, BODY, 2.0)
     # Frozen in a chart of its own, and on leading axes.
     sphere = lambda t, y, args: cfjax.SphereRotation(0 * y)  # noqa: E731
-    cfjax.check_terms(sum_of(sphere, sphere), 0.0, PAIR["q"] / jnp.linalg.norm(PAIR["q"]))
+    cfjax.check_terms(sum_of(sphere, sphere), 0.0, BODY["q"] / jnp.linalg.norm(BODY["q"]))
 
 
 @pytest.mark.parametrize(
@@ -305,9 +309,9 @@ def test_terms_with_exact_flows_pass():
 )
 def test_terms_that_change_along_their_flow_are_named(fields, place):
     with pytest.raises(ValueError, match=rf"terms\[{place}\] must not change along its own flow"):
-        cfjax.check_terms(sum_of(*fields), 0.0, PAIR, 2.0)
+        cfjax.check_terms(sum_of(*fields), 0.0, BODY, 2.0)
 
 
 def test_a_term_that_is_no_sum(no_shape_hook):
     with pytest.raises(TypeError, match=r"must be a diffrax\.MultiTerm"):
-        cfjax.check_terms(cfjax.LieTerm(drift), 0.0, PAIR)
+        cfjax.check_terms(cfjax.LieTerm(drift), 0.0, BODY)
