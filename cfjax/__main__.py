@@ -26,6 +26,12 @@ _CHARTS = {
     for name, function in vars(module).items()
     if name == "chart" or name.startswith("chart_")
 }
+# Noise has no work-precision chart: errors of a mean are mostly those of the sample.
+_WITHOUT_CHART = {
+    name
+    for name, module in _SCENES.items()
+    if not any(function.startswith("chart") for function in vars(module))
+}
 
 # On two cores with nothing else to do.
 _PAPER_TIME = "Takes 2 to 4 minutes, more on a busy machine."
@@ -66,7 +72,8 @@ def main(argv: Sequence[str] | None = None) -> int:
             "CSV, too. In float64. " + _CHART_TIME
         ),
     )
-    chart.add_argument("scene", metavar="SCENE", choices=_CHARTS, help=", ".join(_CHARTS))
+    names = ", ".join(_CHARTS)
+    chart.add_argument("scene", metavar="SCENE", type=_chart, choices=_CHARTS, help=names)
     chart.add_argument(
         "--budget",
         metavar="SECONDS",
@@ -128,6 +135,14 @@ def _list_of_scenes() -> str:
         for name, module in _SCENES.items()
     )
     return "\n".join(["scenes:", *lines])
+
+
+def _chart(text: str) -> str:
+    if text in _WITHOUT_CHART:
+        raise argparse.ArgumentTypeError(
+            f"{text} has no chart, as it has noise; cfjax scene {text} draws it"
+        )
+    return text
 
 
 def _folder(text: str) -> Path:

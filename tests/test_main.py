@@ -227,6 +227,7 @@ def test_every_scene_can_be_run(name, monkeypatch, tmp_path, capsys):
     [
         ([], "SCENE"),
         (["chess"], "invalid choice: 'chess' (choose from"),
+        (["macrospin"], "macrospin has no chart, as it has noise; cfjax scene macrospin draws it"),
         (["rigid_body", "extra"], "extra"),
         (["rigid_body", "--budget"], "--budget"),
         (["rigid_body", "--budget", "soon"], "positive number of seconds, got 'soon'"),

@@ -41,7 +41,7 @@ class AbstractPieces(AbstractLieSolver, diffrax.AbstractStratonovichSolver):
 
     solver: eqx.AbstractVar[AbstractChartSolver]
     # Their times, increments and areas.
-    rows: eqx.AbstractClassVar[tuple[tuple[float, float, float], ...]]
+    rows: ClassVar[tuple[tuple[float, float, float], ...]]
 
     interpolation_cls: ClassVar[Any] = Pieces
 
