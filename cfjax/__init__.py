@@ -60,6 +60,7 @@ if TYPE_CHECKING:
     from ._fields.operator_sum import OperatorSum as OperatorSum
     from ._fields.rigid_motion import PlanarMotion as PlanarMotion
     from ._fields.rigid_motion import RigidMotion as RigidMotion
+    from ._fields.scaling import Scaling as Scaling
     from ._fields.sphere import SphereRotation as SphereRotation
     from ._measure.work_precision import WorkPrecision as WorkPrecision
     from ._measure.work_precision import work_precision as work_precision
@@ -115,6 +116,7 @@ _NAMES_LATER = {
     "_fields.low_rank": ("BorderedSkew", "LowRankSkew"),
     "_fields.operator_sum": ("OperatorSum",),
     "_fields.rigid_motion": ("PlanarMotion", "RigidMotion"),
+    "_fields.scaling": ("Scaling",),
     "_fields.sphere": ("SphereRotation",),
     "_batch.batch": ("BatchResult", "map_batch"),
     "_measure.work_precision": ("WorkPrecision", "work_precision"),

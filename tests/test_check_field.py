@@ -49,6 +49,7 @@ BUILT_IN: dict[str, tuple[Any, Any]] = {
         lambda: cfjax.Affine(random(F64), random(F64, 4), SPECTRUM, cfjax.SineTransform()),
         random(F64, 4),
     ),
+    "Scaling": (lambda: cfjax.Scaling(random(C64, 3, 1)), random(C64, 3, 4)),
     "LowRankSkew": (lambda: cfjax.LowRankSkew(random(F64, 5, 2)), frame(F64, 5, 2)),
     "SphereRotation": (lambda: cfjax.SphereRotation(random(F64, 5)), frame(F64, 5, 1)[:, 0]),
     "BorderedSkew": (lambda: cfjax.BorderedSkew(random(F32, 5, 2)), frame(F32, 5, 2)),

@@ -30,6 +30,7 @@ PROMISED = [
     "LowRankSkew",
     "BorderedSkew",
     "SphereRotation",
+    "Scaling",
     "Tableau",
     "CommutatorFree",
     "LieEuler",

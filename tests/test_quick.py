@@ -67,6 +67,7 @@ FIELDS = {
         lambda t, y, args: cfjax.LinearAffine(jnp.outer(args, jnp.sin(y)), y + t),
         ON_SPHERE,
     ),
+    "Scaling": (lambda t, y, args: cfjax.Scaling(args * jnp.cos(y + t)), ON_SPHERE),
     "LowRankSkew": (unit, FRAME),
     "SphereRotation": (lambda t, y, args: cfjax.SphereRotation(args * y + t), ON_SPHERE),
     "BorderedSkew": (

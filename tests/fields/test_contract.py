@@ -325,6 +325,19 @@ CASES = {
         ),
         has_bracket=False,
     ),
+    "Scaling": Case(
+        cfjax.Scaling,
+        lambda: unit(rate=normal(4)),
+        normal(4),
+        lambda x, rate: (np.diag(rate), 0),
+        SIZES,
+    ),
+    "Scaling, phases of rows": Case(
+        cfjax.Scaling,
+        lambda: unit(rate=1j * normal(3, 1)),
+        normal(3, 2, is_complex=True),
+        lambda x, rate: (columns(np.diag(rate[:, 0]), 2), 0),
+    ),
 }
 # One of each kind; the others compile for minutes.
 QUICK = {
@@ -535,6 +548,7 @@ WITH_DEXPINV = {
     "LeftMatrix": False,
     "RightMatrix": False,
     "LinearAffine": False,
+    "Scaling": True,
 }
 
 

@@ -73,6 +73,7 @@ FIELDS = {
         lambda t, x: cfjax.LinearAffine(0.3 * jnp.outer(x, jnp.cos(x + t)), jnp.sin(x)),
         normal(4, 3),
     ),
+    "Scaling": (lambda t, x: cfjax.Scaling(jnp.cos(A3 @ x + t)), normal(4, 3)),
     "LowRankSkew": (lambda t, x: cfjax.LowRankSkew(jnp.cos(t) * A6 @ x), FRAMES),
     "BorderedSkew": (lambda t, x: cfjax.BorderedSkew(jnp.cos(t) * A6 @ x), FRAMES),
     "SphereRotation": (

@@ -1,0 +1,262 @@
+"""Scaling: each entry to relative rounding, signs, shapes, methods of any order, and splittings."""
+
+import diffrax
+import jax
+import jax.numpy as jnp
+import numpy as np
+import problems
+import pytest
+
+import cfjax
+from cfjax import Scaling
+
+EPS = 2.0**-52
+# In units of the largest rate, whose exponential is far from the ends of the numbers: the parts of
+# a complex one underflow earlier than its modulus.
+FRACTIONS = np.array([0.0, 1e-30, 1e-9, 1e-3, 0.1, 0.7, 1.0])
+RATES = np.concatenate([-FRACTIONS, FRACTIONS])
+LARGEST = {"float32": 50.0, "float64": 600.0}
+
+
+def normal(seed, *shape):
+    return np.random.default_rng(seed).normal(size=shape)
+
+
+@pytest.mark.parametrize(
+    ("dtype", "point_dtype"),
+    [
+        ("float32", "float32"),
+        ("float64", "float64"),
+        ("complex64", "complex64"),
+        ("complex128", "complex128"),
+        ("float64", "complex128"),
+    ],
+)
+def test_every_entry_is_relatively_accurate(dtype, point_dtype):
+    info = np.finfo(dtype)
+    rate = (LARGEST[str(info.dtype)] * RATES).astype(dtype)
+    if np.iscomplexobj(rate):
+        rate += (1j * np.linspace(-30, 30, len(rate))).astype(dtype)
+    # Of all sizes from 1e-3 to 1e3, and of both signs.
+    point = (10.0 ** np.linspace(-3, 3, len(rate)) * (-1) ** np.arange(len(rate))).astype(dtype)
+    if point_dtype.startswith("complex"):
+        point = (point * np.exp(1j * np.arange(len(rate)))).astype(point_dtype)
+    flow, tangent = jax.jit(lambda field, x: (field.flow(x), field.tangent(x)))(
+        Scaling(rate), point
+    )
+    assert flow.dtype == tangent.dtype == point_dtype
+    exact = np.exp(rate.astype(np.clongdouble)) * point.astype(np.clongdouble)
+    # The exponential is off by up to two units, and a complex one in each part; then a product.
+    off = np.abs(np.asarray(flow, np.clongdouble) - exact) / np.abs(exact)
+    assert np.all(off <= 5 * info.eps)
+    off = np.abs(np.asarray(tangent, np.clongdouble) - rate * point.astype(np.clongdouble))
+    assert np.all(off <= 3 * info.eps * np.abs(rate * point))
+
+
+def test_signs_zeros_and_moduli():
+    rate = jnp.array([-1e6, -800.0, -1.0, 0.0, 1.0, 700.0])
+    for point in (jnp.full(6, 0.3), jnp.full(6, -0.3), jnp.zeros(6), -jnp.zeros(6)):
+        flow = Scaling(rate).flow(point)
+        np.testing.assert_array_equal(jnp.signbit(flow), jnp.signbit(point))
+        np.testing.assert_array_equal(flow[3], point[3])
+        np.testing.assert_array_equal(flow == 0, (point == 0) | (rate < -760))
+    phases = Scaling(1j * jnp.linspace(-1e3, 1e3, 101).astype(complex)).flow(
+        jnp.full(101, 0.6 + 0.8j)
+    )
+    np.testing.assert_allclose(jnp.abs(phases), 1, rtol=0, atol=4 * EPS)
+
+
+def test_populations_stay_positive_however_long_the_step():
+    """With rates of 5 and more in each step, where methods in plain space make them negative."""
+    y0 = jnp.array([0.1, 3.0, 40.0])
+
+    def smallest(field, solver):
+        term = cfjax.LieTerm(lambda t, y, args: field(5 * (1 - y) / (1 + jnp.abs(y)), y))
+        sol = cfjax.integrate(term, solver, 0.0, 10.0, y0, num_steps=5, save_every=1)
+        return float(jnp.min(sol.ys))
+
+    for solver in (cfjax.CF4(), cfjax.RKMK5()):
+        assert smallest(lambda rate, y: rate * y, solver) < 0
+        assert smallest(lambda rate, y: Scaling(rate), solver) > 0
+
+
+def test_what_is_small_decays_as_accurately_as_what_is_large():
+    """A compensated sum would lose it: the entries are 1 and 1e-20 of what a step takes away."""
+    term = cfjax.LieTerm(lambda t, y, args: Scaling(jnp.full(3, -7.0)))
+    y0 = jnp.array([1.0, 1e-20, -1e-200])
+    y1 = cfjax.integrate(term, cfjax.CF4(), 0.0, 30.0, y0, num_steps=60).ys[-1]
+    # Five flows in each of 60 steps, each with three units and with a rate of up to 3.5.
+    np.testing.assert_allclose(y1, y0 * np.exp(-210.0), rtol=5 * 60 * 6 * EPS)
+
+
+def test_derivatives():
+    """By time, twice, along a rate and a point that move; and pulled back. At zero too."""
+    p, q, w = (normal(k, 4) + 1j * normal(9 + k, 4) for k in range(3))
+    r = normal(5, 4) + 1j * normal(6, 4)
+    for rate in (np.zeros(4, complex), r, -300.0 + r):
+
+        def at(t, rate=rate):
+            return Scaling(rate + t * w).flow(p + t * q)
+
+        def first(t, at=at):
+            return jax.jvp(at, (t,), (jnp.ones_like(t),))[1]
+
+        zero = jnp.zeros((), complex)
+        second = jax.jvp(first, (zero,), (zero + 1,))[1]
+        factor = np.exp(rate)
+        # Some ten roundings of numbers of up to 3, and of the rate's own in NumPy's factor.
+        rtol = 40 * EPS
+        np.testing.assert_allclose(first(zero), factor * (w * p + q), rtol=rtol)
+        np.testing.assert_allclose(second, factor * (w * w * p + 2 * w * q), rtol=rtol)
+        pulled = jax.vjp(lambda rate, x: Scaling(rate).flow(x), rate, p)[1](jnp.asarray(w))
+        np.testing.assert_allclose(pulled[0], factor * p * w, rtol=rtol)
+        np.testing.assert_allclose(pulled[1], factor * w, rtol=rtol)
+
+
+@pytest.mark.parametrize("shape", [(), (1,), (4,), (1, 4), (3, 1), (3, 4), (2, 1, 1), (2, 3, 4)])
+def test_rates_are_broadcast(shape):
+    rate, x = normal(1, *shape), jnp.asarray(normal(2, 2, 3, 4))
+    field, full = Scaling(rate), Scaling(np.broadcast_to(rate, x.shape))
+    np.testing.assert_array_equal(field.flow(x), full.flow(x))
+    np.testing.assert_array_equal(field.tangent(x), full.tangent(x))
+    # An exponential of a rate is computed once.
+    jaxpr = str(jax.make_jaxpr(field.flow)(x))
+    sizes = ",".join(map(str, shape))
+    assert f"f64[{sizes}] = exp" in jaxpr
+    term = cfjax.LieTerm(lambda t, y, args: field)
+    y1 = cfjax.integrate(term, cfjax.CF2(), 0.0, 1.0, x, num_steps=2).ys[-1]
+    # Four flows, each of some units.
+    np.testing.assert_allclose(y1, full.flow(x), rtol=20 * EPS)
+
+
+def test_sums_and_the_algebra():
+    a, b = Scaling(normal(1, 4)), Scaling(normal(2, 4))
+    x = jnp.asarray(normal(3, 4))
+    np.testing.assert_array_equal(a.bracket(b).rate, np.zeros(4))
+    assert a.dexpinv(b, 5) is b
+    # One sum, and of a flow of a flow; a product and an exponential each.
+    together = cfjax.combine((1.0, 1.0), (a, b)).flow(x)
+    np.testing.assert_allclose(together, a.flow(b.flow(x)), rtol=20 * EPS)
+    assert a.increment(x) is None
+
+
+@pytest.mark.parametrize("solver", [cfjax.RKMK3(), cfjax.RKMK5(), cfjax.RKMK8()])
+def test_a_munthe_kaas_method_acts_on_logarithms(solver):
+    """It is the method of its tableau for them, exactly."""
+
+    def rate(t, y):
+        return jnp.stack([1 - y[1] + jnp.sin(t), y[0] - 1])
+
+    amounts = cfjax.LieTerm(lambda t, y, args: Scaling(rate(t, y)))
+    logarithms = cfjax.LieTerm(lambda t, z, args: rate(t, jnp.exp(z)))
+    y0 = jnp.array([0.4, 1.2])
+    y1 = cfjax.integrate(amounts, solver, 0.0, 5.0, y0, num_steps=8).ys[-1]
+    z1 = cfjax.integrate(logarithms, solver, 0.0, 5.0, jnp.log(y0), num_steps=8).ys[-1]
+    # 13 stages of 8 steps, each with some units, and a flow of the equation that enlarges them.
+    np.testing.assert_allclose(y1, jnp.exp(z1), rtol=1e3 * EPS)
+
+
+@pytest.mark.usefixtures("no_shape_hook")
+@pytest.mark.parametrize(
+    ("call", "error", "text"),
+    [
+        (
+            lambda: Scaling(np.arange(3)),
+            TypeError,
+            "rate must be one of float32, float64, complex64, complex128, got int64",
+        ),
+        (
+            lambda: Scaling(np.ones(3, np.float16)),
+            TypeError,
+            "rate must be one of float32, float64, complex64, complex128, got float16",
+        ),
+        (
+            lambda: Scaling(np.ones(4)).flow(jnp.ones((4, 3))),
+            ValueError,
+            r"Scaling with rate of shape \(4,\) acts on the shapes that rate broadcasts to, got "
+            r"\(4, 3\)\. For rates along the first axes give rate the shape \(4, 1\)\.",
+        ),
+        (
+            lambda: Scaling(np.ones((1, 3))).tangent(jnp.ones(3)),
+            ValueError,
+            r"Scaling with rate of shape \(1, 3\) acts on .* broadcasts to, got \(3,\)\.$",
+        ),
+        (
+            # The result would have the shape of the rate.
+            lambda: Scaling(np.ones(3)).flow(jnp.ones(1)),
+            ValueError,
+            r"Scaling with rate of shape \(3,\) acts on .* broadcasts to, got \(1,\)\.$",
+        ),
+        (
+            lambda: Scaling(np.ones(3)).flow(jnp.ones(3, jnp.float32)),
+            TypeError,
+            "rate must have the precision of the point, float32, got float64",
+        ),
+        (
+            lambda: Scaling(np.ones(3)).bracket(cfjax.LeftMatrix(np.eye(3))),
+            TypeError,
+            "Scaling has a bracket with another Scaling only, got LeftMatrix",
+        ),
+    ],
+)
+def test_refuses(call, error, text):
+    with pytest.raises(error, match=text):
+        call()
+
+
+@pytest.mark.usefixtures("no_shape_hook")
+def test_a_solve_refuses():
+    def solve(rate):
+        term = cfjax.LieTerm(lambda t, y, args: Scaling(rate))
+        cfjax.integrate(term, cfjax.CF2(), 0.0, 1.0, np.ones(3), num_steps=1)
+
+    with pytest.raises(ValueError, match="make y0 complex"):
+        solve(1j * np.ones(3))
+    with pytest.raises(TypeError, match="does not act there: rate must have the precision of the"):
+        solve(np.ones(3, np.float32))
+
+
+# The nonlinear Schroedinger equation i psi_t = -psi_xx / 2 - |psi|^2 psi, on a period so long that
+# the soliton and its images differ by 2 / cosh(32) = 5e-14 at most; what a grid of step 1/6 leaves
+# out of its spectrum is 1 / cosh(pi (6 pi - 1) / 2) = 1e-12 of its largest entry.
+N, PERIOD, SPEED = 384, 64.0, 1.0
+X = PERIOD * (np.arange(N) / N - 0.5)
+KINETIC = -0.5j * (2 * np.pi * np.fft.fftfreq(N, PERIOD / N)) ** 2
+FOURIER = cfjax.FourierTransform()
+
+
+def soliton(t):
+    phase = SPEED * X + (1 - SPEED**2) * t / 2
+    return np.exp(1j * phase) / np.cosh(X - SPEED * t)
+
+
+TERMS = diffrax.MultiTerm(
+    cfjax.LieTerm(lambda t, psi, args: Scaling(1j * (jnp.abs(psi) ** 2).astype(psi.dtype))),
+    cfjax.LieTerm(
+        lambda t, psi, args: cfjax.Affine(1.0, jnp.zeros_like(psi), KINETIC, FOURIER),
+    ),
+)
+
+
+def test_the_terms_of_the_nonlinear_schroedinger_equation_have_exact_flows():
+    cfjax.check_terms(TERMS, 0.0, jnp.asarray(soliton(0.3)))
+
+
+@pytest.mark.parametrize(("solver", "order"), [(cfjax.Strang(), 2), (cfjax.BlanesMoan4(), 4)])
+def test_the_order_of_a_splitting_for_a_soliton(solver, order):
+    steps = [20, 40, 80]
+    ends = [
+        cfjax.integrate(TERMS, solver, 0.0, 2.0, soliton(0.0), num_steps=n).ys[-1] for n in steps
+    ]
+    errors = np.array([np.abs(end - soliton(2.0)).max() for end in ends])
+    assert order - 0.1 < problems.slope(steps, errors) < order + 0.1
+    # The norm, with some units of rounding for each of 80 or 480 transforms and phases.
+    norms = [np.linalg.norm(y) for y in (ends[-1], soliton(0.0))]
+    assert norms[0] == pytest.approx(norms[1], rel=480 * 10 * EPS)
+
+
+def test_a_splitting_of_order_4_reaches_the_error_of_the_grid():
+    y1 = cfjax.integrate(TERMS, cfjax.BlanesMoan4(), 0.0, 2.0, soliton(0.0), num_steps=640).ys[-1]
+    # Its own is 3e-9 / 8^4 = 7e-13; the grid's is as large, and so is the rounding of 640 * 13
+    # transforms of some units each.
+    np.testing.assert_allclose(y1, soliton(2.0), rtol=0, atol=5e-12)
