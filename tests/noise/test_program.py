@@ -1,5 +1,7 @@
 """The compiled program of a step with noise."""
 
+from typing import Any
+
 import diffrax
 import jax
 import jax.numpy as jnp
@@ -43,7 +45,7 @@ def test_numbers_are_drawn_once_a_step(solver, shape, is_rewritten):
 
     def alone(key, y0):
         def body(total, n):
-            value = path(key).evaluate(n * 0.1, (n + 1) * 0.1, use_levy=True)
+            value: Any = path(key).evaluate(n * 0.1, (n + 1) * 0.1, use_levy=True)
             return total + value.W + value.H, None
 
         return jax.lax.scan(body, y0, jnp.arange(50.0))[0]

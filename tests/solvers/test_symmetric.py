@@ -1,5 +1,7 @@
 """Symmetric methods for long times: the implicit midpoint rule at the mean, and compositions."""
 
+from typing import Any
+
 import diffrax
 import equinox as eqx
 import jax
@@ -159,7 +161,7 @@ def test_linear_momenta_and_lengths_stay():
 
 @pytest.mark.slow
 def test_the_energy_of_the_midpoint_does_not_drift():
-    ys = cfjax.integrate(
+    ys: Any = cfjax.integrate(
         TERM, MIDPOINT, 0.0, 1e4, START, INERTIA, num_steps=100_000, save_every=100
     ).ys
     energies = np.asarray(jnp.sum(ys**2 / INERTIA, axis=1) / 2)
