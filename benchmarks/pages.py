@@ -434,7 +434,7 @@ def first_call() -> list[list[str]]:
         base, *others = (one(rows, problem=problem, way=way, method=m) for m in methods)
         cells = [f"1 ({cell(base['CPU seconds'])} s)"]
         cells += [f"{cell(r['over Tsit5'])}; {two_digits(r['CPU seconds'][2])} s" for r in others]
-        table.append([problem, WAYS.get(way, way), *cells])
+        table.append([problem, str(WAYS.get(way, way)), *cells])
     return table
 
 
