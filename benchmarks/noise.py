@@ -21,6 +21,7 @@ from jax import lax
 from jaxtyping import Array, Float
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
+from matplotlib.ticker import NullFormatter
 
 import cfjax
 import results
@@ -33,14 +34,11 @@ class Projected(diffrax.AbstractWrappedSolver):
     """A solver in plain space that goes to the nearest point of the sphere after each step."""
 
     solver: Any
+    interpolation_cls: ClassVar[Any] = diffrax.LocalLinearInterpolation
 
     @property
     def term_structure(self):
         return self.solver.term_structure
-
-    @property
-    def interpolation_cls(self):
-        return self.solver.interpolation_cls
 
     def order(self, terms):
         return self.solver.order(terms)
@@ -135,7 +133,7 @@ class Grid(diffrax.AbstractBrownianPath):
     def t1(self):
         return 1.0
 
-    def evaluate(self, t0, t1=None, left=True, use_levy=False):
+    def evaluate(self, t0: Any, t1: Any = None, left: bool = True, use_levy: bool = False) -> Any:
         start, end = self._at(t0), self._at(t1)
         w = end[0] - start[0]
         if not use_levy:
@@ -164,7 +162,7 @@ class Given(diffrax.AbstractBrownianPath):
     def t1(self):
         return jnp.inf
 
-    def evaluate(self, t0, t1=None, left=True, use_levy=False):
+    def evaluate(self, t0: Any, t1: Any = None, left: bool = True, use_levy: bool = False) -> Any:
         if not use_levy:
             return self.w
         return diffrax.SpaceTimeLevyArea(dt=t1 - t0, W=self.w, H=self.area)
@@ -196,11 +194,11 @@ def states(name: str, terms: Any, t0: Any, t1: Any, y0: Any, steps: int) -> Arra
 
 # On the path: errors at t = 1.
 
-_RNG = np.random.default_rng(0)
-_CONSTANT, _LINEAR = 0.6 * _RNG.normal(size=(3, 3)), 0.3 * _RNG.normal(size=(3, 3, 3))
+RNG = np.random.default_rng(0)
+CONSTANT, LINEAR = 0.6 * RNG.normal(size=(3, 3)), 0.3 * RNG.normal(size=(3, 3, 3))
 # A single channel commutes with itself.
 STRONG = {
-    noise: Equation(channels, lambda y, n=channels + 1: (_CONSTANT + _LINEAR @ y)[:n])
+    noise: Equation(channels, lambda y, n=channels + 1: jnp.asarray(CONSTANT + LINEAR @ y)[:n])
     for channels, noise in ((2, "two channels"), (1, "one channel"))
 }
 Y0 = np.array([0.48, 0.6, 0.64])
@@ -252,10 +250,10 @@ def root_mean_square(values: Array) -> Array:
 IN_THE_MEAN = "in the mean"
 END, DRIFT, STRENGTH = 2.0, 0.5, 0.8
 DEGREE, NODES = 24, 10  # more of either change no digit that is shown
-Z, _WEIGHTS = np.polynomial.legendre.leggauss(DEGREE + 1)
+Z, WEIGHTS = np.polynomial.legendre.leggauss(DEGREE + 1)
 # A row for each polynomial: products with it, over its square.
-_PROJECTION = (np.arange(DEGREE + 1) + 0.5)[:, None] * (
-    _WEIGHTS * np.polynomial.legendre.legvander(Z, DEGREE).T
+PROJECTION = (np.arange(DEGREE + 1) + 0.5)[:, None] * (
+    WEIGHTS * np.polynomial.legendre.legvander(Z, DEGREE).T
 )
 
 
@@ -278,10 +276,10 @@ def weak() -> Iterator[results.Row]:
         exact = expected_height(scipy.linalg.expm(END * generator(is_ito=name == "LieEuler")))
         program = mean_of_step(name)
         for count in (4, 8, 16, 32, 64):
-            matrix = _PROJECTION @ np.asarray(program(END / count))
+            matrix = PROJECTION @ np.asarray(program(END / count))
             error = expected_height(np.linalg.matrix_power(matrix, count)) - exact
             # Over all starts on the sphere.
-            mean = np.sqrt(_WEIGHTS @ error**2 / 2)
+            mean = np.sqrt(WEIGHTS @ error**2 / 2)
             yield {
                 "problem": IN_THE_MEAN,
                 "method": name,
@@ -308,7 +306,7 @@ def mean_of_step(name: str) -> Callable[[Any], Array]:
     start = np.stack([np.sqrt(1 - Z**2), np.zeros_like(Z), Z], axis=1)
 
     def program(h: Any) -> Array:
-        def step(y: Array, w: Array, area: Array) -> Array:
+        def step(y: Array, w: Any, area: Any) -> Array:
             path = Given(jnp.sqrt(h) * w, jnp.sqrt(h / 12) * area)
             return states(name, AXISYMMETRIC.terms(name, path), 0.0, h, y, 1)[-1]
 
@@ -337,7 +335,7 @@ def generator(*, is_ito: bool) -> np.ndarray:
         slope = np.polynomial.Legendre.basis(n).convert(kind=polynomial).deriv()
         noise = g * g * (round_z * slope).deriv() if is_ito else g * (round_z * g * slope).deriv()
         columns.append((noise / 2 + DRIFT * round_z * slope)(Z))
-    return _PROJECTION @ np.stack(columns, axis=1)
+    return PROJECTION @ np.stack(columns, axis=1)
 
 
 # What a step costs in a batch.
@@ -386,11 +384,11 @@ SPIN = Equation(3, spin_turns)
 
 
 def too_large(quick: bool) -> Iterator[results.Row]:
-    copies, duration = (500, 20.0) if quick else (4000, 100.0)
+    copies, duration = (500, 20.0) if quick else (2000, 100.0)
     keys = jax.random.split(jax.random.key(3), copies)
     for name in SOLVERS:
         program = equilibrium(name)
-        for h in np.geomspace(0.05, 50, 7 if quick else 13):
+        for h in np.geomspace(0.02, 50, 8 if quick else 15):
             # Some time is for forgetting the start.
             forget, keep = (max(4, round(x / (BLOCK * h))) for x in (10.0, duration))
             heights, off = (np.asarray(x) for x in program(keys, h, forget, keep))
@@ -445,10 +443,10 @@ def cost(quick: bool) -> Iterator[results.Row]:
         programs |= {name: of_spins(count, steps, name, unsafe) for name in ON_SPHERE}
         programs |= {f"{name}, tree": of_spins(count, steps, name, tree) for name in OF_TREE}
         programs |= {name: numbers_alone(count, steps, area) for name, area in PATHS.items()}
-        compiling: list[list[float]] = []
+        compiling, runs = [], ()
         for _ in range(1 if quick else 5):
             runs, seconds = zip(*(timed_compile(make()) for make in programs.values()), strict=True)
-            compiling.append(list(seconds))
+            compiling.append(seconds)
         running = take_turns(runs, repeats=5 if quick else 25)
         times = dict(zip(programs, zip(running, np.transpose(compiling), strict=True), strict=True))
         for name, (run, to_compile) in times.items():
@@ -576,67 +574,99 @@ STYLES |= {
 
 
 def draw() -> dict[str, Figure]:
+    found = results.load("noise")
     figure = _style.new_figure(
-        (10.5, 9.0),
-        "Full lines: cfjax, on the sphere. Dashed: diffrax in plain space; dotted: with a "
-        "projection to the sphere after each step. Grey lines show orders. LieEuler is compared "
-        "with the solution in the sense of Itô. Times are for float64 on two cores, per path in a "
-        f"batch of {SYSTEMS}, the random numbers included.",
+        (10.5, 9.6),
+        "Full lines: cfjax, on the sphere. Dashed: diffrax in plain space. Dotted: the same with a "
+        "projection to the sphere after each step. Grey: orders. LieEuler is compared with the "
+        "solution in the sense of Itô, all others with that in the sense of Stratonovich. Times "
+        f"are those of a path in a batch of {SYSTEMS}, random numbers included, in float64 on "
+        f"{found['machine']['cores']} cores. Last panel: thin lines are distances from the sphere, "
+        "and the grey area is twice the standard error; a line ends where a state overflows.",
     )
     panels = figure.subplots(2, 2)
-    for axes, (problem, (title, label, orders)) in zip(panels.flat, PANELS.items(), strict=False):
-        _errors(axes, problem, orders)
-        axes.set(title=title, ylabel=label)
-    _too_large(panels[1, 1])
+    for axes, (problem, panel) in zip(panels.flat, PANELS.items(), strict=False):
+        _errors(axes, results.pick(found["rows"], problem=problem), panel)
+    _too_large(panels[1, 1], results.pick(found["rows"], problem=TOO_LARGE))
     for axes in panels.flat:
         axes.title.set_fontsize(10)
     _style.finish(figure, columns=4)
     return {"noise": figure}
 
 
-# The orders, each with the place of its line: parts of the width and height.
-PANELS: dict[str, tuple[str, str, dict[float, tuple[float, float]]]] = {
-    "two channels": (
-        "General noise of two channels: order 1/2 for all",
-        "error of a path at t = 1, rms",
-        {0.5: (0.1, 0.2)},
+ORDERS = {0.5: "1/2", 1: "1", 1.5: "3/2", 2: "2"}
+
+
+class Panel(NamedTuple):
+    """With the orders to draw, and where they begin: parts of the width and of the height."""
+
+    title: str
+    error: str
+    orders: tuple[float, ...]
+    place: tuple[float, float]
+
+
+PANELS = {
+    "two channels": Panel(
+        "General noise of two channels: all have order 1/2",
+        "error of a path at t = 1 (rms)",
+        (0.5,),
+        (0.06, 0.3),
     ),
-    "one channel": (
-        "One channel, or noise that commutes: order 3/2 with the areas",
-        "error of a path at t = 1, rms",
-        {0.5: (0.6, 0.9), 1: (0.6, 0.9), 1.5: (0.6, 0.9)},
+    "one channel": Panel(
+        "One channel, so that noise commutes:\nthe area gives ShiftedNoise order 3/2",
+        "error of a path at t = 1 (rms)",
+        (0.5, 1, 1.5),
+        (0.62, 0.97),
     ),
-    IN_THE_MEAN: (
-        "Error of the mean, computed without random numbers",
-        "error of the mean of z at t = 2, rms over starts",
-        {1: (0.6, 0.9), 2: (0.6, 0.9)},
+    IN_THE_MEAN: Panel(
+        "Error of the mean, without random numbers:\nWeakOrder2 has order 2",
+        "error of the mean height at t = 2 (rms over starts)",
+        (1, 2),
+        (0.06, 0.45),
     ),
 }
 
 
-def _errors(axes: Axes, problem: str, orders: dict[float, tuple[float, float]]) -> None:
-    rows = results.pick(results.load("noise")["rows"], problem=problem)
+def _errors(axes: Axes, rows: list[results.Row], panel: Panel) -> None:
     for name, style in STYLES.items():
         points = [row for row in results.pick(rows, method=name) if "error" in row]
-        timed = [row for row in results.pick(rows, method=name) if "systems" in row]
         if points:
-            seconds = [row["steps"] * timed[0]["seconds a step"][2] for row in points]
-            errors = np.array([row["error"] for row in points], float)
-            label = name if problem == "two channels" else None
-            axes.plot(seconds, errors, label=label, markersize=5, **style)
-    axes.set(yscale="log")
+            (timed,) = (row for row in results.pick(rows, method=name) if "systems" in row)
+            seconds = [row["steps"] * timed["seconds a step"][2] for row in points]
+            axes.plot(seconds, [row["error"] for row in points], markersize=5, **style)
+    axes.set(yscale="log", title=panel.title, ylabel=panel.error)
+    axes.yaxis.set_minor_formatter(NullFormatter())
     _style.logarithmic(axes, "time of a path", "s")
+    (left, right), (low, high) = (np.log(limits) for limits in (axes.get_xlim(), axes.get_ylim()))
+    x0, y0 = left + panel.place[0] * (right - left), low + panel.place[1] * (high - low)
+    for order in panel.orders:
+        x1 = x0 + min(0.25 * (right - left), 0.25 * (high - low) / order)
+        y1 = y0 - order * (x1 - x0)
+        axes.plot(np.exp([x0, x1]), np.exp([y0, y1]), color="0.6", linewidth=1)
+        axes.text(np.exp(x1), np.exp(y1), f" {ORDERS[order]}", color="0.4", fontsize=8, va="center")
 
 
-def _too_large(axes: Axes) -> None:
-    rows = results.pick(results.load("noise")["rows"], problem=TOO_LARGE)
+def _too_large(axes: Axes, rows: list[results.Row]) -> None:
     for name, style in STYLES.items():
         found = results.pick(rows, method=name)
-        step, mean, off = (
-            np.array([row[key] for row in found], float)
-            for key in ("step", "mean", "off the sphere")
-        )
-        axes.loglog(step, np.abs(mean - MEAN), markersize=5, **style)
+        keys = ("step", "mean", "standard error", "off the sphere")
+        step, mean, uncertain, off = (np.array([row[k] for row in found], float) for k in keys)
+        axes.loglog(step, np.abs(mean - MEAN), label=name, markersize=5, **style)
+        if name == [*ON_SPHERE][-1]:
+            # The methods of diffrax begin a column of the legend.
+            axes.plot([], [], " ", label=" ")
+        if name in IN_SPACE:
+            axes.loglog(step, off, color=style["color"], linewidth=0.8)
+        if name == "CF4":
+            axes.fill_between(step, 1e-9, 2 * uncertain, color="0.9", linewidth=0)
+    axes.set(
+        title="Spin at a temperature: methods on the sphere stay there,\n"
+        "but are wrong if a step is a large angle",
+        xlabel="step h (about the angle of a step)",
+        ylabel="error of the mean height at rest",
+        ylim=(2e-4, 3),
+    )
 
 
 if __name__ == "__main__":
