@@ -579,7 +579,8 @@ def draw() -> dict[str, Figure]:
         (10.5, 9.6),
         "Full lines: cfjax, on the sphere. Dashed: diffrax in plain space. Dotted: the same with a "
         "projection to the sphere after each step. Grey: orders. LieEuler is compared with the "
-        "solution in the sense of Itô, all others with that in the sense of Stratonovich. Times "
+        "solution in the sense of Itô, all others with that in the sense of Stratonovich. Errors "
+        "of a mean are an rms over all starts. Times "
         f"are those of a path in a batch of {SYSTEMS}, random numbers included, in float64 on "
         f"{found['machine']['cores']} cores. Last panel: thin lines are distances from the sphere, "
         "and the grey area is twice the standard error; a line ends where a state overflows.",
@@ -604,6 +605,7 @@ class Panel(NamedTuple):
     error: str
     orders: tuple[float, ...]
     place: tuple[float, float]
+    bottom: float | None = None
 
 
 PANELS = {
@@ -611,7 +613,8 @@ PANELS = {
         "General noise of two channels: all have order 1/2",
         "error of a path at t = 1 (rms)",
         (0.5,),
-        (0.06, 0.3),
+        (0.06, 0.4),
+        bottom=7e-3,
     ),
     "one channel": Panel(
         "One channel, so that noise commutes:\nthe area gives ShiftedNoise order 3/2",
@@ -621,7 +624,7 @@ PANELS = {
     ),
     IN_THE_MEAN: Panel(
         "Error of the mean, without random numbers:\nWeakOrder2 has order 2",
-        "error of the mean height at t = 2 (rms over starts)",
+        "error of the mean height at t = 2",
         (1, 2),
         (0.06, 0.45),
     ),
@@ -636,6 +639,7 @@ def _errors(axes: Axes, rows: list[results.Row], panel: Panel) -> None:
             seconds = [row["steps"] * timed["seconds a step"][2] for row in points]
             axes.plot(seconds, [row["error"] for row in points], markersize=5, **style)
     axes.set(yscale="log", title=panel.title, ylabel=panel.error)
+    axes.set_ylim(bottom=panel.bottom)
     axes.yaxis.set_minor_formatter(NullFormatter())
     _style.logarithmic(axes, "time of a path", "s")
     (left, right), (low, high) = (np.log(limits) for limits in (axes.get_xlim(), axes.get_ylim()))
@@ -664,7 +668,7 @@ def _too_large(axes: Axes, rows: list[results.Row]) -> None:
         title="Spin at a temperature: methods on the sphere stay there,\n"
         "but are wrong if a step is a large angle",
         xlabel="step h (about the angle of a step)",
-        ylabel="error of the mean height at rest",
+        ylabel="error of the mean height in equilibrium",
         ylim=(2e-4, 3),
     )
 

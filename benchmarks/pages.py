@@ -552,28 +552,26 @@ def _noise(problem: str) -> dict[str, list[Row]]:
     return {name: pick(rows, method=name) for name in values(rows, "method")}
 
 
-def _noise_errors(*problems: str) -> list[list[str]]:
-    """The errors with some numbers of steps, the observed order, and the time."""
-    found = {problem: _noise(problem) for problem in problems}
-    head, table = [""], {}
-    for problem, methods in found.items():
-        case = f"{problem}, " * (len(problems) > 1)
-        counts = [row["steps"] for row in next(iter(methods.values())) if "error" in row]
+def _noise_errors(problem: str) -> list[list[str]]:
+    """The errors with some numbers of steps, the observed order, and the time of a step."""
+    table = []
+    for name, rows in _noise(problem).items():
+        errors = {row["steps"]: row["error"] for row in rows if "error" in row}
+        if not errors:
+            continue
+        counts = list(errors)
         shown = (counts[0], counts[len(counts) // 2], counts[-1])
-        head += [f"{case}{n} steps" for n in shown] + [f"{case}order", f"{case}time over `CF2`"]
-        for name, rows in methods.items():
-            errors = {row["steps"]: row["error"] for row in rows if "error" in row}
-            if errors:
-                logs = ([math.log(x) for x in values] for values in (errors, errors.values()))
-                order = -statistics.linear_regression(*logs).slope
-                (time,) = (row["over CF2"] for row in rows if "over CF2" in row)
-                cells = [f"{errors[n]:.1e}".replace("e-0", "e-") for n in shown]
-                table.setdefault(name, [noise_name(name)])
-                table[name] += [*cells, f"{order:.1f}", cell(time)]
-    return [head, *table.values()]
+        if not table:
+            table.append(["", *(f"{n} steps" for n in shown), "order", "time over `CF2`"])
+        logs = ([math.log(x) for x in values] for values in (errors, errors.values()))
+        order = -statistics.linear_regression(*logs).slope
+        (time,) = (row["over CF2"] for row in rows if "over CF2" in row)
+        cells = [f"{errors[n]:.1e}".replace("e-0", "e-") for n in shown]
+        table.append([_noise_name(name), *cells, f"{order:.1f}", cell(time)])
+    return table
 
 
-def noise_name(name: str) -> str:
+def _noise_name(name: str) -> str:
     """With the name of the solver as code."""
     solver, *others = name.split(", ")
     is_solver = solver[0].isupper()
@@ -581,12 +579,17 @@ def noise_name(name: str) -> str:
 
 
 @table
-def noise_strong() -> list[list[str]]:
-    return _noise_errors("two channels", "one channel")
+def noise_two_channels() -> list[list[str]]:
+    return _noise_errors("two channels")
 
 
 @table
-def noise_weak() -> list[list[str]]:
+def noise_one_channel() -> list[list[str]]:
+    return _noise_errors("one channel")
+
+
+@table
+def noise_in_the_mean() -> list[list[str]]:
     return _noise_errors("in the mean")
 
 
@@ -604,7 +607,7 @@ def noise_steps() -> list[list[str]]:
         return f"{row['mean']:.3f}" + (f", off by {two_digits(off)}" if off > 1e-9 else "")
 
     return [["", *(f"h = {two_digits(h)}" for h in shown)]] + [
-        [noise_name(name), *(text(one(rows, step=h)) for h in shown)]
+        [_noise_name(name), *(text(one(rows, step=h)) for h in shown)]
         for name, rows in methods.items()
     ]
 
@@ -628,7 +631,7 @@ def noise_cost() -> list[list[str]]:
                 ratio = next(value for key, value in row.items() if key.startswith(over))
                 base = in_units(row[unit][2])
                 cells.append(f"1 ({base})" if program == "CF4, no noise" else cell(ratio))
-        table.append([noise_name(program), *cells])
+        table.append([_noise_name(program), *cells])
     return table
 
 
