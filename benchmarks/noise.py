@@ -384,7 +384,7 @@ SPIN = Equation(3, spin_turns)
 
 
 def too_large(quick: bool) -> Iterator[results.Row]:
-    copies, duration = (500, 20.0) if quick else (2000, 100.0)
+    copies, duration = (500, 20.0) if quick else (4000, 100.0)
     keys = jax.random.split(jax.random.key(3), copies)
     for name in SOLVERS:
         program = equilibrium(name)
