@@ -7,7 +7,9 @@ hyphens.
 
 import argparse
 import itertools
+import math
 import re
+import statistics
 import sys
 from collections.abc import Callable, Iterable
 from pathlib import Path
@@ -27,6 +29,7 @@ PICTURES = {
     "batch": 120,
     "chain": 120,
     "charts": 200,
+    "noise": 120,
     "peers": 120,
     "stability": 100,
     "tolerances": 120,
@@ -541,6 +544,110 @@ def peers_kuramoto() -> list[list[str]]:
 @number
 def peers_versions() -> str:
     return ", ".join(sorted(values(load("peers")["rows"], "package")))
+
+
+def _noise(problem: str) -> dict[str, list[Row]]:
+    """What is measured of each method."""
+    rows = pick(load("noise")["rows"], problem=problem)
+    return {name: pick(rows, method=name) for name in values(rows, "method")}
+
+
+def _noise_errors(problem: str) -> list[list[str]]:
+    """The errors with some numbers of steps, the observed order, and the time of a step."""
+    table = []
+    for name, rows in _noise(problem).items():
+        errors = {row["steps"]: row["error"] for row in rows if "error" in row}
+        if not errors:
+            continue
+        counts = list(errors)
+        shown = (counts[0], counts[len(counts) // 2], counts[-1])
+        if not table:
+            table.append(["", *(f"{n} steps" for n in shown), "order", "time over `CF2`"])
+        logs = ([math.log(x) for x in values] for values in (errors, errors.values()))
+        order = -statistics.linear_regression(*logs).slope
+        (time,) = (row["over CF2"] for row in rows if "over CF2" in row)
+        cells = [f"{errors[n]:.1e}".replace("e-0", "e-") for n in shown]
+        table.append([_noise_name(name), *cells, f"{order:.1f}", cell(time)])
+    return table
+
+
+def _noise_name(name: str) -> str:
+    """With the name of the solver as code."""
+    solver, *others = name.split(", ")
+    is_solver = solver[0].isupper()
+    return ", ".join([f"`{solver}`" if is_solver else solver, *others])
+
+
+@table
+def noise_two_channels() -> list[list[str]]:
+    return _noise_errors("two channels")
+
+
+@table
+def noise_one_channel() -> list[list[str]]:
+    return _noise_errors("one channel")
+
+
+@table
+def noise_in_the_mean() -> list[list[str]]:
+    return _noise_errors("in the mean")
+
+
+@table
+def noise_steps() -> list[list[str]]:
+    methods = _noise("steps too large")
+    steps = values(next(iter(methods.values())), "step")
+    shown = [min(steps, key=lambda h: abs(math.log(h / x))) for x in (0.05, 0.5, 5.0, 50.0)]
+
+    def text(row: Row) -> str:
+        if row["mean"] is None:
+            return "overflow"
+        # On the sphere up to rounding.
+        off = row["off the sphere"]
+        return f"{row['mean']:.3f}" + (f", off by {two_digits(off)}" if off > 1e-9 else "")
+
+    return [["", *(f"h = {two_digits(h)}" for h in shown)]] + [
+        [_noise_name(name), *(text(one(rows, step=h)) for h in shown)]
+        for name, rows in methods.items()
+    ]
+
+
+@number
+def noise_mean() -> str:
+    # Langevin's function at a field of four times the temperature.
+    return f"{1 / math.tanh(4) - 1 / 4:.3f}"
+
+
+@table
+def noise_cost() -> list[list[str]]:
+    rows = [row for row in load("noise")["rows"] if "spins" in row]
+    counts = values(rows, "spins")
+    names = {1: "one spin", 4096: "4096 spins"}
+    table = [["", *(f"{what}, {names[n]}" for n in counts for what in ("a step", "to compile"))]]
+    for program in values(rows, "program"):
+        cells = []
+        for row in (one(rows, spins=n, program=program) for n in counts):
+            for unit, over in (("seconds a step", "over "), ("CPU seconds to compile", "to comp")):
+                ratio = next(value for key, value in row.items() if key.startswith(over))
+                base = in_units(row[unit][2])
+                cells.append(f"1 ({base})" if program == "CF4, no noise" else cell(ratio))
+        table.append([_noise_name(program), *cells])
+    return table
+
+
+@table
+def noise_gradients() -> list[list[str]]:
+    rows = [row for row in load("noise")["rows"] if "gradient of steps" in row]
+    return [["steps", "keeps a state", "MiB", "time", "over the solve"]] + [
+        [
+            str(row["gradient of steps"]),
+            row["keeps a state"],
+            two_digits(row["MiB"]),
+            in_units(row["seconds"][2]),
+            cell(row["over the solve"]),
+        ]
+        for row in rows
+    ]
 
 
 def _seconds_of(derivative: str) -> str:
