@@ -212,9 +212,11 @@ class Step(eqx.Module):
 def control_of(terms: diffrax.AbstractTerm, t0: Any, t1: Any, **kwargs: Any) -> PyTree:
     """The control of a step, whose random numbers are drawn once."""
     control = terms.contr(t0, t1, **kwargs)
-    # XLA draws them again for each flow that uses them, but in what is rewritten.
-    is_alone = is_driven(terms) and not is_rewritten()
-    return lax.optimization_barrier(control) if is_alone else control
+    if not is_driven(terms):
+        return control
+    # Otherwise XLA makes normal numbers of the random bits again for each flow that uses them. A
+    # barrier in what is rewritten would keep arrays whole.
+    return materialised_in_rows(control) if is_rewritten() else lax.optimization_barrier(control)
 
 
 def by_turns(
