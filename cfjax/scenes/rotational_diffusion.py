@@ -7,7 +7,7 @@ Dielectric relaxation measures the decay for l = 1, and the fluorescence of dyes
 which is three times as fast.
 
 Source: Perrin, Étude mathématique du mouvement brownien de rotation, Ann. Sci. Éc. Norm. Supér. 45
-(1928), doi:10.24033/asens.791.
+(1928), p. 1-51.
 """
 
 import functools
