@@ -243,8 +243,9 @@ def _check_paths(name: str, terms: PyTree) -> None:
 
 
 def _check_solver(name: str, solver: Any) -> None:
-    is_known = isinstance(solver, diffrax.AbstractStratonovichSolver | LieEuler)
-    if not isinstance(solver, AbstractChartSolver) or not is_known:
+    # For diffrax a wrapped solver is an instance of what it wraps.
+    is_known = issubclass(type(solver), diffrax.AbstractStratonovichSolver | LieEuler)
+    if not issubclass(type(solver), AbstractChartSolver) or not is_known:
         raise TypeError(
             f"{name} must be a commutator-free or Munthe-Kaas method, such as cfjax.CF4(), got "
             f"{solver!r}."
