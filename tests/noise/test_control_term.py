@@ -12,8 +12,8 @@ import lineax as lx
 import numpy as np
 import problems
 import pytest
-from noise.paths import GivenStep
-from noise.paths import noise_of as omega_of
+from brownian_paths import GivenStep
+from brownian_paths import noise_of as omega_of
 
 import cfjax
 

@@ -7,12 +7,12 @@ order 3/2.
 
 from typing import Any
 
+import brownian_paths as paths
 import diffrax
 import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from noise import paths
 from problems import slope
 
 import cfjax

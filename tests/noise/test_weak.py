@@ -16,7 +16,7 @@ import jax.numpy as jnp
 import numpy as np
 import problems
 import pytest
-from noise.paths import GivenStep
+from brownian_paths import GivenStep
 from numpy.polynomial import hermite_e, legendre
 from scipy.linalg import expm
 
