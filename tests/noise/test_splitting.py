@@ -14,7 +14,8 @@ import cfjax
 from cfjax._methods.splitting import splitting_order
 
 # A symmetric top, of moments of inertia J, J and J3: the kinetic energy of a spherical body, and
-# what turns it about its own axis. No two of the terms commute.
+# what turns it about its own axis. These two commute, and neither does with the torque. (A body in
+# four terms is in tests/solvers/test_symmetric.py.)
 J, J3 = 1.0, 0.4
 FRICTION = 0.8
 START = {"q": np.array([0.6, 0.0, 0.48, 0.64]), "m": np.array([0.5, -0.8, 1.1])}
