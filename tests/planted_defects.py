@@ -758,6 +758,60 @@ DEFECTS = [
         "updates in place within a program that is scalarised",
         "xla/test_understood.py",
     ),
+    # Noise.
+    Defect(
+        "_solvers/pieces.py",
+        "((1 / 2, 1 / 2, sqrt(6)), (1 / 2, 1 / 2, -sqrt(6)))",
+        "((1 / 2, 1 / 2, 2.0), (1 / 2, 1 / 2, -2.0))",
+        "too little area of the noise in WeakOrder2",
+        "noise/test_weak.py",
+    ),
+    Defect(
+        "_solvers/pieces.py",
+        "((1 / 2, 1 / 2, sqrt(6)), (1 / 2, 1 / 2, -sqrt(6)))",
+        "((1.0, 1 / 2, sqrt(6)), (0.0, 1 / 2, -sqrt(6)))",
+        "all of the drift in one of the pieces that follow the noise",
+        "noise/test_weak.py",
+    ),
+    Defect(
+        "_solvers/pieces.py",
+        "b * w + c * jnp.sign(h).astype(w.dtype) * area",
+        "b * w + c * area",
+        "the area of noise that is followed backwards, with the other sign",
+        "noise/test_control_term.py -k there_and_back",
+    ),
+    Defect(
+        "_solvers/pieces.py",
+        "((0.0, 0.0, sqrt(3) + 1), (1.0, 1.0, -2 * sqrt(3)), (0.0, 0.0, sqrt(3) - 1))",
+        "((0.0, 0.0, sqrt(3) - 1), (1.0, 1.0, -2 * sqrt(3)), (0.0, 0.0, sqrt(3) + 1))",
+        "the area of the noise in ShiftedNoise, with the other sign",
+        "noise/test_strong.py",
+    ),
+    Defect(
+        "_term.py",
+        """strict=True)]
+        return combine([1.0] * len(parts), parts)
+    if not any""",
+        """strict=True)]
+        return jtu.tree_map(lambda *arrays: sum(arrays[1:], arrays[0]), *parts)
+    if not any""",
+        "terms, of noise for example, that are added array by array",
+        "noise/test_control_term.py -k operator",
+    ),
+    Defect(
+        "_control_term.py",
+        "return jtu.tree_map(lambda x: jnp.where(is_back, -x, x), value)",
+        "return value",
+        "noise that does not turn round when it is followed backwards",
+        "noise/test_control_term.py -k backwards",
+    ),
+    Defect(
+        "_solvers/splitting.py",
+        "turns += [(k, x.back, x.end) for k in reversed(range(1, last))]",
+        "turns += [(k, x.back, x.end) for k in range(1, last)]",
+        "a splitting whose way back is not the mirror image",
+        "solvers/test_symmetric.py -k four_terms",
+    ),
 ]
 
 

@@ -10,7 +10,7 @@ from jax import lax
 from .._control_term import is_driven
 from .._methods.splitting import COMPOSITIONS
 from .base import AbstractLieSolver, State, by_turns, result_of, time_at
-from .dense import Pieces
+from .dense import Pieces, as_part
 
 
 class _Turn(NamedTuple):
@@ -99,8 +99,7 @@ class Composition(AbstractLieSolver):
             )
             if not self.shows_failure:
                 result = diffrax.RESULTS.where(diffrax.is_okay(result), new, result)
-            part = self.solver.interpolation_cls(t0=0.0, t1=1.0, **dense_info)
-            return (y, state, result), part
+            return (y, state, result), as_part(self.solver, dense_info, t0)
 
         turns = list(itertools.starmap(_Turn, itertools.pairwise(ends)))
         carry = y0, solver_state, diffrax.RESULTS.successful

@@ -63,6 +63,12 @@ class Pieces(diffrax.AbstractLocalInterpolation):
         return point
 
 
+def as_part(solver: Any, dense_info: dict[str, Any], t: Any) -> Any:
+    """The output of a step for times from 0 to 1, which are arrays, as diffrax stores them."""
+    zero = jnp.zeros((), jnp.result_type(t))
+    return solver.interpolation_cls(t0=zero, t1=zero + 1, **dense_info)
+
+
 def part_of_step(step: Any, t: Any) -> Real[Array, ""]:
     """The part of a step at a time."""
     with jax.numpy_dtype_promotion("standard"):

@@ -19,7 +19,7 @@ from jaxtyping import PyTree
 from .._term import product
 from .base import AbstractChartSolver, AbstractLieSolver, by_turns, control_of, result_of, time_at
 from .commutator_free import CF4, LieEuler
-from .dense import Pieces
+from .dense import Pieces, as_part
 from .dependence import depending_on_state
 
 
@@ -89,7 +89,7 @@ class AbstractPieces(AbstractLieSolver, diffrax.AbstractStratonovichSolver):
                 start, end = (time_at(c, t0, t1) for c in (piece.start, piece.start + piece.time))
                 along = _along(terms, control, piece)
                 y, _, dense_info, state, _ = solver.step(along, start, end, y, args, state, False)
-                return (y, state), solver.interpolation_cls(t0=0.0, t1=1.0, **dense_info)
+                return (y, state), as_part(solver, dense_info, t0)
 
             carry, more = by_turns(follow, carry, list(alike))
             parts += more
@@ -243,8 +243,9 @@ def _check_paths(name: str, terms: PyTree) -> None:
 
 
 def _check_solver(name: str, solver: Any) -> None:
-    is_known = isinstance(solver, diffrax.AbstractStratonovichSolver | LieEuler)
-    if not isinstance(solver, AbstractChartSolver) or not is_known:
+    # For diffrax a wrapped solver is an instance of what it wraps.
+    is_known = issubclass(type(solver), diffrax.AbstractStratonovichSolver | LieEuler)
+    if not issubclass(type(solver), AbstractChartSolver) or not is_known:
         raise TypeError(
             f"{name} must be a commutator-free or Munthe-Kaas method, such as cfjax.CF4(), got "
             f"{solver!r}."

@@ -1,0 +1,455 @@
+"""Equations with noise whose answers are known: means over many paths, and solutions path by path.
+
+The means have a statistical error, of which five times the standard error are allowed, and the weak
+error of the steps, stated for each. All copies are leading axes of one state.
+"""
+
+from typing import Any
+
+import diffrax
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from scipy.linalg import expm
+
+import cfjax
+
+number = pytest.mark.parametrize(
+    "number", [4000, pytest.param(200_000, marks=pytest.mark.slow)], ids=["few", "many"]
+)
+
+
+def brownian(shape: tuple[int, ...], seed: int = 0) -> diffrax.UnsafeBrownianPath:
+    key = jax.random.key(seed)
+    return diffrax.UnsafeBrownianPath(shape, key, levy_area=diffrax.SpaceTimeLevyArea)
+
+
+def solve(drift: Any, noise: Any, shape: Any, solver: Any, y0: Any, t1: float, n: int, args=None):
+    """The end of `n` steps; no drift is None."""
+    term: Any = cfjax.LieControlTerm(noise, brownian(shape))
+    if drift is not None:
+        term = diffrax.MultiTerm(cfjax.LieTerm(drift), term)
+    return cfjax.integrate(term, solver, 0.0, t1, y0, args, num_steps=n).ys
+
+
+def ends(*args: Any) -> Any:
+    return jax.tree.map(lambda x: x[-1], solve(*args))
+
+
+def copies(y: Any, number: int) -> jax.Array:
+    y = jnp.asarray(y)
+    return jnp.broadcast_to(y, (number, *y.shape))
+
+
+def assert_mean(samples: Any, expected: Any, weak_error: float) -> None:
+    samples = np.asarray(samples)
+    mean, n = samples.mean(0), len(samples)
+    # Of complex numbers the deviation is that of both parts.
+    error = np.abs(mean - expected)
+    allowed = 5 * samples.std(0) / np.sqrt(n) + weak_error
+    assert np.all(error < allowed), (error, allowed)
+
+
+def hat(w: Any) -> np.ndarray:
+    return np.cross(np.eye(3), np.asarray(w)).T * -1.0
+
+
+RATES = np.array([0.5, 0.8, 1.1])
+
+
+# Groups
+
+
+@number
+def test_brownian_motion_of_attitudes(number):
+    """`E[R] = exp(T (hat(W) + sum_k s_k^2 hat(e_k)^2 / 2)) R(0)`."""
+    turn = np.array([0.3, -0.7, 0.5])
+    start = expm(hat([0.4, 0.1, -0.9]))
+
+    def drift(t, y, args):
+        return cfjax.Rotation(jnp.asarray(turn)[None])
+
+    def noise(t, y, args, dw):
+        return cfjax.Rotation(RATES[None] * dw)
+
+    found = ends(
+        drift, noise, (number, 3), cfjax.WeakOrder2(cfjax.CF3()), copies(start, number), 1.0, 8
+    )
+    squares = sum(s**2 / 2 * hat(e) @ hat(e) for s, e in zip(RATES, np.eye(3), strict=True))
+    # Of order 2: 1e-3 at steps of 1/8.
+    assert_mean(found, expm(hat(turn) + squares) @ start, 1e-3)
+
+
+@number
+def test_noise_of_an_inertial_sensor(number):
+    """`E[T] = T(0) exp(t (X + sum_k s_k^2 E_k^2 / 2))` for the noise of a pose in its own frame."""
+    rates = np.array([0.5, 0.3, 0.6, 0.2, 0.7, 0.4])
+    twist = np.array([0.3, -0.7, 0.5, 1.0, 0.2, -0.4])
+
+    def generator(x):
+        return np.block([[hat(x[:3]), np.reshape(x[3:], (3, 1))], [np.zeros((1, 4))]])
+
+    def motion(x):
+        return cfjax.RigidMotion(omega=x[:, :3], v=x[:, 3:], frame="body")
+
+    start = expm(generator(twist[::-1]))
+    found = ends(
+        lambda t, y, args: motion(jnp.asarray(twist)[None]),
+        lambda t, y, args, dw: motion(rates[None] * dw),
+        (number, 6),
+        cfjax.WeakOrder2(cfjax.CF3()),
+        copies(start, number),
+        1.0,
+        8,
+    )
+    squares = sum(
+        s**2 / 2 * generator(e) @ generator(e) for s, e in zip(rates, np.eye(6), strict=True)
+    )
+    assert_mean(found, start @ expm(generator(twist) + squares), 1e-3)
+
+
+@number
+def test_random_circuit(number):
+    """`E|tr U|^2 = 1 + (d^2 - 1) exp(-d s^2 T)` for noise that is the same in all of U(d)."""
+    d, s = 3, 0.4
+
+    def noise(t, y, args, dw):
+        upper, lower = jnp.triu(dw, 1), jnp.swapaxes(jnp.tril(dw, -1), -1, -2)
+        half = ((jnp.triu(dw) - upper) / 2).astype(complex) + jax.lax.complex(
+            upper, lower
+        ) * np.sqrt(0.5).item()
+        return cfjax.LeftMatrix(1j * s * (half + jnp.conj(jnp.swapaxes(half, -1, -2))))
+
+    start = copies(jnp.eye(d, dtype=complex), number)
+    found = ends(None, noise, (number, d, d), cfjax.CF2(), start, 1.0, 16)
+    squares = np.abs(np.trace(found, axis1=1, axis2=2)) ** 2
+    # As below for Perrin's formula, of a rate of d s^2: a part (d s^2)^2 / (12 16) of 8.
+    assert_mean(squares, 1 + (d**2 - 1) * np.exp(-d * s**2), 0.01)
+
+
+@number
+def test_a_qubit_with_two_noises_that_do_not_commute(number):
+    """The mean of the projectors is the solution of Lindblad's equation."""
+    h = np.array([[0.5, 0.2 - 0.3j], [0.2 + 0.3j, -0.5]])
+    noises = np.array([[[0.6, 0.1], [0.1, -0.6]], [[0.0, -0.5j], [0.5j, 0.2]]])
+
+    def noise(t, y, args, dw):
+        total = jnp.einsum("nk,kij->nij", dw.astype(complex), jnp.asarray(noises))
+        return cfjax.LeftMatrix(-1j * total)
+
+    start = np.array([[0.6], [0.8j]])
+    found = np.asarray(
+        ends(
+            lambda t, y, args: cfjax.LeftMatrix(jnp.asarray(-1j * h)[None]),
+            noise,
+            (number, 2),
+            cfjax.WeakOrder2(cfjax.CF3()),
+            copies(start, number),
+            1.5,
+            8,
+        )
+    )
+
+    def commutator(a):
+        return np.kron(a, np.eye(2)) - np.kron(np.eye(2), a.T)
+
+    squares = sum(commutator(s) @ commutator(s) / 2 for s in noises)
+    rho = expm(1.5 * (-1j * commutator(h) - squares)) @ np.ravel(start @ np.conj(start.T))
+    assert_mean(found @ np.conj(np.swapaxes(found, 1, 2)), rho.reshape(2, 2), 2e-3)
+
+
+# Spheres and their like
+
+
+@number
+def test_rotational_diffusion(number):
+    """Perrin: `E[P_l(m @ m(0))] = exp(-l (l + 1) s^2 T / 2)`."""
+    s, n = 0.7, 20
+
+    def noise(t, y, args, dw):
+        return cfjax.Rotation(s * dw)
+
+    start = jnp.asarray([0.48, 0.6, 0.64])
+    found = ends(None, noise, (number, 3), cfjax.CF4(), copies(start, number), 1.0, n) @ start
+    degrees = np.arange(1, 4)
+    values = np.polynomial.legendre.legvander(np.asarray(found), 3)[:, 1:]
+    rates = degrees * (degrees + 1) * s**2 / 2
+    # The mean of a rotation by a normal vector of variance v is 1 - v + 5 v^2 / 12 and not exp(-v),
+    # and for l = 2, 3 alike: a part of less than rate^2 / (4 n).
+    assert_mean(values, np.exp(-rates), float(np.max(rates**2 * np.exp(-rates)) / (4 * n)))
+
+
+@number
+def test_brownian_motion_on_a_sphere_of_dimension_4(number):
+    """`E[y @ y(0)] = exp(-(n - 1) s^2 T / 2)` for n coordinates."""
+    s = 0.6
+    start = jnp.ones(5) / np.sqrt(5)
+
+    def noise(t, y, args, dw):
+        return cfjax.SphereRotation(s * dw)
+
+    found = ends(None, noise, (number, 5), cfjax.CF2(), copies(start, number), 1.0, 16) @ start
+    # The rate is 0.72, and the error of a step is a part of its square.
+    assert_mean(found, np.exp(-4 * s**2 / 2), 0.72**2 / 16 / 4)
+
+
+@number
+def test_brownian_motion_of_orthonormal_columns(number):
+    """`E[Y] = exp(-(n - p) s^2 T / 2) Y(0)` for noise that leaves the span of p columns."""
+    s = 0.6
+    start, _ = np.linalg.qr(np.random.default_rng(0).standard_normal((4, 2)))
+
+    def noise(t, y, args, dw):
+        along = jnp.einsum("nij,nik->njk", y, dw)
+        return cfjax.LowRankSkew(s * (dw - jnp.einsum("nij,njk->nik", y, along)))
+
+    found = ends(None, noise, (number, 4, 2), cfjax.CF2(), copies(start, number), 1.0, 16)
+    # As on the sphere, with the rate 0.36.
+    assert_mean(found, np.exp(-2 * s**2 / 2) * start, 0.36**2 / 16 / 4)
+
+
+# Equilibrium
+
+
+def langevin(x: float) -> float:
+    return 1 / np.tanh(x) - 1 / x
+
+
+DAMPING, HEAT = 1.0, 1.0
+
+
+def answer_to(field, m):
+    """The angular velocity of spins in a field (Landau, Lifshitz & Gilbert)."""
+    return (field + DAMPING * jnp.cross(m, field)) / (1 + DAMPING**2)
+
+
+def thermal(t, y, args, dw):
+    return cfjax.Rotation(answer_to(np.sqrt(2 * DAMPING * HEAT) * dw, y))
+
+
+@number
+def test_a_spin_at_rest_in_a_field(number):
+    """`<m_z> = L(b / kT)` with Langevin's function L, from spins along the field."""
+    b = 2.0
+
+    def drift(t, y, args):
+        return cfjax.Rotation(answer_to(jnp.asarray([[0.0, 0.0, b]]), y))
+
+    start = copies([0.0, 0.0, 1.0], number)
+    found = ends(drift, thermal, (number, 3), cfjax.WeakOrder2(), start, 5.0, 40)
+    # The slowest decay is exp(-1.2 t), with 2 kT damping / (1 + damping^2) = 1 without the field.
+    # The steps are of order 2.
+    assert_mean(found[:, 2], langevin(b / HEAT), 3e-3)
+
+
+@number
+def test_a_chain_of_spins(number):
+    """Fisher: `<m_i @ m_(i+r)> = L(J / kT)^r` in an open chain."""
+    size, coupling = 8, 2.0
+
+    def drift(t, y, args):
+        zero = jnp.zeros_like(y[:, :1])
+        before = jnp.concatenate([zero, y[:, :-1]], 1)
+        after = jnp.concatenate([y[:, 1:], zero], 1)
+        return cfjax.Rotation(answer_to(coupling * (before + after), y))
+
+    chains = number // size // 2
+    start = copies([[0.0, 0.6, 0.8]] * size, chains)
+    found = np.asarray(ends(drift, thermal, (chains, size, 3), cfjax.WeakOrder2(), start, 6.0, 48))
+    for r in (1, 2, 3):
+        products = np.sum(found[:, r:] * found[:, :-r], -1).mean(1)
+        assert_mean(products, langevin(coupling / HEAT) ** r, 5e-3)
+
+
+INERTIA = np.array([1.0, 2.0, 3.0])
+FRICTION, DIPOLE = 1.0, 2.0
+AMPLITUDES = np.sqrt(2 * FRICTION * HEAT * INERTIA)[None]
+
+
+def kick(t, y, args):
+    """The torque of a vertical field on a dipole along the body's third axis."""
+    vertical = cfjax.quaternion_to_matrix(y["q"], order="wxyz")[:, 2, :]
+    axis = jnp.asarray([[0.0, 0.0, 1.0]])
+    return {"q": None, "m": DIPOLE * jnp.cross(axis, vertical)}
+
+
+def spin(k):
+    """The part of the kinetic energy of one axis, along whose flow it is constant."""
+
+    def field(t, y, args):
+        w = y["m"] * (np.eye(3)[k] / INERTIA)[None]
+        return {
+            "q": cfjax.QuaternionRotation(w, frame="body", order="wxyz"),
+            "m": cfjax.Rotation(-w),
+        }
+
+    return cfjax.LieTerm(field)
+
+
+def friction(t, y, args):
+    eye = jnp.eye(3)[None]
+    return {"q": None, "m": cfjax.LinearAffine(-FRICTION * eye, jnp.zeros((1, 3)))}
+
+
+def torques(t, y, scale, dw):
+    kicks = scale * AMPLITUDES * dw
+    return {"q": None, "m": cfjax.LinearAffine(jnp.zeros((1, 3, 3)), kicks)}
+
+
+def free(t, y, args):
+    total = [spin(k).field(t, y, args) for k in range(3)]
+    w = sum(f["q"].omega for f in total)
+    return {
+        "q": cfjax.QuaternionRotation(w, frame="body", order="wxyz"),
+        "m": kick(t, y, args)["m"] + jnp.cross(y["m"], w) - FRICTION * y["m"],
+    }
+
+
+def plain_torques(t, y, args, dw):
+    return {"q": None, "m": AMPLITUDES * dw}
+
+
+def langevin_body(number, solver, h):
+    """The end of a body's motion with friction and noise, by a splitting or in one field."""
+    noise = brownian((number, 3))
+    # With it the frozen affine flow has the exact law of an Ornstein-Uhlenbeck process.
+    x = FRICTION * h / 2
+    if isinstance(solver, cfjax.Strang):
+        last = diffrax.MultiTerm(cfjax.LieTerm(friction), cfjax.LieControlTerm(torques, noise))
+        term = diffrax.MultiTerm(cfjax.LieTerm(kick), *map(spin, range(3)), last)
+    else:
+        term = diffrax.MultiTerm(cfjax.LieTerm(free), cfjax.LieControlTerm(plain_torques, noise))
+    y0 = {"q": copies([1.0, 0.0, 0.0, 0.0], number), "m": jnp.zeros((number, 3))}
+    scale = np.sqrt(x / np.tanh(x))
+    t1 = 10.0
+    y = cfjax.integrate(term, solver, 0.0, t1, y0, scale, num_steps=round(t1 / h)).ys
+    assert y is not None
+    return jax.tree.map(lambda x: x[-1], y)
+
+
+@pytest.mark.parametrize(
+    "number, solver",
+    [
+        (1000, cfjax.Strang()),
+        pytest.param(20_000, cfjax.Strang(), marks=pytest.mark.slow),
+        pytest.param(20_000, cfjax.WeakOrder2(cfjax.CF3()), marks=pytest.mark.slow),
+    ],
+    ids=["few", "many", "WeakOrder2"],
+)
+def test_a_body_at_a_temperature(number, solver):
+    """`<m_k^2 / J_k> = kT` and `<cos> = L(dipole / kT)`, by BAOAB with the exact friction."""
+    end = langevin_body(number, solver, 0.25)
+    height = cfjax.quaternion_to_matrix(end["q"], order="wxyz")[:, 2, 2]
+    # Weak errors at these steps: measured with more paths, 1 % of the temperature and 0.2 %.
+    assert_mean(np.asarray(end["m"]) ** 2 / INERTIA, HEAT, 0.02)
+    assert_mean(height, langevin(DIPOLE / HEAT), 3e-3)
+
+
+def test_friction_and_noise_in_a_splitting_have_the_exact_law():
+    """The variance of momenta after any step, from the increment's own variance."""
+    h = 0.7
+    x = FRICTION * h / 2
+    scale = np.sqrt(x / np.tanh(x))
+    field = cfjax.combine(
+        (h, 1.0),
+        (friction(0.0, None, None)["m"], torques(0.0, None, scale, jnp.full((1, 3), h**0.5))["m"]),
+    )
+    m = field.flow(jnp.zeros((1, 3)))[0]
+    exact = HEAT * INERTIA * (1 - np.exp(-2 * FRICTION * h))
+    np.testing.assert_allclose(m**2, exact, rtol=1e-14)
+
+
+# Path by path
+
+
+def oscillator(s, n=50):
+    """Kubo's oscillator, with the Brownian motion itself as a second part of the state."""
+
+    def drift(t, y, s):
+        return {"z": cfjax.LeftMatrix(jnp.full((1, 1), 1j, complex)), "w": None}
+
+    def noise(t, y, s, dw):
+        return {"z": cfjax.LeftMatrix(1j * (s * dw).astype(complex)[None]), "w": dw}
+
+    y0 = {"z": jnp.ones((1, 1), complex), "w": jnp.zeros(1)}
+    ends = solve(drift, noise, (1,), cfjax.CF4(), y0, 2.0, n, s)
+    return ends["z"][-1, 0, 0], ends["w"][-1, 0]
+
+
+def test_kubos_oscillator_and_its_derivative():
+    """`z = exp(i (T + s W))`, path by path, and `dz/ds = i W z`."""
+    s = jnp.asarray(0.8)
+    (z, w), (dz, _) = jax.jvp(oscillator, (s,), (jnp.ones_like(s),))
+    # 50 steps of a few roundings each.
+    s, w, z = map(np.asarray, (s, w, z))
+    np.testing.assert_allclose(z, np.exp(1j * (2 + s * w)), rtol=0, atol=1e-14)
+    np.testing.assert_allclose(dz, 1j * w * z, rtol=0, atol=3e-14)
+
+    def loss(s):
+        z, _ = oscillator(s)
+        return jnp.real(z) + 2 * jnp.imag(z)
+
+    expected = np.real(1j * w * z) + 2 * np.imag(1j * w * z)
+    np.testing.assert_allclose(jax.jit(jax.grad(loss))(s), expected, rtol=0, atol=3e-14)
+
+
+@pytest.mark.parametrize(
+    "solver, is_ito",
+    [(cfjax.LieEuler(), True), (cfjax.CF4(), False), (cfjax.WeakOrder2(), False)],
+    ids=lambda x: type(x).__name__,
+)
+def test_geometric_brownian_motion_tells_the_sense_of_the_noise(solver, is_ito):
+    """Itô: `exp((m - s^2 / 2) T + s W)`; Stratonovich: `exp(m T + s W)`. For plain numbers."""
+    m, s, number, n = 0.3, 0.6, 200, 400
+
+    def drift(t, y, args):
+        return {"x": m * y["x"], "w": jnp.zeros_like(y["w"])}
+
+    def noise(t, y, args, dw):
+        return {"x": s * y["x"] * dw, "w": dw}
+
+    y0 = {"x": jnp.ones(number), "w": jnp.zeros(number)}
+    y = ends(drift, noise, (number,), solver, y0, 1.0, n)
+    ito, stratonovich = (np.exp(m - s**2 / 2 * k + s * y["w"]) for k in (1, 0))
+    error, other = (
+        np.sqrt(np.mean((y["x"] / exact - 1) ** 2))
+        for exact in ((ito, stratonovich) if is_ito else (stratonovich, ito))
+    )
+    # Euler: root mean square s^2 sqrt(T h / 2) = 0.013, and with chords less. The limits are 20 %
+    # apart.
+    assert error < 0.02
+    assert other > 0.1
+    assert isinstance(solver, diffrax.AbstractItoSolver) == is_ito
+    assert isinstance(solver, diffrax.AbstractStratonovichSolver) != is_ito
+
+
+def test_the_manifold_is_kept_to_rounding():
+    """After 100 000 steps, on spheres and with unit quaternions and attitudes."""
+
+    def drift(t, y, args):
+        return {
+            "s": cfjax.Rotation(y["s"][::-1]),
+            "q": cfjax.QuaternionRotation(y["s"], frame="body", order="wxyz"),
+            "r": cfjax.Rotation(-y["s"]),
+        }
+
+    def noise(t, y, args, dw):
+        return {
+            "s": cfjax.Rotation((1 + y["s"]) * dw),
+            "q": cfjax.QuaternionRotation(0.7 * dw, frame="body", order="wxyz"),
+            "r": cfjax.Rotation(dw * y["s"]),
+        }
+
+    y0 = {
+        "s": jnp.asarray([0.6, 0.0, 0.8]),
+        "q": jnp.asarray([1.0, 0.0, 0.0, 0.0]),
+        "r": jnp.eye(3),
+    }
+    y = ends(drift, noise, (3,), cfjax.CF2(), y0, 100.0, 100_000)
+    unit = np.finfo(float).eps
+    # The sums are compensated, so the rounding of a step does not add up. What is left is that of
+    # the entries: two units for a length, and three for a product of columns.
+    assert abs(np.linalg.norm(y["s"]) - 1) < 4 * unit
+    assert abs(np.linalg.norm(y["q"]) - 1) < 4 * unit
+    assert np.max(np.abs(y["r"].T @ y["r"] - np.eye(3))) < 8 * unit

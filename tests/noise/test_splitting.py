@@ -1,0 +1,215 @@
+"""Splittings: a body in three terms, with and without a bath of friction and noise."""
+
+from typing import Any
+
+import brownian_paths as paths
+import diffrax
+import jax
+import jax.numpy as jnp
+import numpy as np
+import problems
+import pytest
+
+import cfjax
+from cfjax._methods.splitting import splitting_order
+
+# A symmetric top, of moments of inertia J, J and J3: the kinetic energy of a spherical body, and
+# what turns it about its own axis. These two commute, and neither does with the torque. (A body in
+# four terms is in tests/solvers/test_symmetric.py.)
+J, J3 = 1.0, 0.4
+FRICTION = 0.8
+START = {"q": np.array([0.6, 0.0, 0.48, 0.64]), "m": np.array([0.5, -0.8, 1.1])}
+
+
+def turn(w):
+    return cfjax.QuaternionRotation(w, frame="body", order="wxyz")
+
+
+def kick(t, y, args):
+    """A torque that depends on attitude and time."""
+    frame = cfjax.quaternion_to_matrix(y["q"], order="wxyz")
+    strength = (1.5 + jnp.sin(3 * t)).astype(frame.dtype)
+    return {"q": None, "m": strength * jnp.cross(frame[2], jnp.asarray([0.3, 0, 1], frame.dtype))}
+
+
+def spherical(t, y, args):
+    return {"q": turn(y["m"] / J), "m": None}
+
+
+def axial(t, y, args):
+    w = y["m"] * np.array([0, 0, 1 / J3 - 1 / J], y["m"].dtype)
+    return {"q": turn(w), "m": cfjax.Rotation(-w)}
+
+
+def friction(t, y, args):
+    a = -FRICTION * jnp.eye(3, dtype=y["m"].dtype)
+    return {"q": None, "m": cfjax.LinearAffine(a, jnp.zeros_like(y["m"]))}
+
+
+def torques(t, y, args, dw):
+    return {"q": None, "m": cfjax.LinearAffine(jnp.zeros((3, 3)), dw * np.array([0.5, 0.8, 0.6]))}
+
+
+def all_terms(*fields: Any) -> diffrax.MultiTerm:
+    return diffrax.MultiTerm(*map(cfjax.LieTerm, fields))
+
+
+TOP = all_terms(kick, spherical, axial)
+BODY: Any = tuple(TOP.terms)
+
+
+def with_bath(path):
+    bath = diffrax.MultiTerm(cfjax.LieTerm(friction), cfjax.LieControlTerm(torques, path))
+    return diffrax.MultiTerm(*BODY, bath)
+
+
+def top_ode(t, y):
+    m, (a, *v) = y[:3], y[3:]
+    v = np.array(v)
+    w = m / np.array([J, J, J3])
+    # The third row of the matrix of the quaternion.
+    z = np.array([0.0, 0.0, 1.0])
+    row = z + 2 * np.cross(v, np.cross(v, z)) - 2 * a * np.cross(v, z)
+    torque = (1.5 + np.sin(3 * t)) * np.cross(row, [0.3, 0.0, 1.0])
+    return np.concatenate([np.cross(m, w) + torque, [-v @ w / 2], (a * w + np.cross(v, w)) / 2])
+
+
+@pytest.fixture(scope="module")
+def top_answer():
+    return problems.reference(top_ode, 0.0, 1.0, np.concatenate([START["m"], START["q"]]))
+
+
+def solve(term, solver, n, t1=1.0, y0=START, t0=0.0):
+    y = cfjax.integrate(term, solver, t0, t1, problems.arrays(y0), num_steps=n).ys
+    return jax.tree.map(lambda x: x[-1], y)
+
+
+@pytest.mark.parametrize(
+    "solver, order, steps",
+    [
+        (cfjax.Splitting((1.0, 0.0)), 1, (64, 128)),
+        (cfjax.BlanesMoan4(), 4, (8, 16)),
+        pytest.param(cfjax.Strang(), 2, (16, 32), marks=pytest.mark.slow),
+        pytest.param(cfjax.Splitting((0.0, 1.0)), 1, (64, 128), marks=pytest.mark.slow),
+        pytest.param(cfjax.BlanesMoan6(), 6, (4, 8), marks=pytest.mark.slow),
+    ],
+    ids=["Lie-Trotter", "BlanesMoan4", "Strang", "its adjoint", "BlanesMoan6"],
+)
+def test_the_order_for_three_terms(solver, order, steps, top_answer):
+    ends = [solve(TOP, solver, n) for n in steps]
+    errors = [np.linalg.norm(np.concatenate([y["m"], y["q"]]) - top_answer) for y in ends]
+    assert order - 0.2 < np.log2(errors[0] / errors[1]) < order + 0.35
+    assert solver.order(TOP) == order
+
+
+def yoshida(w):
+    return tuple(x / 2 for x in (w, w, 1 - 2 * w, 1 - 2 * w, w, w))
+
+
+@pytest.mark.parametrize(
+    "stages, order",
+    [
+        ((1.0, 0.0), 1),
+        ((0.3, 0.7), 1),
+        ((0.5, 0.5), 2),
+        ((0.25,) * 4, 2),
+        (yoshida(1 / (2 - 2 ** (1 / 3))), 4),
+        (yoshida(1 / (2 - 2 ** (1 / 3)) + 1e-9), 2),
+        (cfjax.BlanesMoan4.stages, 4),
+        (cfjax.BlanesMoan6.stages, 6),
+    ],
+)
+def test_the_order_of_stages(stages, order):
+    assert splitting_order(stages) == order
+    solver = cfjax.Splitting(stages)
+    assert solver.order(TOP) == order
+    assert solver.is_symmetric == (stages == pytest.approx(stages[::-1]))
+
+
+def test_rounding_does_not_add_up():
+    """In float32 after 30 000 steps: the length of q, and that of m without torques."""
+    y0 = jax.tree.map(lambda x: jnp.asarray(x, jnp.float32), START)
+    y = solve(all_terms(spherical, axial), cfjax.Strang(), 30_000, 300.0, y0)
+    unit = np.finfo(np.float32).eps
+    lengths = np.array([np.linalg.norm(np.asarray(y[k], float)) for k in y])
+    starts = np.array([np.linalg.norm(np.asarray(y0[k], float)) for k in y])
+    # The sums over the steps are compensated. A random walk of roundings would be some 100 units.
+    assert np.all(np.abs(lengths / starts - 1) < 4 * unit)
+
+
+# Noise
+
+
+def test_a_bath_has_strong_order_1():
+    path = paths.drawn(6, 100, (3,), 512)
+    y0 = problems.arrays(START)
+    end = paths.ends(with_bath, cfjax.Strang(), path, y0, jnp.asarray(512))
+    steps = [8, 16, 32, 64]
+    errors = paths.strong_errors(with_bath, cfjax.Strang(), path, y0, steps, end)
+    # The reference is eight times as good as the last of them, which adds 0.05 to the slope.
+    assert 0.85 < problems.slope(steps, errors) < 1.25
+
+
+def test_output_within_a_step_with_noise():
+    key = jax.random.key(0)
+    tree = diffrax.VirtualBrownianTree(0.0, 1.0, 2.0**-3, (3,), key)
+    sol = diffrax.diffeqsolve(
+        with_bath(tree),
+        cfjax.Strang(),
+        0.0,
+        1.0,
+        0.5,
+        problems.arrays(START),
+        saveat=diffrax.SaveAt(t0=True, steps=True, dense=True),
+        max_steps=2,
+        adjoint=diffrax.ForwardMode(),
+    )
+    ys = jax.jit(jax.vmap(sol.evaluate))(jnp.linspace(0.0, 1.0, 9))
+    for name in ("q", "m"):
+        # Ten flows of a few roundings of entries of size one.
+        np.testing.assert_allclose(ys[name][::4], sol.ys[name][:3], rtol=0, atol=1e-14)
+    np.testing.assert_allclose(jnp.linalg.norm(ys["q"], axis=1), 1, rtol=0, atol=2e-15)
+    # diffrax knows the sense of the noise and that there is no estimate for adaptive steps.
+    assert cfjax.Strang().strong_order(with_bath(tree)) == 0.5
+    with pytest.raises(RuntimeError, match="error estimates"):
+        diffrax.diffeqsolve(
+            with_bath(tree),
+            cfjax.Strang(),
+            0.0,
+            1.0,
+            0.5,
+            problems.arrays(START),
+            stepsize_controller=diffrax.PIDController(rtol=1e-2, atol=1e-2),
+        )
+
+
+# Errors
+
+
+@pytest.mark.parametrize(
+    "stages", [(), (1.0,), (0.5, 0.5, 0.5), (0.5, 0.6), (0.5, "a"), ("ab", None)]
+)
+def test_wrong_stages(stages, no_shape_hook):
+    with pytest.raises((ValueError, TypeError), match="stages must be an even number of numbers"):
+        cfjax.Splitting(stages)
+
+
+def test_terms_that_a_splitting_refuses(no_shape_hook):
+    path = diffrax.UnsafeBrownianPath((3,), jax.random.key(0))
+    noise = cfjax.LieControlTerm(torques, path)
+
+    def fails(term, kind, match):
+        with pytest.raises(kind, match=match):
+            solve(term, cfjax.Strang(), 2)
+
+    fails(
+        all_terms(kick), TypeError, "Strang takes a diffrax.MultiTerm of two or more terms, got 1"
+    )
+    fails(BODY[0], TypeError, "Strang takes a term of the form")
+    fails(diffrax.MultiTerm(noise, *BODY), TypeError, "takes noise, or what else a path drives, in")
+    fails(diffrax.MultiTerm(BODY[0], noise, BODY[1]), TypeError, "in its last term only: move it")
+    fails(all_terms(axial, spherical, kick), TypeError, "last term of Strang must not depend on t")
+    # A last term that rests takes the time.
+    rest = cfjax.LieTerm(lambda t, y, args: {"q": None, "m": None})
+    ends = [solve(term, cfjax.Strang(), 2) for term in (diffrax.MultiTerm(*BODY, rest), TOP)]
+    np.testing.assert_allclose(ends[0]["m"], ends[1]["m"], rtol=0, atol=1e-15)
