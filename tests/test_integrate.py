@@ -73,6 +73,16 @@ def test_it_takes_the_steps_of_diffeqsolve(term, solver, t1):
     assert found.result == diffrax.RESULTS.successful
 
 
+def test_a_wrapped_solver():
+    """Both go on from two half steps. For diffrax they are instances of what they wrap."""
+    wrapped: Any = [diffrax.HalfSolver(cfjax.CF2()), cfjax.Richardson(cfjax.CF2())]
+    expected = cfjax.integrate(TERM, cfjax.CF2(), 0.0, 1.0, Y0, ARGS, num_steps=8)
+    for solver in wrapped:
+        found = cfjax.integrate(TERM, solver, 0.0, 1.0, Y0, ARGS, num_steps=4)
+        close(found.ys, expected.ys)
+        assert found.result == diffrax.RESULTS.successful
+
+
 # Output
 
 

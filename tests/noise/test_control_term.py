@@ -117,7 +117,8 @@ def test_fields_of_several_kinds_in_a_sum():
 # Parts of the state
 
 
-@pytest.mark.parametrize("solver", [cfjax.CF4(), cfjax.WeakOrder2()], ids=["CF4", "WeakOrder2"])
+@pytest.mark.representatives(1)
+@pytest.mark.parametrize("solver", [cfjax.WeakOrder2(), cfjax.CF4()], ids=["WeakOrder2", "CF4"])
 def test_a_part_at_rest_in_one_term_is_moved_by_the_others(solver):
     def product_drift(t, y, args):
         return {"spin": drift(t, y["spin"], args), "at": None, "out": -y["out"], "still": None}
@@ -156,11 +157,14 @@ def test_leading_axes_are_single_solves(solver):
     def many_noise(t, y, args, dw):
         return cfjax.Rotation(jax.vmap(lambda y, dw: noise(t, y, args, dw).omega)(y, dw))
 
+    @jax.jit
+    def single(w, h, y0):
+        return problems.first_step(solver, term_of(GivenStep(w, h)), 0.0, 0.25, y0, None)[0]
+
     term = diffrax.MultiTerm(
         cfjax.LieTerm(many_drift), cfjax.LieControlTerm(many_noise, GivenStep(w, h))
     )
-    single = [step(solver, term_of(GivenStep(w[k], h[k])), y0[k]) for k in range(n)]
-    close(step(solver, term, y0), jnp.stack(single), atol=1e-13)
+    close(step(solver, term, y0), jnp.stack(list(map(single, w, h, y0))), atol=1e-13)
 
 
 def test_an_increment_may_be_a_pytree():
@@ -198,15 +202,10 @@ def test_noise_of_plain_numbers(solver):
 # Times
 
 
-@pytest.mark.parametrize("way", ["integrate", "diffeqsolve"])
-@pytest.mark.parametrize("solver", PIECES, ids=lambda x: type(x).__name__)
-def test_there_and_back(solver, way):
-    """With fields that do not depend on the state, the way back undoes every piece.
-
-    `ShiftedNoise` is not symmetric: its way back is another path of pieces, and is left out.
-    """
-    if not isinstance(solver, cfjax.WeakOrder2):
-        pytest.skip("not symmetric")
+@pytest.mark.parametrize("way", ["diffeqsolve", pytest.param("integrate", marks=pytest.mark.slow)])
+def test_there_and_back(way):
+    """With fields that do not depend on the state, the way back undoes every piece."""
+    solver = cfjax.WeakOrder2()
 
     def constant(t, y, args):
         return cfjax.Rotation(jnp.asarray([0.3, -0.2, 0.5]))
@@ -218,6 +217,7 @@ def test_there_and_back(solver, way):
         cfjax.LieTerm(constant), cfjax.LieControlTerm(constant_noise, tree(tol=2.0**-8))
     )
 
+    @jax.jit
     def solve(t0, t1, y0):
         if way == "integrate":
             return cfjax.integrate(term, solver, t0, t1, y0, num_steps=16).ys[-1]
@@ -279,7 +279,8 @@ def test_a_smooth_path():
 # Precision and transformations
 
 
-@pytest.mark.parametrize("solver", [cfjax.CF4(), cfjax.WeakOrder2()], ids=["CF4", "WeakOrder2"])
+@pytest.mark.representatives(1)
+@pytest.mark.parametrize("solver", [cfjax.WeakOrder2(), cfjax.CF4()], ids=["WeakOrder2", "CF4"])
 def test_float32(solver):
     def field(t, y, args, dw):
         return cfjax.Rotation(omega_of(y, dw))
@@ -368,6 +369,7 @@ def test_the_gradient_of_a_path(solver, options):
     close(problems.inner(gradient, direction), difference, atol=1e-9)
 
 
+@pytest.mark.slow
 def test_a_gradient_on_the_tree():
     """By diffrax's own adjoint, whose checkpoints evaluate the tree again."""
     brownian = tree(tol=2.0**-3)
@@ -389,11 +391,12 @@ def test_a_gradient_on_the_tree():
 # Output within a step
 
 
-@pytest.mark.parametrize("solver", [cfjax.CF4(), *PIECES], ids=lambda x: type(x).__name__)
+@pytest.mark.representatives(1)
+@pytest.mark.parametrize("solver", [*reversed(PIECES), cfjax.CF4()], ids=lambda x: type(x).__name__)
 def test_output_within_a_step(solver):
     """It meets both ends and stays on the manifold."""
     sol = diffrax.diffeqsolve(
-        term_of(tree()),
+        term_of(GIVEN),
         solver,
         0.0,
         1.0,
@@ -411,7 +414,6 @@ def test_output_within_a_step(solver):
     # Nowhere does it jump. The pieces of `ShiftedNoise` turn by up to 5 in a third of a step.
     gaps = jnp.linalg.norm(jnp.diff(ys, axis=0), axis=1)
     assert np.max(gaps) < 0.4
-    close(sol.evaluate(0.25, 0.75), sol.evaluate(0.75) - sol.evaluate(0.25))
 
 
 # Adaptive steps
@@ -443,6 +445,7 @@ def test_a_method_has_no_estimate_where_a_path_drives(solver):
         adaptive(solver, 1e-2)
 
 
+@pytest.mark.slow
 def test_step_doubling_controls_the_error():
     @jax.jit
     @jax.vmap
