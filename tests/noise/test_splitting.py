@@ -11,7 +11,6 @@ import problems
 import pytest
 
 import cfjax
-from cfjax._methods.splitting import splitting_order
 
 # A symmetric top, of moments of inertia J, J and J3: the kinetic energy of a spherical body, and
 # what turns it about its own axis. These two commute, and neither does with the torque. (A body in
@@ -120,7 +119,6 @@ def yoshida(w):
     ],
 )
 def test_the_order_of_stages(stages, order):
-    assert splitting_order(stages) == order
     solver = cfjax.Splitting(stages)
     assert solver.order(TOP) == order
     assert solver.is_symmetric == (stages == pytest.approx(stages[::-1]))
