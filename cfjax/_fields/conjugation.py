@@ -162,9 +162,15 @@ class Congruence(AbstractTwoSided):
         return weight, _without_skew_part(moved, is_hermitian)
 
     def average(self, x: Inexact[Array, "n n"]) -> Inexact[Array, "n n"]:
-        if self.q is not None:
-            return Congruence(self.a / 2, self.q / 2).flow(x)
-        return Congruence(self.a, x).flow(jnp.zeros_like(x))
+        mean = Congruence(self.a, x).flow(jnp.zeros_like(x))
+        if self.q is None:
+            return mean
+        # Less than the integral of exp(s a) q exp(s a)^H over s, by the time since: (1 - s) ds.
+        a, q = promoted(self.a, self.q)
+        b, zero, n = -_adjoint(a), jnp.zeros_like(a), len(a)
+        one = jnp.eye(n, dtype=a.dtype)
+        whole = expm(jnp.block([[a, q, zero], [zero, b, one], [zero, zero, b]]))
+        return jnp.add(*promoted(mean, _times(whole[:n, 2 * n :], expm(-b))))
 
     def velocity(self, x: Inexact[Array, "n n"]) -> Inexact[Array, "n n"]:
         v = _linear_part(self.a, x)

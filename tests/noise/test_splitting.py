@@ -148,6 +148,7 @@ def test_a_bath_has_strong_order_1():
     assert 0.85 < problems.slope(steps, errors) < 1.25
 
 
+@pytest.mark.slow
 def test_output_within_a_step_with_noise():
     solver, y0 = cfjax.Strang(), problems.arrays(START)
     term = with_bath(paths.GivenStep(jnp.asarray([0.3, -0.5, 0.4]), None))
