@@ -226,6 +226,8 @@ def thermal(t, y, args, dw):
     return cfjax.Rotation(answer_to(np.sqrt(2 * DAMPING * HEAT) * dw, y))
 
 
+# `scenes/test_macrospin.py` has a quick one.
+@pytest.mark.slow
 @number
 def test_a_spin_at_rest_in_a_field(number):
     """`<m_z> = L(b / kT)` with Langevin's function L, from spins along the field."""

@@ -138,6 +138,7 @@ def test_rounding_does_not_add_up():
 # Noise
 
 
+@pytest.mark.slow
 def test_a_bath_has_strong_order_1():
     path = paths.drawn(6, 100, (3,), 512)
     y0 = problems.arrays(START)

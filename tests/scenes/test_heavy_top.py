@@ -63,6 +63,7 @@ def test_the_reference_against_the_closed_form(reference):
     np.testing.assert_allclose(reference["m"] @ axis, along * spin, rtol=1e-11)
 
 
+@pytest.mark.slow
 def test_a_richardson_extrapolated_reference(reference):
     # CF54 with half the steps twice: order 6, 37 turns of the body.
     found = end(cfjax.Richardson(cfjax.CF54()), 2000)

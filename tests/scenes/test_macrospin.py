@@ -28,6 +28,7 @@ def test_the_exact_mean_starts_with_its_slope_and_ends_with_langevins_function()
         np.testing.assert_allclose(macrospin.reference(200.0, args), end, rtol=0, atol=1e-10)
 
 
+@pytest.mark.representatives(1)
 @pytest.mark.parametrize("args", PARTICLES, ids=["weak", "strong"])
 def test_means_of_samples(args):
     ys = np.asarray(macrospin.samples(4000, args, num_steps=80))

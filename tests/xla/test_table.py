@@ -32,8 +32,7 @@ def test_only_where_the_whole_step_is_too_long(rewritten):
         assert "cfjax_operation" in program
 
 
-@pytest.mark.representatives(1)
-@pytest.mark.parametrize("scene", [spacecraft, heavy_top])
+@pytest.mark.parametrize("scene", [heavy_top, pytest.param(spacecraft, marks=pytest.mark.slow)])
 def test_values_and_gradients_are_those_of_the_program_as_it_is(rewritten, scene):
     """Up to rounding, of which there are thousands in a step."""
     loss, *start = _loss(scene, 4)

@@ -164,7 +164,7 @@ LATTICES = {
 }
 
 
-@pytest.mark.representatives(2)
+@pytest.mark.representatives(1)
 @pytest.mark.parametrize("name", LATTICES)
 def test_solves_of_lattices(name):
     """XLA updates arrays in place, and reads what it has overwritten if these have two shapes."""
