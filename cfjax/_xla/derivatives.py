@@ -234,8 +234,17 @@ def _batched(
     def batch_of(program):
         return jax.vmap(jaxpr_as_fun(program), in_axes=dims, out_axes=out_dims)
 
+    def batch_of_plain(program):
+        def batched(*values):
+            outs = jax.vmap(jaxpr_as_fun(program), in_axes=dims)(*values)
+            # Whole arrays may mix what the batch reaches with what it does not.
+            first = [x[0] if size else jnp.zeros(x.shape[1:], x.dtype) for x in outs]
+            return [x if d == 0 else y for x, y, d in zip(outs, first, out_dims, strict=True)]
+
+        return batched
+
     if plain is not None:
-        plain = plain.derived(batch_of, operands, range(len(operands)), range(len(out_dims)))
+        plain = plain.derived(batch_of_plain, operands, range(len(operands)), range(len(out_dims)))
     return program_of(batch_of(program), *operands), plain, out_dims
 
 

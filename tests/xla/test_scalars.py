@@ -439,6 +439,15 @@ def test_entries_without_use_are_not_singular_in_second_derivatives(fun, first):
     np.testing.assert_allclose(got, want, rtol=1e-15)
 
 
+def test_the_gradient_of_a_batch_that_meets_what_is_in_none():
+    """A stack of what has the axis of a batch and what does not."""
+    y, p = jnp.asarray(np.arange(210.0).reshape(70, 3)), jnp.ones((70, 3))
+    f = lambda y: scalarised(lambda y: jnp.stack([y, p], -2), y)  # noqa: E731
+    batch = jnp.stack([y, 2 * y])
+    got = jax.grad(lambda ys: jnp.sum(jax.vmap(f)(ys) ** 2))(batch)
+    np.testing.assert_array_equal(got, 2 * batch)
+
+
 def test_custom_vmap_rule_is_kept():
     fun = lambda y: odd_vmap(y) + y  # noqa: E731
     batch = jnp.stack([jnp.asarray(Y), jnp.asarray(W)])
