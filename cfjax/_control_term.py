@@ -91,10 +91,15 @@ class _Place(eqx.Module):
         return eqx.combine(self.arrays, jtu.tree_unflatten(self.structure, self.others))
 
 
+def paths(terms: PyTree[diffrax.AbstractTerm]) -> list[diffrax.AbstractPath]:
+    """The paths that drive these terms."""
+    is_path = lambda x: isinstance(x, diffrax.AbstractPath)  # noqa: E731
+    return list(filter(is_path, jtu.tree_leaves(terms, is_leaf=is_path)))
+
+
 def is_driven(terms: PyTree[diffrax.AbstractTerm]) -> bool:
     """Whether a path drives one of these terms, be it noise or not."""
-    is_path = lambda x: isinstance(x, diffrax.AbstractPath)  # noqa: E731
-    return any(map(is_path, jtu.tree_leaves(terms, is_leaf=is_path)))
+    return bool(paths(terms))
 
 
 class _NoEstimate(eqx.Module):

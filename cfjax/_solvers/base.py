@@ -20,7 +20,7 @@ from .._numerics.checks import Fault
 from .._term import product, velocity
 from .._xla import is_rewritten, materialised_in_rows, materialised_together, scalarised
 from .chart import Chart
-from .compensation import added, at, no_compensation, with_sums
+from .compensation import added, at, no_compensation, with_sums, zeros
 from .dense import Interpolation, Path
 
 
@@ -91,10 +91,7 @@ class AbstractLieSolver(diffrax.AbstractSolver):
             return field, no_compensation(field, y0)
 
         field, compensation = eqx.filter_eval_shape(at_start, y0)
-        # Like the state, which may be spread over a mesh.
-        compensation = with_sums(
-            lambda c, y: None if c is None else jnp.zeros_like(y), compensation, y0
-        )
+        compensation = zeros(compensation, y0)
         first = terms.vf(t0, y0, args) if self.first_same_as_last else None
         return State(compensation, first, None), fault_of_start(t0, t1, (field,), y0)
 

@@ -32,6 +32,11 @@ def no_compensation(field: PyTree, y0: PyTree) -> PyTree:
     return jtu.tree_map(part, field, y0, is_leaf=is_field)
 
 
+def zeros(compensation: PyTree, y0: PyTree) -> PyTree:
+    """That of the first step, given by shape: like the state, which may be spread over a mesh."""
+    return with_sums(lambda c, y: None if c is None else jnp.zeros_like(y), compensation, y0)
+
+
 def with_sums(fun: Callable[..., Any], compensation: PyTree, *trees: PyTree) -> PyTree:
     """`fun(c, *leaves)` for each part of the state, where c is None unless the part is a sum."""
     return jtu.tree_map(fun, compensation, *trees, is_leaf=lambda x: x is None)

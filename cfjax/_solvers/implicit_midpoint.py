@@ -43,8 +43,7 @@ class ImplicitMidpoint(AbstractLieSolver):
     iteration does not converge, mostly one that is too long, fails with a `diffrax.RESULTS`.
 
     Source: Bou-Rabee & Marsden, Hamilton-Pontryagin integrators on Lie groups, Found. Comput. Math.
-    9 (2009), doi:10.1007/s10208-008-9030-4; McLachlan, Modin & Verdier, A minimal-variable
-    symplectic integrator on spheres, Math. Comp. 86 (2017), for the sphere.
+    9 (2009), doi:10.1007/s10208-008-9030-4.
     """
 
     rtol: float | None = None

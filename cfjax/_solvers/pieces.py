@@ -16,6 +16,7 @@ import jax.numpy as jnp
 import jax.tree_util as jtu
 from jaxtyping import PyTree
 
+from .._control_term import is_driven, paths
 from .._term import product
 from .base import AbstractChartSolver, AbstractLieSolver, by_turns, control_of, result_of, time_at
 from .commutator_free import CF4, LieEuler
@@ -49,10 +50,8 @@ class AbstractPieces(AbstractLieSolver, diffrax.AbstractStratonovichSolver):
         _check_solver("solver", self.solver)
 
     @abc.abstractmethod
-    def check_noise(self, is_constant: bool) -> None:
-        """Raises `TypeError` if the method cannot take fields of the noise that depend on the state
-        or, if `is_constant`, do not.
-        """
+    def check_for_state(self) -> None:
+        """Raises `TypeError` if the fields of the noise must not depend on the state."""
 
     def solver_of(self, piece: _Piece, is_constant: bool) -> AbstractChartSolver:
         """The solver along a piece."""
@@ -69,7 +68,8 @@ class AbstractPieces(AbstractLieSolver, diffrax.AbstractStratonovichSolver):
 
     def start(self, terms, t0, t1, y0, args):
         _check_paths(type(self).__name__, terms)
-        self.check_noise(_is_constant(terms, t0, t1, y0, args))
+        if not _is_constant(terms, t0, t1, y0, args):
+            self.check_for_state()
         return super().start(terms, t0, t1, y0, args)
 
     def step(self, terms, t0, t1, y0, args, solver_state, made_jump):
@@ -121,9 +121,8 @@ class WeakOrder2(AbstractPieces):
     def __check_init__(self):
         _check_order("solver", self.solver, 3)
 
-    def check_noise(self, is_constant):
-        if not is_constant:
-            _check_for_state("WeakOrder2", "solver", self.solver)
+    def check_for_state(self):
+        _check_for_state("WeakOrder2", "solver", self.solver)
 
 
 class ShiftedNoise(AbstractPieces):
@@ -150,11 +149,10 @@ class ShiftedNoise(AbstractPieces):
         if self.noise_solver is not None:
             _check_solver("noise_solver", self.noise_solver)
 
-    def check_noise(self, is_constant):
-        if not is_constant:
-            _check_for_state("ShiftedNoise", "solver", self.solver)
-            if self.noise_solver is not None:
-                _check_for_state("ShiftedNoise", "noise_solver", self.noise_solver)
+    def check_for_state(self):
+        _check_for_state("ShiftedNoise", "solver", self.solver)
+        if self.noise_solver is not None:
+            _check_for_state("ShiftedNoise", "noise_solver", self.noise_solver)
 
     def solver_of(self, piece, is_constant):
         if piece.time:
@@ -223,14 +221,12 @@ def _is_constant(terms: Any, t0: Any, t1: Any, y0: PyTree, args: PyTree) -> bool
 
 
 def _check_paths(name: str, terms: PyTree) -> None:
-    is_path = lambda x: isinstance(x, diffrax.AbstractPath)  # noqa: E731
-    paths = list(filter(is_path, jtu.tree_leaves(terms, is_leaf=is_path)))
-    if not paths:
+    if not is_driven(terms):
         raise TypeError(
             f"{name} is for equations with noise, and no term has a Brownian motion: use another "
             "method, for example cfjax.CF4()."
         )
-    for path in paths:
+    for path in paths(terms):
         area: Any = getattr(path, "levy_area", None)
         is_brownian = isinstance(path, diffrax.AbstractBrownianPath)
         if not is_brownian or not issubclass(area, diffrax.AbstractSpaceTimeLevyArea):

@@ -26,7 +26,7 @@ from .base import (
     time_at,
 )
 from .chart import flow_at, moved
-from .compensation import at, no_compensation, with_sums
+from .compensation import at, no_compensation, with_sums, zeros
 from .dense import part_of_step
 from .dependence import depending_on_time
 
@@ -91,7 +91,7 @@ class AbstractSplitting(AbstractLieSolver, diffrax.AbstractStratonovichSolver):
         if depending_on_time(lambda t: product(last, last.vf(t, y0, args), control[-1]), t0, y0):
             raise TypeError(
                 f"The last term of {type(self).__name__} must not depend on time, which passes "
-                "while it acts: take another one as the last, or add one that returns None."
+                "while it acts: take another one as the last, or add one at rest, with zeros for each part."
             )
 
         def at_start(y0: PyTree) -> tuple[list[PyTree], PyTree]:
@@ -100,10 +100,7 @@ class AbstractSplitting(AbstractLieSolver, diffrax.AbstractStratonovichSolver):
             return fields, _no_compensation(fields, y0)
 
         fields, compensation = eqx.filter_eval_shape(at_start, y0)
-        # Like the state, which may be spread over a mesh.
-        compensation = with_sums(
-            lambda c, y: None if c is None else jnp.zeros_like(y), compensation, y0
-        )
+        compensation = zeros(compensation, y0)
         first = terms.terms[0].vf(t0, y0, args)
         return State(compensation, first, None), fault_of_start(t0, t1, fields, y0)
 

@@ -120,7 +120,7 @@ def slopes(solver: Any, slope: float, **kwargs: Any) -> list[float]:
 class UncheckedWeakOrder2(cfjax.WeakOrder2):
     """One that takes any inner solver of order 3 or more."""
 
-    def check_noise(self, is_constant):
+    def check_for_state(self):
         pass
 
 
