@@ -91,7 +91,8 @@ class AbstractSplitting(AbstractLieSolver, diffrax.AbstractStratonovichSolver):
         if depending_on_time(lambda t: product(last, last.vf(t, y0, args), control[-1]), t0, y0):
             raise TypeError(
                 f"The last term of {type(self).__name__} must not depend on time, which passes "
-                "while it acts: take another one as the last, or add one at rest, with zeros for each part."
+                "while it acts: take another one as the last, or add one at rest, with zeros for "
+                "each part."
             )
 
         def at_start(y0: PyTree) -> tuple[list[PyTree], PyTree]:
