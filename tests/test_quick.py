@@ -24,6 +24,8 @@ SOLVERS = {
     "CommutatorFree": lambda: cfjax.CommutatorFree(cfjax.third_order_b(2)),
     "RKMK": lambda: cfjax.RKMK(diffrax.Bosh3.tableau),
     "Richardson": lambda: cfjax.Richardson(cfjax.CF2()),
+    "Splitting": lambda: cfjax.Splitting((0.5, 0.5)),
+    "Composition": lambda: cfjax.Composition(cfjax.Strang(), 4),
 }
 ON_SPHERE = np.array([0.6, 0.0, 0.8])
 SQUARE = np.array([[0.4, -0.2], [0.1, 0.3]])
@@ -40,6 +42,34 @@ def unit(t, y, args):
 def of_time(t, y, args):
     """What does not depend on the state."""
     return cfjax.Rotation(args * jnp.asarray(ON_SPHERE) + t)
+
+
+def about(axis):
+    """A part of `unit` that is constant along its own flow, about one axis."""
+
+    def field(t, y, args):
+        # The time passes while the last term acts, which does not depend on it.
+        passed = 0.0 if axis == 2 else t
+        return cfjax.Rotation(jnp.eye(3)[axis] * (args * y + passed))
+
+    return field
+
+
+def noise(t, y, args, increment):
+    """So weak that it moves the end by some 1e-3."""
+    return cfjax.Rotation(1e-3 * args * increment)
+
+
+def term_for(solver):
+    """The rotation `unit`, or what a solver takes in its place."""
+    if isinstance(solver, cfjax.WeakOrder2 | cfjax.ShiftedNoise):
+        path = diffrax.VirtualBrownianTree(
+            0.0, 1.0, 0.05, (3,), jax.random.key(0), levy_area=diffrax.SpaceTimeLevyArea
+        )
+        return diffrax.MultiTerm(cfjax.LieTerm(unit), cfjax.LieControlTerm(noise, path))
+    if solver.term_structure is diffrax.MultiTerm:
+        return diffrax.MultiTerm(*(cfjax.LieTerm(about(axis)) for axis in range(3)))
+    return cfjax.LieTerm(of_time if type(solver).__name__.startswith("Magnus") else unit)
 
 
 FIELDS = {
@@ -89,9 +119,10 @@ FIELDS = {
 }
 
 
-def check(solver, field, y0, has_gradient):
+def check(solver, term, y0, has_gradient):
     """Against a reference in plain space, and a gradient against a difference."""
-    term = cfjax.LieTerm(field)
+    parts = term.terms if isinstance(term, diffrax.MultiTerm) else (term,)
+    fields = [part.field for part in parts if isinstance(part, cfjax.LieTerm)]
 
     def end(args):
         return cfjax.integrate(term, solver, 0.0, 0.2, y0, args, num_steps=2).ys[-1]
@@ -99,7 +130,7 @@ def check(solver, field, y0, has_gradient):
     args, direction = jnp.array([0.5, -0.4, 0.9]), jnp.array([0.3, 0.2, -0.5])
 
     def rate(t, y):
-        return cfjax.tangent(field(t, y, args), y)
+        return sum(cfjax.tangent(field(t, y, args), y) for field in fields)
 
     y0 = jnp.asarray(y0)
     exact = np.asarray(y0 + 0.2 * rate(0.1, y0 + 0.1 * rate(0.0, y0)))
@@ -118,14 +149,15 @@ def check(solver, field, y0, has_gradient):
 @pytest.mark.slow
 @pytest.mark.parametrize("name", SOLVERS)
 def test_every_solver(name):
-    field = of_time if name.startswith("Magnus") else unit
-    check(SOLVERS[name](), field, FRAME if name == "CayleyRK4" else ON_SPHERE, has_gradient=False)
+    solver, y0 = SOLVERS[name](), FRAME if name == "CayleyRK4" else ON_SPHERE
+    check(solver, term_for(solver), y0, has_gradient=False)
 
 
 @pytest.mark.slow
 @pytest.mark.parametrize("name", FIELDS)
 def test_every_field(name):
-    check(cfjax.CF3(), *FIELDS[name], has_gradient=True)
+    field, y0 = FIELDS[name]
+    check(cfjax.CF3(), cfjax.LieTerm(field), y0, has_gradient=True)
 
 
 def test_none_is_left_out():
