@@ -16,6 +16,7 @@ from jaxtyping import Array, Bool, Int, PyTree, Real
 from ._numerics.checks import Fault, checked, error_if, needing
 from ._numerics.squaring import max_over_batch
 from ._solvers.base import is_finite, result_of
+from ._step_back import repeat_and_undo
 from ._xla import repeat
 
 # Steps whose derivative is not rewritten.
@@ -36,6 +37,7 @@ def integrate(
     save_every: int | np.integer | None = None,
     save_initial: bool = False,
     checkpoint_every: int | np.integer | None = None,
+    step_back: bool = False,
     throw: bool = True,
 ) -> diffrax.Solution:
     """Integrates from `t0` to `t1` with `num_steps` equal steps of any diffrax solver.
@@ -60,6 +62,11 @@ def integrate(
     - `checkpoint_every`: for reverse mode with little memory. Reverse mode then keeps one state for
       each group of this many steps, and computes the steps between a second time. About
       `sqrt(num_steps)` is best, and makes the memory proportional to `sqrt(num_steps)` states.
+    - `step_back`: for reverse mode in constant memory. Reverse mode then keeps the saved states
+      alone, and computes all others by steps backwards. For symmetric solvers, which undo a step to
+      rounding: `cfjax.Strang` and other splittings, `cfjax.ImplicitMidpoint`, `cfjax.Composition`
+      and Magnus methods. What grows forwards in time is well conditioned, but what decays grows on
+      the way back, and so does its rounding. Forward mode is not possible.
     - `throw`: whether a failure is an error, as in diffrax. If not, `result` of the solution says
       what happened, and invalid values of the arguments give NaN. In a batch made by `jax.vmap` one
       failure is an error for the whole batch. An error check within a function that you compile is
@@ -72,8 +79,8 @@ def integrate(
 
     **Raises:** `TypeError` or `ValueError` for arguments of wrong type or value. A runtime error if
     `y0` or a saved state has an entry that is not finite, if `y0` is off the manifold that a field
-    acts on, if a time is NaN, if a step is shorter than the rounding of a time, or if the solver
-    reports a failure.
+    acts on, if a time is NaN, if a step is shorter than the rounding of a time, if the solver
+    reports a failure, or if the steps back miss the start by more than half of the digits.
     """
     check_term_and_solver(term, solver)
     check_own_tolerances(solver)
@@ -87,6 +94,17 @@ def integrate(
         raise TypeError(f"save_initial must be a bool, got {save_initial!r}.")
     if checkpoint_every is not None:
         checkpoint_every = count("checkpoint_every", checkpoint_every)
+    if not isinstance(step_back, bool):
+        raise TypeError(f"step_back must be a bool, got {step_back!r}.")
+    if step_back and checkpoint_every is not None:
+        raise ValueError(
+            "step_back needs no checkpoints: give either step_back or checkpoint_every, got both."
+        )
+    if step_back and not getattr(solver, "is_symmetric", False):
+        raise ValueError(
+            "step_back takes a symmetric solver, such as cfjax.Strang(), cfjax.ImplicitMidpoint() "
+            f"or cfjax.Magnus4(), got {type(solver).__name__}. With others use checkpoint_every."
+        )
     dtype = time_dtype(y0)
     if num_steps > _most_steps(dtype):
         raise ValueError(
@@ -108,6 +126,7 @@ def integrate(
         save_every,
         save_initial,
         checkpoint_every,
+        step_back,
         throw=throw and is_traced,
     )
     if throw and not is_traced:
@@ -127,6 +146,7 @@ def equal_steps(
     save_every: int | None,
     save_initial: bool,
     checkpoint_every: int | None,
+    step_back: bool,
     throw: bool,
 ) -> tuple[diffrax.Solution, Fault]:
     """`integrate` of checked arguments, and what is wrong with them, which is an error if `throw`.
@@ -150,17 +170,17 @@ def equal_steps(
         # From the step's number, so that rounding does not add up, and t1 is met exactly.
         return jnp.where(n == num_steps, t1, t0 + n.astype(t0.dtype) * ((t1 - t0) / intervals))
 
-    def step(carry):
+    def step(carry, by=1):
         n, y, solver_state, result = carry
         y, _, _, solver_state, step_result = solver.step(
-            term, time(n), time(n + 1), y, args, solver_state, made_jump=False
+            term, time(n), time(n + by), y, args, solver_state, made_jump=False
         )
         # Our own fail where the state is not finite, which the last one shows as well. A loop of
         # small steps feels every operation.
         if not is_ours and step_result is not diffrax.RESULTS.successful:
             is_first = result == diffrax.RESULTS.successful
             result = diffrax.RESULTS.where(is_first, step_result, result)
-        return (n + 1, y, solver_state, result)
+        return (n + by, y, solver_state, result)
 
     # For diffrax a wrapped solver is an instance of what it wraps.
     is_ours = getattr(solver, "shows_failure", False)
@@ -185,8 +205,10 @@ def equal_steps(
 
     def advance(carry, number):
         # XLA would scalarise a loop of one turn, and compute the step anew for each of its uses.
-        if isinstance(number, int) and number == 1:
+        if isinstance(number, int) and number == 1 and not step_back:
             return step(carry)
+        if step_back:
+            return repeat_and_undo(step, lambda carry: step(carry, -1), carry, number, throw)
         if checkpoint_every is None:
             return repeat(step, carry, number, order=order)[0]
         length, rest = checkpoint_every, number % checkpoint_every
@@ -199,7 +221,7 @@ def equal_steps(
         return carry, carry[1]
 
     num_saves: Any = 1 if save_every is None else num_steps // save_every
-    if save_every == 1 and num_saves > 1:
+    if save_every == 1 and num_saves > 1 and not step_back:
         carry, ys = repeat(step, carry, num_saves, lambda carry: carry[1], order)
     else:
         carry, ys = lax.scan(steps_and_save, carry, length=num_saves)

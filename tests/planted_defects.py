@@ -36,6 +36,13 @@ class Defect(NamedTuple):
 
 
 DEFECTS = [
+    Defect(
+        "_step_back.py",
+        "jtu.tree_map(jnp.add, of_step, more)), None",
+        "more), None",
+        "a gradient by steps backwards that has the last step's part alone",
+        "test_step_back.py",
+    ),
     # Methods: coefficients and what is made of them.
     Defect(
         "_methods/tableau.py",

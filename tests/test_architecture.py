@@ -28,6 +28,7 @@ ROWS = [
     # Fields, and coefficients of methods.
     {"_fields", "_methods"},
     {"_solvers"},
+    {"_step_back"},
     {"_integrate"},
     {"_batch", "_testing"},
     {"_measure"},

@@ -208,7 +208,7 @@ def take_turns(
 def _equal_steps(problem: Problem, num_steps: Int[Array, ""]) -> tuple:
     term, solver, t0, t1, _, y0, args = problem
     solution, fault = equal_steps(
-        term, solver, t0, t1, y0, args, num_steps, None, False, None, throw=False
+        term, solver, t0, t1, y0, args, num_steps, None, False, None, False, throw=False
     )
     y, *rest = _end(solution, num_steps, 0)
     return needing(fault.error(jnp.zeros(())), y), *rest

@@ -52,6 +52,14 @@ class MagnusTableau:
         """Whether the last evaluation of a step is the first one of the next."""
         return self.nodes[0] == 0 and self.nodes[-1] == 1
 
+    @property
+    def is_symmetric(self) -> bool:
+        """Whether a step backwards in time undoes one forwards: the flows are a palindrome."""
+        mirrored = tuple(tuple(reversed(row)) for row in reversed(self.rows))
+        return mirrored == self.rows and all(
+            a + b == 1 for a, b in zip(self.nodes, reversed(self.nodes), strict=True)
+        )
+
     @classmethod
     def of(
         cls,

@@ -53,6 +53,10 @@ class AbstractMagnus(AbstractChartSolver):
         check_choice("unroll", self.unroll, True, False, None)
 
     @property
+    def is_symmetric(self) -> bool:
+        return self.tableau.is_symmetric
+
+    @property
     def first_same_as_last(self) -> bool:
         return self.tableau.shares_ends
 

@@ -1,6 +1,7 @@
 """All that reads and rewrites programs, so that XLA makes fast code of them.
 
-- `scalarised`, `repeat`: a step, and many equal ones, on single numbers.
+- `scalarised`, `repeat`: a step, and many equal ones, on single numbers. `within_equal_steps`: for
+  a step that is traced before the loop.
 - `table`: the stages of a long step, each scalarised; `are_long`: whether they make one.
 - `materialised_if_long`, `materialised_together`, `materialised_in_rows`: values that several
   results need, computed once.
@@ -24,5 +25,6 @@ from .program import are_long as are_long
 from .program import scalarised as scalarised
 from .scope import is_rewritten as is_rewritten
 from .scope import rewriting as rewriting
+from .scope import within_equal_steps as within_equal_steps
 from .smooth import smooth as smooth
 from .table import table as table

@@ -32,6 +32,7 @@ from .operation import operation
 from .rules import on_entries
 from .scope import (
     Place,
+    in_equal_steps,
     is_numeric,
     is_on,
     is_rows,
@@ -105,7 +106,7 @@ def scalarised(fun: Callable[[PyTree], PyTree], y: PyTree) -> PyTree:
     y, parameters = split((y, program.parameters), program.rows)
     # What is around may use single entries, so that XLA computes anew what these share. It does
     # little harm to a step, but much to a derivative.
-    is_derived = program.length <= _SHORT_TO_DIFFERENTIATE
+    is_derived = program.length <= _SHORT_TO_DIFFERENTIATE or in_equal_steps()
     through = _materialised if is_derived else lambda x: x
     # The derivative of an adaptive loop computes a step at one place and uses its derivative at
     # another. What that needs of the step is many numbers: to compute them again is cheaper than to
