@@ -183,6 +183,7 @@ def test_methods_and_fields_do_not_know_xla():
         "_solvers.chart",
         "_solvers.dense",
         "_solvers.stages",
+        "_step_back",
         "scenes.wilson_flow",
     }
 
