@@ -53,7 +53,7 @@ def twice(term, solver, t1, y0, num_steps, save_every=1, args=None) -> list[Any]
 def growth(runs, error) -> tuple[float, float]:
     """The observed order at t1 / 2, and how much larger the error is at t1.
 
-    The errors are the largest of a tenth of the time to t1, which has two periods or more.
+    The errors are the largest of a tenth of the time to t1, which has a period or more.
     """
     (ts, ys), (fine_ts, fine_ys) = runs
     coarse, fine, t1 = error(ts, ys), error(fine_ts, fine_ys), ts[-1]
@@ -321,7 +321,7 @@ def test_pendulums_in_a_torus(name, order, num_steps):
 
     term = all_terms(lambda t, y, args: {"U": None, "P": -BETA / 6 * skew(y["U"])}, drift)
     start = {"U": links(np.zeros(1))[0], "P": np.zeros((3, 3, 3), complex)}
-    # Ten periods of the slowest.
+    # 16 periods of the slowest.
     runs = twice(term, of_the_page(name), 200.0, start, num_steps)
     assert_linear(runs, off, order)
     # To rounding of some thousand exponentials, at random.
