@@ -200,7 +200,8 @@ def trace(fun: Callable[[PyTree], PyTree], y: PyTree, place: Place) -> Program |
 
     def run(y: PyTree, parameters: PyTree) -> PyTree:
         outs = jaxpr_as_fun(made)(*jtu.tree_leaves((y, parameters)))
-        return jtu.tree_unflatten(jtu.tree_structure(out), outs)
+        # A literal comes out as NumPy's.
+        return jtu.tree_unflatten(jtu.tree_structure(out), list(map(jnp.asarray, outs)))
 
     def plain(y: PyTree, parameters: PyTree) -> PyTree:
         closed = ClosedJaxpr(before.jaxpr, list(map(_whole, values(before.consts, parameters))))

@@ -209,3 +209,17 @@ def test_what_moves_only_later():
 
     want, found = (jax.jit(first(run))(VECTOR) for run in (plain, looped))
     close(found, want, VECTOR)
+
+
+def test_an_entry_that_is_known_before():
+    """A force without a part along an axis leaves a literal in the carry."""
+
+    def step(carry):
+        x, _ = carry
+        return jnp.cos(x), jnp.stack([jnp.zeros_like(x[0]), x[2], -x[1]])
+
+    start = (VECTOR, jnp.zeros(3))
+    expected = lax.scan(lambda c, _: (step(c), None), start, length=NUM_STEPS)[0]
+    for found, x in zip(repeat(step, start, NUM_STEPS)[0], expected, strict=True):
+        # The same operations, which XLA may fuse in other ways.
+        np.testing.assert_allclose(found, x, rtol=1e-15, atol=1e-15)

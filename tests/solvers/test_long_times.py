@@ -1,0 +1,609 @@
+"""Symplectic methods against motions that are known: their errors over long times, and invariants.
+
+A symplectic method of order p solves a system near by, with a period that is off by h^p. So the
+error grows as t h^p, where that of other methods grows as its square, with their energy.
+"""
+
+import itertools
+from functools import partial
+from pathlib import Path
+from typing import Any
+
+import diffrax
+import jax
+import jax.numpy as jnp
+import mpmath as mp
+import numpy as np
+import problems
+import pytest
+from scipy.linalg import expm
+from scipy.spatial.transform import Rotation
+from scipy.special import ellipj, ellipk
+
+import cfjax
+
+EPS = 2.0**-52
+PAGE = Path(__file__).parents[2] / "docs" / "long_times.md"
+
+
+def all_terms(*fields: Any) -> Any:
+    return diffrax.MultiTerm(*map(cfjax.LieTerm, fields))
+
+
+def of_the_page(name: str) -> Any:
+    """A method of which the page shows the coefficients."""
+    (block,) = (b for b in PAGE.read_text().split("```") if "def symmetric" in b)
+    names: dict[str, Any] = {"cfjax": cfjax}
+    exec(block.removeprefix("python"), names)
+    return names[name]
+
+
+def twice(term, solver, t1, y0, num_steps, save_every=1, args=None) -> list[Any]:
+    """Times and states to t1, and with half the step to t1 / 2: the same number, so one program."""
+    y0 = problems.arrays(y0)
+    found = []
+    for end in (t1, t1 / 2):
+        solution = cfjax.integrate(
+            term, solver, 0.0, end, y0, args, num_steps=num_steps, save_every=save_every
+        )
+        found.append((np.asarray(solution.ts), jax.tree.map(np.asarray, solution.ys)))
+    return found
+
+
+def growth(runs, error) -> tuple[float, float]:
+    """The observed order at t1 / 2, and how much larger the error is at t1.
+
+    The errors are the largest of a tenth of the time to t1, which has a period or more.
+    """
+    (ts, ys), (fine_ts, fine_ys) = runs
+    coarse, fine, t1 = error(ts, ys), error(fine_ts, fine_ys), ts[-1]
+    is_early = (ts > 0.4 * t1) & (ts <= 0.5 * t1 * (1 + EPS))
+    early, late = coarse[is_early].max(), coarse[ts > 0.9 * t1].max()
+    return np.log2(early / fine[fine_ts > 0.4 * t1].max()), late / early
+
+
+def assert_linear(runs, error, order):
+    slope, factor = growth(runs, error)
+    # The next terms of the error are smaller by the square of the step.
+    assert order - 0.1 < slope < order + 0.1
+    # 2, but for the part of the error that only goes to and fro.
+    assert 1.8 < factor < 2.2
+
+
+# A free rigid body: m' = m x w, in Jacobi's elliptic functions.
+
+BODY = np.array([0.5, 0.0, 1.0])
+
+
+def spin(axis):
+    return lambda t, m, inertia: cfjax.Rotation(-jnp.eye(3)[axis] * m / inertia)
+
+
+AXES = all_terms(spin(0), spin(1), spin(2))
+WHOLE = cfjax.LieTerm(problems.rigid_body)
+
+
+def body_at(t):
+    """Landau & Lifshitz, Mechanics, section 37, for a start in the plane of the axes 1 and 3."""
+    (a, b, c), energy, square = (
+        problems.INERTIA,
+        np.sum(BODY**2 / problems.INERTIA),
+        np.sum(BODY**2),
+    )
+    # It goes round the third axis.
+    assert square > energy * b
+    rate = np.sqrt((c - b) * (square - energy * a) / (a * b * c))
+    parameter = (b - a) * (energy * c - square) / ((c - b) * (square - energy * a))
+    middle = np.sqrt(b * (energy * c - square) / (c - b))
+    sn, cn, dn, _ = ellipj(rate * t, parameter)
+    return np.stack([BODY[0] * cn, middle * sn, BODY[2] * dn], axis=-1)
+
+
+def off_body(ts, ys):
+    return np.abs(ys - body_at(ts)).max(axis=1)
+
+
+@pytest.mark.parametrize(
+    "term, solver, order",
+    [
+        (AXES, cfjax.BlanesMoan4(), 4),
+        (WHOLE, cfjax.ImplicitMidpoint(), 2),
+        pytest.param(AXES, cfjax.Strang(), 2, marks=pytest.mark.slow),
+        pytest.param(AXES, cfjax.BlanesMoan6(), 6, marks=pytest.mark.slow),
+        pytest.param(
+            WHOLE, cfjax.Composition(cfjax.ImplicitMidpoint(), 4), 4, marks=pytest.mark.slow
+        ),
+    ],
+    ids=["BlanesMoan4", "midpoint", "Strang", "BlanesMoan6", "Composition"],
+)
+def test_a_free_body_for_fifty_periods(term, solver, order):
+    runs = twice(term, solver, 1000.0, BODY, 4000, 4, problems.arrays(problems.INERTIA))
+    assert_linear(runs, off_body, order)
+    for _, ys in runs:
+        # The increments of the steps are summed with compensation.
+        np.testing.assert_allclose(np.sum(ys**2, axis=1), 1.25, rtol=8 * EPS)
+
+
+@pytest.mark.slow
+def test_the_error_of_a_method_that_is_not_symplectic_grows_as_the_square():
+    runs = twice(WHOLE, cfjax.CF4(), 1000.0, BODY, 4000, 4, problems.arrays(problems.INERTIA))
+    assert 3.8 < growth(runs, off_body)[1] < 4.2
+
+
+# Lagrange's top: inertia 1, 1 and I3, and a potential that is the height of a point of its axis.
+
+I3, TILT, SPIN = 0.4, 0.8, np.array([0.0, 0.4, 1.0])
+TILTED = np.array(
+    [[1, 0, 0], [0, np.cos(TILT), -np.sin(TILT)], [0, np.sin(TILT), np.cos(TILT)]], dtype=float
+)
+ATTITUDE = np.array([np.cos(TILT / 2), np.sin(TILT / 2), 0.0, 0.0])
+VERTICAL = (TILTED @ SPIN)[2]
+
+
+def turn(w, frame) -> Any:
+    return cfjax.QuaternionRotation(w, frame=frame, order="wxyz")
+
+
+def frame_of(q):
+    return cfjax.quaternion_to_matrix(q, order="wxyz")
+
+
+def nutation(t):
+    """The height of the axis, between two roots of a cubic: Goldstein, Mechanics, section 5.7."""
+    energy, start = SPIN[1] ** 2 + 2 * np.cos(TILT), np.cos(TILT)
+    # u'^2 = (1 - u^2) (energy - 2 u) - (vertical - m3 u)^2.
+    m3 = SPIN[2]
+    cubic = [2, -energy - m3**2, 2 * m3 * VERTICAL - 2, energy - VERTICAL**2]
+    low, high, other = np.sort(np.roots(cubic).real)
+    # The start is the higher of its turning points.
+    np.testing.assert_allclose(high, start, rtol=1e-14)
+    rate, parameter = np.sqrt((other - low) / 2), (high - low) / (other - low)
+    return low + (high - low) * ellipj(rate * t + ellipk(parameter), parameter)[0] ** 2
+
+
+def kick_in_space(t, y, args):
+    a = frame_of(y["q"])[:, 2]
+    return {"q": None, "m": jnp.stack([-a[1], a[0], jnp.zeros_like(a[0])])}
+
+
+def spherical(t, y, args):
+    return {"q": turn(y["m"], "fixed"), "m": None}
+
+
+def axial(t, y, args):
+    m3 = jnp.dot(frame_of(y["q"])[:, 2], y["m"])
+    return {"q": turn((1 / I3 - 1) * m3 * np.array([0.0, 0.0, 1.0]), "body"), "m": None}
+
+
+def kick_in_the_body(t, y, args):
+    up = frame_of(y["q"])[2]
+    return {"q": None, "m": jnp.stack([up[1], -up[0], jnp.zeros_like(up[0])])}
+
+
+def about(axis):
+    def field(t, y, args):
+        w = np.eye(3)[axis] / np.array([1.0, 1.0, I3]) * y["m"]
+        return {"q": turn(w, "body"), "m": cfjax.Rotation(-w)}
+
+    return field
+
+
+SYMMETRIC_TOP = all_terms(kick_in_space, spherical, axial)
+FOUR_TERMS = all_terms(kick_in_the_body, about(0), about(1), about(2))
+
+
+@pytest.mark.parametrize("frame", ["space", pytest.param("body", marks=pytest.mark.slow)])
+def test_the_nutation_of_a_symmetric_top(frame):
+    is_space = frame == "space"
+    term = SYMMETRIC_TOP if is_space else FOUR_TERMS
+    start = {"q": ATTITUDE, "m": TILTED @ SPIN if is_space else SPIN}
+    # 200 nutations.
+    runs = twice(term, cfjax.BlanesMoan4(), 1000.0, start, 5000, 2)
+    frames = [Rotation.from_quat(np.roll(ys["q"], -1, axis=1)).as_matrix() for _, ys in runs]
+    assert_linear(
+        [(ts, frame) for (ts, _), frame in zip(runs, frames, strict=True)],
+        lambda ts, frames: np.abs(frames[:, 2, 2] - nutation(ts)),
+        4,
+    )
+    # 30 000 kicks, each with a rounding or two of numbers of size one: a random walk of 4e-14.
+    atol = 2e-13
+    m = runs[0][1]["m"]
+    if is_space:
+        # No flow moves the vertical momentum, and each keeps the momentum about the axis.
+        np.testing.assert_array_equal(m[:, 2], VERTICAL)
+        about_axis = np.sum(frames[0][:, :, 2] * m, axis=1)
+        np.testing.assert_allclose(about_axis, SPIN[2], rtol=0, atol=atol)
+    else:
+        vertical = np.sum(frames[0][:, 2] * m, axis=1)
+        np.testing.assert_allclose(vertical, VERTICAL, rtol=0, atol=atol)
+        # Turns about the other axes move that about the third.
+        assert np.ptp(m[:, 2]) > 1e-8
+
+
+# Kovalevskaya's top, in the body's frame: inertia 1, 1, 1/2, and g is the upward direction, with a
+# potential g1. With z = m1 + i m2 and c = g1 + i g2, (z^2 - 2 c)' = -2 i m3 (z^2 - 2 c).
+
+INVERSE = np.array([1.0, 1.0, 2.0])
+
+
+def pull(t, y, args):
+    g = y["g"]
+    return {"m": jnp.stack([jnp.zeros_like(g[0]), g[2], -g[1]]), "g": None}
+
+
+def spherical_in_the_body(t, y, args):
+    return {"m": None, "g": cfjax.Rotation(-y["m"])}
+
+
+def axial_in_the_body(t, y, args):
+    w = np.array([0.0, 0.0, 1.0]) * y["m"]
+    return {"m": cfjax.Rotation(-w), "g": cfjax.Rotation(-w)}
+
+
+def kovalevskaya(y):
+    """The energy, and the square of the modulus of z^2 - 2 c."""
+    m, g = y["m"], y["g"]
+    z, c = m[..., 0] + 1j * m[..., 1], g[..., 0] + 1j * g[..., 1]
+    return np.stack([np.sum(INVERSE * m**2, -1) / 2 + g[..., 0], np.abs(z**2 - 2 * c) ** 2], -1)
+
+
+@pytest.mark.parametrize(
+    "solver, order, step",
+    [
+        (cfjax.Strang(), 2, 0.1),
+        pytest.param(cfjax.BlanesMoan4(), 4, 0.2, marks=pytest.mark.slow),
+    ],
+    ids=["Strang", "BlanesMoan4"],
+)
+def test_both_invariants_of_kovalevskaya_stay_in_a_band(solver, order, step):
+    term = all_terms(pull, spherical_in_the_body, axial_in_the_body)
+    start = {"m": np.array([0.6, 0.5, 0.4]), "g": np.array([0.48, 0.6, 0.64])}
+    runs = twice(term, solver, 10_000 * step, start, 10_000, 2)
+    bands = []
+    for _, ys in runs:
+        off = np.abs(kovalevskaya(ys) - kovalevskaya(start)).reshape(5, 1000, 2).max(axis=1)
+        bands.append(off.max(axis=0))
+        # A fifth of the time has hundreds of periods, so all maxima are of the same band; those of
+        # CF4 are 1.6 to 5 times as large in the last fifth as in the first.
+        assert np.all(off.max(axis=0) < 1.15 * off.min(axis=0))
+        # The Casimirs: a random walk of the roundings of 10 000 steps, some 1e-14.
+        np.testing.assert_allclose(np.sum(ys["g"] ** 2, axis=1), 1, rtol=0, atol=2e-14)
+        product = np.sum(ys["m"] * ys["g"], axis=1)
+        np.testing.assert_allclose(product, 0.6 * 0.48 + 0.5 * 0.6 + 0.4 * 0.64, rtol=0, atol=5e-14)
+    slopes = np.log2(bands[0] / bands[1])
+    # The next terms are smaller by the square of the step; a maximum has 3 per cent of scatter.
+    assert np.all((order - 0.15 < slopes) & (slopes < order + 0.15))
+
+
+# Links of SU(3) with the action -(beta / 3) sum Re tr and the kinetic energy -tr P^2, so that
+# U' = P U and P' = -(beta / 6) (the traceless skew-Hermitian part of U times its staple).
+
+BETA = 6.0
+
+
+def dagger(u):
+    return u.conj().swapaxes(-1, -2)
+
+
+def skew(m):
+    m = (m - dagger(m)) / 2
+    trace = m[..., 0, 0] + m[..., 1, 1] + m[..., 2, 2]
+    xp = jnp if isinstance(m, jax.Array) else np
+    return m - trace[..., None, None] / 3 * xp.broadcast_to(np.eye(3, dtype=complex), m.shape)
+
+
+def drift(t, y, args):
+    return {"U": cfjax.LeftMatrix(y["P"]), "P": None}
+
+
+@pytest.mark.parametrize(
+    "name, order, num_steps",
+    [
+        ("nystrom", 6, 800),
+        pytest.param("minimum_norm", 2, 2000, marks=pytest.mark.slow),
+    ],
+)
+def test_pendulums_in_a_torus(name, order, num_steps):
+    """Single links U = exp(i phi H) with the action of U itself: phi'' = -(beta / 6) sin phi."""
+    rng = np.random.default_rng(1)
+    basis = np.linalg.qr(rng.normal(size=(3, 3)) + 1j * rng.normal(size=(3, 3)))[0]
+    # The last one starts close to the top.
+    modulus = np.sin(np.array([0.5, 1.5, 2.8]) / 2)
+
+    def links(t):
+        cd = np.divide(*ellipj(np.sqrt(BETA / 6) * t[:, None], modulus**2)[1:3])
+        phi = 2 * np.arcsin(modulus * cd)
+        phases = np.exp(1j * phi[..., None] * np.array([1, -1, 0]))
+        return np.einsum("ik,...k,jk->...ij", basis, phases, basis.conj())
+
+    def off(ts, ys):
+        return np.abs(ys["U"] - links(ts)).max(axis=(1, 2, 3))
+
+    term = all_terms(lambda t, y, args: {"U": None, "P": -BETA / 6 * skew(y["U"])}, drift)
+    start = {"U": links(np.zeros(1))[0], "P": np.zeros((3, 3, 3), complex)}
+    # 16 periods of the slowest.
+    runs = twice(term, of_the_page(name), 200.0, start, num_steps)
+    assert_linear(runs, off, order)
+    # To rounding of some thousand exponentials, at random.
+    squares = dagger(runs[0][1]["U"]) @ runs[0][1]["U"]
+    np.testing.assert_allclose(
+        squares, np.broadcast_to(np.eye(3), squares.shape), rtol=0, atol=1e-13
+    )
+
+
+# One step of an oscillator, q' = p and p' = -q, as a product of matrices of the published numbers.
+
+PUBLISHED = {
+    # Blanes & Moan, J. Comput. Appl. Math. 142 (2002): S6 and S10 of Table 2, 11b of Table 3. Those
+    # of the outer term, those of the inner one, and what follows from the sum 1 is the middle.
+    "BlanesMoan4": (
+        "0.0792036964311957 0.353172906049774 -0.0420650803577195",
+        "0.209515106613362 -0.143851773179818",
+    ),
+    "BlanesMoan6": (
+        "0.0502627644003922 0.413514300428344 0.0450798897943977 -0.188054853819569"
+        " 0.541960678450780",
+        "0.148816447901042 -0.132385865767784 0.067307604692185 0.432666402578175",
+    ),
+    "nystrom": (
+        "0.0414649985182624 0.198128671918067 -0.0400061921041533 0.0752539843015807"
+        " -0.0115113874206879",
+        "0.123229775946271 0.290553797799558 -0.127049212625417 -0.246331761062075"
+        " 0.357208872795928",
+    ),
+    # Omelyan, Mryglod & Folk, Comput. Phys. Commun. 151 (2003).
+    "minimum_norm": ("0.1931833275037836", ""),
+    # Steps of Strang's: Sofroniou & Spaletta (2005), and Kahan & Li (1997).
+    # Suzuki (1990): 1 / (4 - 4^(1/3)).
+    "Suzuki": ("0.41449077179437573714235406286076 0.41449077179437573714235406286076",),
+    "Sofroniou & Spaletta": (
+        "0.21375583945878254555518066964857 0.18329381407425713911385974425217"
+        " 0.17692819473098943794898811709929 -0.44329082681170215849622829626258"
+        " 0.11728560432865935385403585669136",
+    ),
+    "Kahan & Li": (
+        "0.13020248308889008088 0.56116298177510838456 -0.38947496264484728641"
+        " 0.15884190655515560090 -0.39590389413323757734 0.18453964097831570709"
+        " 0.25837438768632204729 0.29501172360931029887",
+    ),
+}
+# So long that a step depends on each digit.
+STEP = 4.0
+
+
+def palindrome(half, ends_twice):
+    """Numbers with sum 1 whose first half is given but for its last: one, or two that are equal."""
+    last = [(mp.mpf(1) / 2 - sum(half))] if ends_twice else [1 - 2 * sum(half)]
+    return [*half, *last, *(last if ends_twice else []), *reversed(half)]
+
+
+def published_step(lists):
+    """The matrix of a step, from lists of numbers."""
+    if len(lists) == 1:
+        parts = palindrome(lists[0], False)
+        outer = [sum(pair) / 2 for pair in itertools.pairwise([0, *parts, 0])]
+        inner = parts
+    else:
+        # One more of the outer ones; the middle of the step is of the longer half.
+        is_inner = len(lists[0]) == len(lists[1])
+        outer, inner = palindrome(lists[0], is_inner), palindrome(lists[1], not is_inner)
+    step = mp.eye(2)
+    for kick, drift in itertools.zip_longest(outer, inner, fillvalue=mp.mpf(0)):
+        step = mp.matrix([[1, 0], [-STEP * kick, 1]]) * step
+        step = mp.matrix([[1, STEP * drift], [0, 1]]) * step
+    return step
+
+
+OSCILLATOR = all_terms(
+    lambda t, y, args: {"q": None, "p": -y["q"]}, lambda t, y, args: {"q": y["p"], "p": None}
+)
+
+
+SOLVERS = {
+    "BlanesMoan4": cfjax.BlanesMoan4,
+    "BlanesMoan6": cfjax.BlanesMoan6,
+    "nystrom": partial(of_the_page, "nystrom"),
+    "minimum_norm": partial(of_the_page, "minimum_norm"),
+    "Suzuki": lambda: cfjax.Composition(cfjax.Strang(), 4),
+    "Sofroniou & Spaletta": lambda: cfjax.Composition(cfjax.Strang(), 6),
+    "Kahan & Li": lambda: cfjax.Composition(cfjax.Strang(), 8),
+}
+
+
+@pytest.mark.parametrize("name", SOLVERS)
+def test_a_step_has_each_published_digit(name):
+    start = {"q": jnp.array([1.0, 0.0]), "p": jnp.array([0.0, 1.0])}
+    ys: Any = cfjax.integrate(OSCILLATOR, SOLVERS[name](), 0.0, STEP, start, num_steps=1).ys
+    # Up to 35 products of matrices with entries of size ten, each with a rounding.
+    atol = 50 * EPS
+    with mp.workdps(40):
+        lists = [list(map(mp.mpf, text.split())) for text in PUBLISHED[name]]
+        step = published_step(lists)
+        found, expected = np.stack([ys["q"][-1], ys["p"][-1]]), np.array(step.tolist(), float)
+        np.testing.assert_allclose(found, expected, rtol=0, atol=atol)
+        # A digit that is wrong by 1e-13 is seen, whichever it is.
+        for k, numbers in enumerate(lists):
+            for j in range(len(numbers)):
+                wrong = [[*x] for x in lists]
+                wrong[k][j] += mp.mpf("1e-13")
+                assert mp.norm(published_step(wrong) - step, mp.inf) > 10 * atol
+
+
+# Vortices of strength 4 pi on the sphere: x_i' = sum over j of x_j x x_i / (1 - x_i . x_j). In
+# a ring of N at the latitude of sine c and cosine s the rate is (N - 1) c / s^2.
+
+NUM_VORTICES, SINE, COSINE = 4, 0.8, 0.6
+PARTNERS = [np.array(x) for x in ([1, 0, 3, 2], [2, 3, 0, 1], [3, 2, 1, 0])]
+
+
+def ring(t):
+    rate = (NUM_VORTICES - 1) * SINE / COSINE**2
+    angle = 2 * np.pi * np.arange(NUM_VORTICES) / NUM_VORTICES + rate * t[:, None]
+    height = np.full_like(angle, SINE)
+    return np.stack([COSINE * np.cos(angle), COSINE * np.sin(angle), height], axis=-1)
+
+
+def pairs(partner):
+    """Disjoint pairs, both of which turn about their sum."""
+
+    def field(t, x, args):
+        other = x[partner]
+        return cfjax.Rotation((x + other) / (1 - jnp.sum(x * other, axis=1, keepdims=True)))
+
+    return field
+
+
+def all_vortices(t, x, args):
+    identity = np.eye(NUM_VORTICES)
+    return cfjax.Rotation(((1 - identity) / (1 - x @ x.T + identity)) @ x)
+
+
+@pytest.mark.parametrize(
+    "term, solver, order",
+    [
+        (all_terms(*map(pairs, PARTNERS)), cfjax.BlanesMoan4(), 4),
+        pytest.param(
+            cfjax.LieTerm(all_vortices), cfjax.ImplicitMidpoint(), 2, marks=pytest.mark.slow
+        ),
+    ],
+    ids=["pairs", "midpoint"],
+)
+def test_a_ring_of_vortices_turns_as_one(term, solver, order):
+    start = ring(np.zeros(1))[0]
+    runs = twice(term, solver, 30.0, start, 2000, 4)
+    assert_linear(runs, lambda ts, ys: np.abs(ys - ring(ts)).max(axis=(1, 2)), order)
+    for _, ys in runs:
+        # The momentum, kept by each pair; the increments are summed with compensation.
+        momentum = np.broadcast_to(start.sum(axis=0), (500, 3))
+        np.testing.assert_allclose(ys.sum(axis=1), momentum, rtol=0, atol=20 * EPS)
+
+
+# Heisenberg's ring, s_i' = (s_(i-1) + s_(i+1)) x s_i: a spiral with angles k i in a plane, tilted
+# out of it with sine c, turns at the rate 2 c (1 - cos k).
+
+NUM_SPINS = 8
+WAVE = 2 * np.pi / NUM_SPINS
+IS_EVEN = np.arange(NUM_SPINS)[:, None] % 2 == 0
+
+
+def spiral(t):
+    angle = WAVE * np.arange(NUM_SPINS) + 2 * SINE * (1 - np.cos(WAVE)) * t[:, None]
+    height = np.full_like(angle, SINE)
+    return np.stack([COSINE * np.cos(angle), COSINE * np.sin(angle), height], axis=-1)
+
+
+def colour(mask):
+    def field(t, s, args):
+        return cfjax.Rotation(jnp.where(mask, jnp.roll(s, 1, axis=0) + jnp.roll(s, -1, axis=0), 0))
+
+    return field
+
+
+@pytest.mark.parametrize(
+    "solver, order",
+    [
+        (cfjax.Strang(), 2),
+        pytest.param(cfjax.BlanesMoan4(), 4, marks=pytest.mark.slow),
+        pytest.param(cfjax.BlanesMoan6(), 6, marks=pytest.mark.slow),
+    ],
+    ids=["Strang", "BlanesMoan4", "BlanesMoan6"],
+)
+def test_a_spin_wave(solver, order):
+    term = all_terms(colour(IS_EVEN), colour(~IS_EVEN))
+    runs = twice(term, solver, 100.0, spiral(np.zeros(1))[0], 500)
+    assert_linear(runs, lambda ts, ys: np.abs(ys - spiral(ts)).max(axis=(1, 2)), order)
+    for _, s in runs:
+        # Each flow keeps the energy, a sum of eight products with a rounding each.
+        energy = np.sum(s * np.roll(s, 1, axis=1), axis=(1, 2))
+        np.testing.assert_allclose(
+            energy, 8 * (COSINE**2 * np.cos(WAVE) + SINE**2), rtol=0, atol=40 * EPS
+        )
+
+
+# Hybrid Monte Carlo: a periodic lattice of 4 x 4 plaquettes, with shape (chains, 2, 4, 4, 3, 3).
+
+
+def staples(u):
+    """The two others of the plaquettes that a link begins, for both directions."""
+    xp: Any = jnp if isinstance(u, jax.Array) else np
+    both = []
+    for k in (0, 1):
+        a, b = u[:, k], u[:, 1 - k]
+        b_next = xp.roll(b, -1, axis=1 + k)
+        above = b_next @ dagger(xp.roll(a, -1, axis=2 - k)) @ dagger(b)
+        both.append(above + xp.roll(dagger(b_next) @ dagger(a) @ b, 1, axis=2 - k))
+    return xp.stack(both, axis=1)
+
+
+def lattice_force(u):
+    return -BETA / 6 * skew(u @ staples(u))
+
+
+LATTICE = all_terms(lambda t, y, args: {"U": None, "P": lattice_force(y["U"])}, drift)
+
+
+def hamiltonian(y):
+    a, b = y["U"][:, 0], y["U"][:, 1]
+    plaquettes = a @ np.roll(b, -1, axis=1) @ dagger(np.roll(a, -1, axis=2)) @ dagger(b)
+    action = -BETA / 3 * np.trace(plaquettes, axis1=-2, axis2=-1).real.sum(axis=(1, 2))
+    return action - np.einsum("ndxyij,ndxyji->n", y["P"], y["P"]).real
+
+
+@pytest.fixture(scope="module")
+def lattice():
+    """Momenta with density exp(tr P^2), and links near the identity, as at a large beta."""
+    rng = np.random.default_rng(3)
+
+    def momenta():
+        z = rng.normal(size=(8, 2, 4, 4, 3, 3)) + 1j * rng.normal(size=(8, 2, 4, 4, 3, 3))
+        return skew(z / np.sqrt(2))
+
+    return {"U": expm(0.3 * momenta()), "P": momenta()}
+
+
+def energy_errors(solver, start):
+    """The root mean squares over the chains at t = 1/2 in four steps and in eight."""
+    errors = []
+    for ts, ys in twice(LATTICE, solver, 1.0, start, 8):
+        (k,) = np.flatnonzero(ts == 0.5)
+        off = hamiltonian({name: y[k] for name, y in ys.items()}) - hamiltonian(start)
+        errors.append(np.sqrt(np.mean(off**2)))
+    return errors
+
+
+@pytest.mark.slow
+def test_energy_errors_of_trajectories_on_a_lattice(lattice):
+    forces = {"Strang": 1, "minimum_norm": 2, "BlanesMoan6": 10, "nystrom": 11}
+    orders = {"Strang": 2, "minimum_norm": 2, "BlanesMoan6": 6, "nystrom": 6}
+    scaled = {}
+    for name, order in orders.items():
+        solver = getattr(cfjax, name)() if name in vars(cfjax) else of_the_page(name)
+        errors = energy_errors(solver, lattice)
+        # The next terms are smaller by the square of the step.
+        assert order - 0.2 < np.log2(errors[0] / errors[1]) < order + 0.2
+        scaled[name] = errors[1] * forces[name] ** order
+    # At equal numbers of forces the page has 4 and 9.
+    assert 3 < scaled["Strang"] / scaled["minimum_norm"] < 6
+    assert 5 < scaled["BlanesMoan6"] / scaled["nystrom"] < 15
+
+
+@pytest.mark.slow
+def test_a_nystroem_method_has_order_6_on_a_group(lattice):
+    solver = of_the_page("nystrom")
+    # For any terms its order is lower.
+    assert solver.order(LATTICE) == 4
+    start = {name: y[:1] for name, y in lattice.items()}
+    shape = start["U"].shape
+
+    def ode(t, y):
+        u, p = y.reshape(2, *shape)
+        return np.stack([p @ u, lattice_force(u)]).ravel()
+
+    answer = problems.reference(ode, 0.0, 0.5, np.stack([start["U"], start["P"]]).ravel())
+    errors = []
+    for ts, ys in twice(LATTICE, solver, 1.0, start, 8):
+        (k,) = np.flatnonzero(ts == 0.5)
+        errors.append(np.abs(np.stack([ys["U"][k], ys["P"][k]]).ravel() - answer).max())
+    # Above the rounding of the reference, so the slope is the method's.
+    assert errors[1] > 20 * problems.REFERENCE_ERROR
+    assert 5.8 < np.log2(errors[0] / errors[1]) < 6.2
