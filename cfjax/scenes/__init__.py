@@ -14,5 +14,6 @@ from . import spins as spins
 from . import stiefel as stiefel
 from . import toda as toda
 from . import transmon as transmon
+from . import vortices as vortices
 from . import wilson_flow as wilson_flow
 from . import zeitlin as zeitlin
