@@ -12,6 +12,7 @@ from . import rotational_diffusion as rotational_diffusion
 from . import spacecraft as spacecraft
 from . import spins as spins
 from . import stiefel as stiefel
+from . import tennis_racket as tennis_racket
 from . import toda as toda
 from . import transmon as transmon
 from . import vortices as vortices
