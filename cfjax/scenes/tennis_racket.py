@@ -199,7 +199,7 @@ def picture(num_steps: int = 1_000_000) -> "Figure":
             y = jax.tree.map(lambda x: x[:, -1], ys)
             for up, m, colour in zip(ys["up"], ys["m"], colours, strict=True):
                 angle, height = section(up, m).T
-                dots: Any = dict(color=colour, markersize=0.9, markeredgewidth=0, rasterized=True)
+                dots: Any = dict(color=colour, markersize=1.8, markeredgewidth=0, rasterized=True)
                 ax.plot(np.degrees(angle), height, ".", **dots)
         ax.set(title=type(solver).__name__, xlabel="momentum from axis 1 to axis 2 (degrees)")
         ax.set(xlim=(-180, 180), ylim=(-1, 1), xticks=[-180, -90, 0, 90, 180])

@@ -58,12 +58,10 @@ def test_a_start_is_on_the_section(angle, height):
     np.testing.assert_allclose([found, part], [angle, height], rtol=0, atol=1e-4)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     "solver, num_steps",
-    [
-        (cfjax.CF4(), (160, 320)),
-        pytest.param(cfjax.BlanesMoan4(), (80, 160), marks=pytest.mark.slow),
-    ],
+    [(cfjax.CF4(), (160, 320)), (cfjax.BlanesMoan4(), (80, 160))],
     ids=["CF4", "BlanesMoan4"],
 )
 def test_order(solver, num_steps):
@@ -92,13 +90,13 @@ def test_the_energy_stays_in_a_band_or_drifts(long):
     for name, run in long.items():
         line = np.polyfit(times, run.kept["energy"], 1)
         scatter = np.std(run.kept["energy"] - np.polyval(line, times))
+        # From the start to the end. The band of Strang is 1e-4 wide.
         drift = abs(line[0])
-        print(name, drift, scatter)
-        assert drift < scatter / 10 if name == "Strang" else drift > 10 * scatter
+        assert drift < scatter / 100 if name == "Strang" else drift > 100 * scatter
 
 
 def test_what_a_splitting_keeps(long):
-    # A thousandth of the rounding of each step, as sums over the steps are compensated.
+    # Less than the rounding of each step, as sums over the steps are compensated.
     kept = long["Strang"].kept
     np.testing.assert_allclose(kept["vertical momentum"], 0.5, rtol=0, atol=1e-14)
     np.testing.assert_allclose(kept["length of up"], 1, rtol=0, atol=1e-14)
@@ -106,15 +104,18 @@ def test_what_a_splitting_keeps(long):
 
 
 def test_curves_stay_closed_or_are_left(long):
+    """A curve through the first half of the crossings goes through the second half too."""
     off = {}
     for name, run in long.items():
         angle, height = scene.section(run.ys["up"], run.ys["m"]).T
-        waves = np.exp(1j * np.multiply.outer(angle, np.arange(20)))
-        waves = np.concatenate([waves.real, waves.imag[:, 1:]], axis=1)
+        phases = np.multiply.outer(angle, np.arange(20))
+        waves = np.concatenate([np.cos(phases), np.sin(phases[:, 1:])], axis=1)
         half = len(angle) // 2
         curve = np.linalg.lstsq(waves[:half], height[:half])[0]
-        off[name] = [np.sqrt(np.mean((waves @ curve - height)[part] ** 2)) for part in (slice(half), slice(half, None))]
-    print(off)
+        off[name] = np.max(np.abs(waves @ curve - height)[half:])
+    # The error of the cubic that finds a crossing, and a tenth of the picture's width of a line.
+    assert off["Strang"] < 1e-4
+    assert off["CF4"] > 1e-3
 
 
 @pytest.mark.slow
