@@ -57,10 +57,9 @@ class Racket(NamedTuple):
 
 
 def y0(angle: float = np.pi / 2, height: float = 0.1) -> State:
-    """A state on the section, with energy 1/3 and momentum 1/2 about the vertical.
+    """A state with these coordinates of `section`, energy 1/3 and vertical momentum 1/2.
 
-    `angle` and `height` are the coordinates of `section`. By default the body is near the second
-    axis, the middle one.
+    By default the body turns about almost its second axis, the middle one.
     """
     ring, args = np.sqrt(1 - height**2), Racket()
     along = np.array([ring * np.cos(angle), ring * np.sin(angle), height])

@@ -8,8 +8,9 @@ fluid of all others:
 The energy and the momentum, the sum of all `G x`, are constant. All quantities are dimensionless.
 
 Two vortices alone turn about `G_1 x_1 + G_2 x_2`, which does not move, so their flow is exact. In
-a round all vortices move in pairs. As in a tournament, N - 1 rounds bring every two of them
-together, and a splitting of the rounds keeps the momentum to rounding and the energy in a band.
+a round all vortices move in pairs, and as in a tournament N - 1 rounds bring every two of them
+together. A splitting into rounds keeps the momentum to rounding. It is symplectic, so the energy
+does not drift, as long as the steps are short for the vortices that come closest.
 
 Source: Newton, The N-Vortex Problem, Springer (2001), Chapter 4, doi:10.1007/978-1-4684-9290-3;
 Myerscough & Frank, Explicit, parallel Poisson integration of point vortices on the sphere, J.
@@ -54,10 +55,8 @@ def y0(n: int = 4, latitude: float = 0.4, shift: float = 0.02) -> Float[np.ndarr
     k = np.arange(2 * n)
     longitude = (2 * k + k // n) * np.pi / n + shift * np.cos(k)
     latitudes = np.where(k < n, latitude, -latitude) + shift * np.sin(2 * k)
-    ring = np.cos(latitudes)
-    return np.stack(
-        [ring * np.cos(longitude), ring * np.sin(longitude), np.sin(latitudes)], axis=-1
-    )
+    direction = np.cos(longitude), np.sin(longitude), np.tan(latitudes)
+    return np.cos(latitudes)[:, None] * np.stack(direction, axis=-1)
 
 
 def strengths(n: int = 4) -> Float[np.ndarray, " N"]:
@@ -81,8 +80,7 @@ def velocity(t: Any, y: Vortices, args: Strengths) -> Float[Array, "N 3"]:
 def rounds(num_vortices: int = 8) -> diffrax.MultiTerm:
     """The terms of a splitting, one less than the vortices, of which the number must be even.
 
-    In each every vortex has one partner, and both turn with the angular velocity
-    `(G_1 x_1 + G_2 x_2) / (4 pi (1 - x_1 . x_2))`.
+    In each of them every vortex has one partner, with which it turns about `G_1 x_1 + G_2 x_2`.
     """
     last = num_vortices - 1
     k = np.arange(last)
@@ -169,14 +167,11 @@ def picture() -> "Figure":
     from matplotlib.figure import Figure
 
     start, args, end = jnp.asarray(y0()), jnp.asarray(strengths()), 100.0
-    whole = LieTerm(field)
-    found = {}
-    for name, term, solver, n in (
-        ("CF4", whole, CF4(), 3000),
-        ("RKMK8", whole, RKMK8(), 1000),
-        ("BlanesMoan4", rounds(), BlanesMoan4(), 1000),
-    ):
+    whole, found = LieTerm(field), {}
+    solvers = (whole, CF4(), 3000), (whole, RKMK8(), 1000), (rounds(), BlanesMoan4(), 1000)
+    for term, solver, n in solvers:
         options: Any = dict(num_steps=n, save_every=n // 1000, save_initial=True)
+        name = type(solver).__name__
         found[name] = integrate(term, solver, 0.0, end, start, args, **options)
 
     figure = Figure((10.5, 3.2), layout="constrained")
