@@ -172,6 +172,8 @@ TO_ITS_ORDER = {
     "rigid_body": ["energy"],
     "heavy_top": ["energy (J)"],
     "spacecraft": ["energy"],
+    "tennis_racket": ["energy", "vertical momentum"],
+    "vortices": ["energy", "momentum"],
     "zeitlin": ["energy", "angular momentum"],
 }
 

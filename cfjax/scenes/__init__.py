@@ -12,7 +12,9 @@ from . import rotational_diffusion as rotational_diffusion
 from . import spacecraft as spacecraft
 from . import spins as spins
 from . import stiefel as stiefel
+from . import tennis_racket as tennis_racket
 from . import toda as toda
 from . import transmon as transmon
+from . import vortices as vortices
 from . import wilson_flow as wilson_flow
 from . import zeitlin as zeitlin

@@ -1,0 +1,121 @@
+"""Point vortices on the sphere: their velocities, the rounds of pairs, and what they keep."""
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+import cfjax
+from cfjax.scenes import vortices
+
+WHOLE, ROUNDS = cfjax.LieTerm(vortices.field), vortices.rounds()
+T = 20.0
+
+# Eight vortices in no order, all of different strengths.
+OTHERS = np.random.default_rng(3).normal(size=(8, 3))
+OTHERS = jnp.asarray(OTHERS / np.linalg.norm(OTHERS, axis=1, keepdims=True))
+UNEQUAL = jnp.asarray(np.random.default_rng(4).normal(size=8))
+
+
+@pytest.fixture(
+    scope="module", ids=str, params=[(2, 0.2), pytest.param((4, 0.02), marks=pytest.mark.slow)]
+)
+def street(request):
+    """Vortices of a ring, the start, the strengths and the answer."""
+    n, shift = request.param
+    start, strengths = vortices.y0(n, shift=shift), vortices.strengths(n)
+    answer = vortices.reference(T, start, strengths)
+    return n, jnp.asarray(start), jnp.asarray(strengths), answer
+
+
+def test_the_velocity_is_that_of_the_fluid():
+    # Around a vortex of strength G the fluid goes with G / (4 pi tan(angle / 2)).
+    want = np.zeros((8, 3))
+    for i, x in enumerate(np.asarray(OTHERS)):
+        for j, (g, z) in enumerate(zip(UNEQUAL, np.asarray(OTHERS), strict=True)):
+            if i != j:
+                across = np.cross(z, x) / np.linalg.norm(np.cross(z, x))
+                want[i] += g / (4 * np.pi * np.tan(np.arccos(z @ x) / 2)) * across
+    # Of size one, with the rounding of an arc cosine.
+    options = dict(rtol=0, atol=1e-14)
+    np.testing.assert_allclose(vortices.velocity(0.0, OTHERS, UNEQUAL), want, **options)
+    parts = [cfjax.tangent(term.field(0.0, OTHERS, UNEQUAL), OTHERS) for term in ROUNDS.terms]
+    assert len(parts) == 7
+    np.testing.assert_allclose(sum(parts), want, **options)
+
+
+def test_the_flow_of_a_round_is_exact():
+    cfjax.check_terms(ROUNDS, 0.0, OTHERS, UNEQUAL)
+
+
+def test_energy_and_momentum_are_constant():
+    def value(y):
+        return vortices.energy(y, UNEQUAL), vortices.momentum(y, UNEQUAL)
+
+    (energy, _), rates = jax.jvp(value, (OTHERS,), (vortices.velocity(0.0, OTHERS, UNEQUAL),))
+    # Some 28 terms of size one cancel.
+    for rate in rates:
+        assert np.max(np.abs(rate)) < 1e-15 * 28
+    y, g = np.asarray(OTHERS), np.asarray(UNEQUAL)
+    pairs = [(i, j) for i in range(8) for j in range(i)]
+    want = sum(g[i] * g[j] * np.log(np.sum((y[i] - y[j]) ** 2) / 2) for i, j in pairs)
+    np.testing.assert_allclose(energy, -want / (4 * np.pi), rtol=0, atol=1e-14)
+
+
+def test_a_street_turns_as_a_whole():
+    y = vortices.y0(5, 0.3, shift=0.0)
+    rate = np.asarray(vortices.velocity(0.0, jnp.asarray(y), vortices.strengths(5)))
+    across = np.stack([-y[:, 1], y[:, 0], 0 * y[:, 0]], axis=-1)
+    speed = np.sum(rate * across, axis=1) / np.sum(across**2, axis=1)
+    np.testing.assert_allclose(rate, np.mean(speed) * across, rtol=0, atol=1e-15)
+    assert abs(np.mean(speed)) > 0.1
+    np.testing.assert_array_equal(np.sign(y[:, 2]), vortices.strengths(5))
+
+
+@pytest.mark.parametrize(
+    "solver, order, num_steps",
+    [
+        (cfjax.BlanesMoan4(), 4, (30, 60)),
+        pytest.param(cfjax.CF4(), 4, (40, 80), marks=pytest.mark.slow),
+        pytest.param(cfjax.ImplicitMidpoint(), 2, (160, 320), marks=pytest.mark.slow),
+    ],
+    ids=["BlanesMoan4", "CF4", "ImplicitMidpoint"],
+)
+def test_order_and_what_is_kept(solver, order, num_steps, street):
+    n, start, strengths, answer = street
+    is_split = isinstance(solver, cfjax.BlanesMoan4)
+    term, first = vortices.rounds(2 * n) if is_split else WHOLE, moving(start, strengths)
+    errors = []
+    for k in num_steps:
+        y = cfjax.integrate(term, solver, 0.0, T, start, strengths, num_steps=k).ys[-1]
+        errors.append(np.linalg.norm(y - answer))
+        energy, momentum = (
+            abs(a - b).max() for a, b in zip(moving(y, strengths), first, strict=True)
+        )
+        # Rounding of a few numbers of size one in each step.
+        np.testing.assert_allclose(np.linalg.norm(y, axis=1), 1, rtol=0, atol=1e-16 * k)
+        if isinstance(solver, cfjax.CF4):
+            assert momentum > 1e-13 * k
+        else:
+            assert momentum < 1e-16 * k
+        assert 1e-13 < energy < errors[-1]
+    # Far above the error of the reference.
+    assert errors[1] > 1e-9
+    assert 0.8 * 2**order < errors[0] / errors[1] < 1.3 * 2**order
+
+
+def moving(y, strengths):
+    return [np.asarray(f(y, strengths)) for f in (vortices.energy, vortices.momentum)]
+
+
+@pytest.mark.slow
+def test_the_error_of_the_reference():
+    given = vortices.problem()
+    found = cfjax.integrate(solver=cfjax.RKMK8(), **given, num_steps=1000).ys[-1]
+    answer = vortices.reference(vortices.t1, given["y0"], given["args"])
+    assert np.linalg.norm(found - answer) < 3e-11
+
+
+@pytest.mark.slow
+def test_the_picture():
+    assert len(vortices.picture().axes) == 5
