@@ -173,6 +173,8 @@ TO_ITS_ORDER = {
     "heavy_top": ["energy (J)"],
     "spacecraft": ["energy"],
     "zeitlin": ["energy", "angular momentum"],
+    "hmc": ["energy of each chain"],
+    "spin_waves": ["energy"],
 }
 
 

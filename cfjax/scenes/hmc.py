@@ -72,6 +72,7 @@ METHODS: dict[str, tuple[diffrax.AbstractSolver, int]] = {
 }
 
 
+@functools.partial(jax.jit, static_argnums=1)
 def momenta(key: Key[Array, ""], shape: tuple[int, ...]) -> Complex[Array, "..."]:
     """Matrices of su(n) with density `exp(tr P^2)`, of shape `(..., n, n)`."""
     real, imaginary = jax.random.normal(key, (2, *shape)) / jnp.sqrt(2)
@@ -81,8 +82,8 @@ def momenta(key: Key[Array, ""], shape: tuple[int, ...]) -> Complex[Array, "..."
 def algebra(x: Complex[Array, "*batch n n"]) -> Complex[Array, "*batch n n"]:
     """The part in su(n): skew-Hermitian and traceless."""
     x = (x - jnp.conj(jnp.swapaxes(x, -1, -2))) / 2
-    n = x.shape[-1]
-    return x - jnp.trace(x, axis1=-2, axis2=-1)[..., None, None] * jnp.eye(n, dtype=x.dtype) / n
+    trace = jnp.trace(x, axis1=-2, axis2=-1)[..., None, None]
+    return x - trace / x.shape[-1] * _identity(x)
 
 
 def plaquette(links: Links) -> Float[Array, " chains"]:
@@ -118,13 +119,13 @@ def drift(t: Any, y: State, beta: Any) -> dict[str, Any]:
 term = diffrax.MultiTerm(LieTerm(kick), LieTerm(drift))
 
 
-def y0(chains: int = 64, side: int = 4, *, beta: float = 2.0, n: int = 2, seed: int = 0) -> State:
+@functools.partial(jax.jit, static_argnums=(0, 1), static_argnames=("n",))
+def y0(chains: int = 64, side: int = 4, *, beta: Any = 2.0, n: int = 2, seed: Any = 0) -> State:
     """A start with plaquettes about as large as those of the density, but not yet of it."""
     shape = chains, 2, side, side, n, n
     first, second = jax.random.split(jax.random.key(seed))
     spread = momenta(first, shape) / jnp.sqrt(beta)
-    eye = jnp.broadcast_to(jnp.eye(n, dtype=spread.dtype), shape)
-    return {"U": LeftMatrix(spread).flow(eye), "P": momenta(second, shape)}
+    return {"U": LeftMatrix(spread).flow(_identity(spread)), "P": momenta(second, shape)}
 
 
 def samples(
@@ -138,20 +139,20 @@ def samples(
 ) -> tuple[Links, Float[Array, "num_trajectories chains"], Float[Array, "num_trajectories chains"]]:
     """The links at the end; after each trajectory the plaquette, and the dH that it had.
 
-    Trajectories are of length one, by default of two steps of `cfjax.BlanesMoan4`. An error of a mean
+    Trajectories have length one and by default two steps of `cfjax.BlanesMoan4`. An error of a mean
     is honest only between chains, as one chain's values depend on each other: see `estimate`.
     """
     keys = jax.random.split(jax.random.key(seed), num_trajectories)
     return _samples(keys, jnp.asarray(start), beta, solver or BlanesMoan4(), num_steps)
 
 
-def estimate(values: Float[Array, "times chains"]) -> tuple[float, float]:
+def estimate(values: Float[Array | np.ndarray, "times chains"]) -> tuple[float, float]:
     """The mean, and its standard error from the means of independent chains."""
     means = np.mean(values, axis=0)
     return float(np.mean(means)), float(np.std(means, ddof=1) / np.sqrt(len(means)))
 
 
-def reference(beta: Any, side: int = 4) -> Float[np.ndarray, "..."]:
+def reference(beta: Any, side: int = 4) -> Any:
     """The exact mean of the plaquette of SU(2), to rounding.
 
     With V plaquettes Z is the sum of `(2 I_n(beta) / beta)^V` over the characters n = 1, 2, ...,
@@ -178,7 +179,7 @@ def problem() -> dict[str, Any]:
 def invariants(y: State, args: Any = 2.0) -> dict[str, Array]:
     """What stays, or goes one way, as its name says."""
     square = _product(jnp.conj(jnp.swapaxes(y["U"], -1, -2)), y["U"])
-    defect = square - jnp.eye(square.shape[-1], dtype=square.dtype)
+    defect = square - _identity(square)
     return {
         "energy of each chain": energy(y, args),
         "distance of each link from unitary": jnp.linalg.norm(defect, axis=(-2, -1)),
@@ -212,7 +213,7 @@ def picture(num_trajectories: int = 150, most_steps: int = 64) -> "Figure":
     means = []
     for k, beta in enumerate(betas):
         _, values, _ = samples(y0(beta=beta, seed=k)["U"], beta, num_trajectories, seed=k)
-        means.append(estimate(values[num_trajectories // 5 :]))
+        means.append(estimate(np.asarray(values)[num_trajectories // 5 :]))
     found, deviation = np.transpose(means)
 
     figure = Figure((9.5, 3.9), layout="constrained")
@@ -246,6 +247,10 @@ def picture(num_trajectories: int = 150, most_steps: int = 64) -> "Figure":
     below.errorbar(betas, 1e3 * off, 1e3 * bars, fmt="o", color="#0072B2", markersize=5)
     below.set(xlabel="$\\beta$", ylabel="off / $10^{-3}$")
     return figure
+
+
+def _identity(like: Array) -> Array:
+    return jnp.broadcast_to(jnp.eye(like.shape[-1], dtype=like.dtype), like.shape)
 
 
 def _product(x: Array, y: Array) -> Array:

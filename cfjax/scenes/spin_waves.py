@@ -16,11 +16,14 @@ Source: Krech, Bunker & Landau, Fast spin dynamics algorithms for classical spin
 Phys. Commun. 111 (1998), doi:10.1016/S0010-4655(98)00009-5.
 """
 
+import functools
 from typing import TYPE_CHECKING, Any
 
 import diffrax
+import jax
 import jax.numpy as jnp
 import numpy as np
+from jax import lax
 from jaxtyping import Array, Complex, Float, Int
 
 from .. import (
@@ -95,36 +98,29 @@ def wave(
     return np.stack([np.sin(tilt) * np.cos(phase), np.sin(tilt) * np.sin(phase), z], axis=-1)
 
 
-def amplitudes(y: Spins, waves: Int[np.ndarray, "waves 2"]) -> Complex[Array, " waves"]:
+def amplitudes(y: Spins, waves: Int[Array | np.ndarray, "waves 2"]) -> Complex[Array, " waves"]:
     """The waves in a state; `waves` has the turns along each axis."""
-    across = jnp.fft.fft2(y[..., 0] + 1j * y[..., 1])
+    across = jnp.fft.fft2(lax.complex(y[..., 0], y[..., 1]))
     return across[waves[:, 0], waves[:, 1]] / across.size
 
 
+@functools.partial(jax.jit, static_argnums=(3, 4))
 def run(
     start: Spins,
-    waves: Int[np.ndarray, "waves 2"],
-    step: float,
+    waves: Int[Array | np.ndarray, "waves 2"],
+    step: Any,
     num_steps: int,
-    solver: diffrax.AbstractSolver | None = None,
+    solver: diffrax.AbstractSolver,
 ) -> tuple[Complex[Array, "num_steps waves"], Float[Array, " num_steps"]]:
     """The amplitudes of `waves` and the energy of a spin after each step."""
 
     def seen(t: Any, y: Spins, args: spins.Magnet) -> Any:
         return amplitudes(y, waves), spins.energy(y, args) / (y.size // 3)
 
-    return diffrax.diffeqsolve(
-        term,
-        Strang() if solver is None else solver,
-        0.0,
-        num_steps * step,
-        step,
-        jnp.asarray(start),
-        MAGNET,
-        stepsize_controller=diffrax.ConstantStepSize(),
-        saveat=diffrax.SaveAt(steps=True, fn=seen),
-        max_steps=num_steps,
-    ).ys
+    saveat = diffrax.SaveAt(steps=True, fn=seen)
+    options: Any = dict(saveat=saveat, max_steps=num_steps)
+    end = num_steps * step
+    return diffrax.diffeqsolve(term, solver, 0.0, end, step, start, MAGNET, **options).ys
 
 
 def spectrum(
@@ -200,11 +196,11 @@ def picture(side: int = 64, time: float = 120.0) -> "Figure":
             ends = (-0.5, len(waves) - 0.5, 0, frequencies[shown][-1])
             decades = np.log10(power[shown] / np.max(power))
             options: Any = dict(origin="lower", aspect="auto", extent=ends, cmap="magma")
-            image = ax.imshow(decades, **options, vmin=-6, vmax=0, interpolation="nearest")
+            ax.imshow(decades, **options, vmin=-6, vmax=0, interpolation="nearest")
             ax.plot(frequency(kx, ky), "--", color="#56B4E9", linewidth=1.2, label="exact")
             ax.set(xticks=[0, half, 2 * half, 3 * half], xticklabels=["Γ", "X", "M", "Γ"])
             ax.set(title=name, xlabel="wave")
-            figure.colorbar(image, label="power, powers of ten") if ax is middle else None
+    figure.colorbar(middle.images[0], label="power, powers of ten")
     left.set_ylabel("frequency")
     left.legend(frameon=False, labelcolor="w", loc="lower center")
     right.set(title="Energy of the waves", xlabel="t", ylabel="largest change, relative")
