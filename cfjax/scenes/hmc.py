@@ -234,7 +234,7 @@ def picture(num_trajectories: int = 150, most_steps: int = 64) -> "Figure":
         left.annotate(f"{order}", (1.5 * cost, error / 1.3**order))
     left.set(xlabel="forces in a trajectory", ylabel="root mean square of dH")
     left.set_title("SU(2), 4 x 4 plaquettes, $\\beta = 2$; slopes 2, 4, 6")
-    left.legend(frameon=False)
+    left.legend(frameon=False, loc="lower left")
 
     often = np.linspace(0.02, 8.6, 200)
     right.plot(often, reference(often), color="0.4", linewidth=1, label="exact")
