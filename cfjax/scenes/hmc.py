@@ -49,7 +49,6 @@ t0, t1 = 0.0, 1.0
 Links = Complex[Array | np.ndarray, "chains 2 rows columns n n"]
 State = dict[str, Links]
 
-
 # Half a step of Blanes and Moan's SRKN11b, from the outside: kick, drift, kick, ....
 _HALF = (
     *(0.0414649985182624, 0.123229775946271, 0.198128671918067, 0.290553797799558),
@@ -63,7 +62,7 @@ _L = 0.1931833275037836
 # Each with its forces a step. Omelyan, Mryglod & Folk, Comput. Phys. Commun. 151 (2003),
 # doi:10.1016/S0010-4655(02)00754-3; Blanes & Moan, J. Comput. Appl. Math. 142 (2002),
 # doi:10.1016/S0377-0427(01)00492-7. SRKN11b has order 6 where H is quadratic in the momenta.
-METHODS: dict[str, tuple[diffrax.AbstractSolver, int]] = {
+METHODS: dict[str, tuple[Any, int]] = {
     "Strang": (Strang(), 1),
     "Omelyan": (Splitting((_L, 0.5 - _L, 0.5 - _L, _L)), 2),
     "BlanesMoan4": (BlanesMoan4(), 6),
@@ -128,22 +127,36 @@ def y0(chains: int = 64, side: int = 4, *, beta: Any = 2.0, n: int = 2, seed: An
     return {"U": LeftMatrix(spread).flow(_identity(spread)), "P": momenta(second, shape)}
 
 
+@functools.partial(jax.jit, static_argnums=(2, 3), static_argnames=("num_steps",))
 def samples(
     start: Links,
-    beta: float,
+    beta: Any,
     num_trajectories: int,
     solver: diffrax.AbstractSolver | None = None,
     *,
     num_steps: int = 2,
-    seed: int = 0,
+    seed: Any = 0,
 ) -> tuple[Links, Float[Array, "num_trajectories chains"], Float[Array, "num_trajectories chains"]]:
     """The links at the end; after each trajectory the plaquette, and the dH that it had.
 
     Trajectories have length one and by default two steps of `cfjax.BlanesMoan4`. An error of a mean
     is honest only between chains, as one chain's values depend on each other: see `estimate`.
     """
+
+    def trajectory(links: Any, key: Any) -> Any:
+        first, second = jax.random.split(key)
+        begin = {"U": links, "P": momenta(first, links.shape)}
+        options: Any = dict(num_steps=num_steps, throw=False)
+        ys = integrate(term, solver or BlanesMoan4(), t0, t1, begin, beta, **options).ys
+        end: Any = jax.tree.map(lambda y: y[-1], ys)
+        dh = energy(end, beta) - energy(begin, beta)
+        is_accepted = jax.random.uniform(second, dh.shape) < jnp.exp(-dh)
+        links = jnp.where(is_accepted[:, None, None, None, None, None], end["U"], links)
+        return links, (plaquette(links), dh)
+
     keys = jax.random.split(jax.random.key(seed), num_trajectories)
-    return _samples(keys, jnp.asarray(start), beta, solver or BlanesMoan4(), num_steps)
+    links, (plaquettes, errors) = lax.scan(trajectory, start, keys)
+    return links, plaquettes, errors
 
 
 def estimate(values: Float[Array | np.ndarray, "times chains"]) -> tuple[float, float]:
@@ -188,19 +201,13 @@ def invariants(y: State, args: Any = 2.0) -> dict[str, Array]:
 
 def chart(**options: Any) -> WorkPrecision:
     """The root mean square of dH of 64 trajectories of 4 x 4 plaquettes of SU(2), beta 2."""
-    given = problem()
-    before = energy(given["y0"], given["args"])
 
-    def error(y: State, start: State) -> float:
-        return float(jnp.sqrt(jnp.mean((energy(y, given["args"]) - before) ** 2)))
+    def error(end: State, start: State) -> float:
+        return float(jnp.sqrt(jnp.mean((energy(end, 2.0) - energy(start, 2.0)) ** 2)))
 
-    return work_precision(
-        **given,
-        methods={name: solver for name, (solver, _) in METHODS.items()} | {"CF4": CF4()},
-        reference=given["y0"],
-        error=error,
-        **(dict(num_steps=[2**k for k in range(7)]) | options),
-    )
+    methods = {name: solver for name, (solver, _) in METHODS.items()} | {"CF4": CF4()}
+    given: Any = dict(methods=methods, reference=y0(), num_steps=[2**k for k in range(7)])
+    return work_precision(**problem(), error=error, **(given | options))
 
 
 def picture(num_trajectories: int = 150, most_steps: int = 64) -> "Figure":
@@ -253,22 +260,6 @@ def _identity(like: Array) -> Array:
     return jnp.broadcast_to(jnp.eye(like.shape[-1], dtype=like.dtype), like.shape)
 
 
-def _product(x: Array, y: Array) -> Array:
+def _product(x: Any, y: Any) -> Array:
     # Ten times as fast as `@`, which calls a function for each product of small matrices.
     return jnp.sum(x[..., :, :, None] * y[..., None, :, :], axis=-2)
-
-
-@functools.partial(jax.jit, static_argnums=(3, 4))
-def _samples(keys: Any, start: Any, beta: Any, solver: Any, num_steps: int) -> Any:
-    def trajectory(links: Any, key: Any) -> Any:
-        first, second = jax.random.split(key)
-        begin = {"U": links, "P": momenta(first, links.shape)}
-        ys = integrate(term, solver, t0, t1, begin, beta, num_steps=num_steps, throw=False).ys
-        end: Any = jax.tree.map(lambda y: y[-1], ys)
-        dh = energy(end, beta) - energy(begin, beta)
-        is_accepted = jax.random.uniform(second, dh.shape) < jnp.exp(-dh)
-        links = jnp.where(is_accepted[:, None, None, None, None, None], end["U"], links)
-        return links, (plaquette(links), dh)
-
-    links, (plaquettes, errors) = lax.scan(trajectory, start, keys)
-    return links, plaquettes, errors

@@ -120,7 +120,8 @@ def run(
     saveat = diffrax.SaveAt(steps=True, fn=seen)
     options: Any = dict(saveat=saveat, max_steps=num_steps)
     end = num_steps * step
-    return diffrax.diffeqsolve(term, solver, 0.0, end, step, start, MAGNET, **options).ys
+    found: Any = diffrax.diffeqsolve(term, solver, 0.0, end, step, start, MAGNET, **options)
+    return found.ys
 
 
 def spectrum(
