@@ -54,6 +54,7 @@ def colour(parity: int) -> LieTerm:
     """The term that turns the spins of one colour, about fields that do not change meanwhile."""
 
     def field(t: Any, y: Spins, args: spins.Magnet) -> Rotation:
+        # In NumPy, as a constant of the program. XLA takes minutes to work it out.
         row, column = np.ogrid[: y.shape[0], : y.shape[1]]
         is_mine = ((row + column) % 2 == parity)[..., None]
         return Rotation(jnp.where(is_mine, spins.effective_field(y, args), 0))
@@ -68,8 +69,8 @@ def y0(side: int = 64, tilt: float = 0.03, seed: int = 0) -> Float[np.ndarray, "
     """Spins near z with all waves alike: random phases, and `tilt` as the mean square root."""
     phases = 2j * np.pi * np.random.default_rng(seed).random((side, side))
     across = tilt * side * np.fft.ifft2(np.exp(phases))
-    spins = np.stack([across.real, across.imag, np.ones((side, side))], axis=-1)
-    return spins / np.linalg.norm(spins, axis=-1, keepdims=True)
+    y = np.stack([across.real, across.imag, np.ones((side, side))], axis=-1)
+    return y / np.linalg.norm(y, axis=-1, keepdims=True)
 
 
 def frequency(kx: Any, ky: Any) -> Any:
@@ -78,7 +79,7 @@ def frequency(kx: Any, ky: Any) -> Any:
 
 
 def frequency_of_strang(kx: Any, ky: Any, step: float) -> Any:
-    """The frequency that a small wave has with steps of `cfjax.Strang`, exactly.
+    """The frequency that a small wave has with steps of `cfjax.Strang` below pi / 4, exactly.
 
     A step couples the amplitudes of the two colours by a matrix with determinant exp(8j step). It
     has two eigenvalues of modulus one, for this frequency and for that of k + (pi, pi).
