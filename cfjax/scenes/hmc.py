@@ -123,7 +123,8 @@ def y0(chains: int = 64, side: int = 4, *, beta: Any = 2.0, n: int = 2, seed: An
     """A start with plaquettes about as large as those of the density, but not yet of it."""
     shape = chains, 2, side, side, n, n
     first, second = jax.random.split(jax.random.key(seed))
-    spread = momenta(first, shape) / jnp.sqrt(beta)
+    spread = momenta(first, shape)
+    spread = spread / jnp.sqrt(jnp.asarray(beta, spread.dtype))
     return {"U": LeftMatrix(spread).flow(_identity(spread)), "P": momenta(second, shape)}
 
 
