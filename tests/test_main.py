@@ -175,6 +175,8 @@ TO_ITS_ORDER = {
     "tennis_racket": ["energy", "vertical momentum"],
     "vortices": ["energy", "momentum"],
     "zeitlin": ["energy", "angular momentum"],
+    "hmc": ["energy of each chain"],
+    "spin_waves": ["energy"],
 }
 
 

@@ -4,12 +4,14 @@ from . import annealing as annealing
 from . import covariance as covariance
 from . import heat as heat
 from . import heavy_top as heavy_top
+from . import hmc as hmc
 from . import imu as imu
 from . import landau_zener as landau_zener
 from . import macrospin as macrospin
 from . import rigid_body as rigid_body
 from . import rotational_diffusion as rotational_diffusion
 from . import spacecraft as spacecraft
+from . import spin_waves as spin_waves
 from . import spins as spins
 from . import stiefel as stiefel
 from . import tennis_racket as tennis_racket
