@@ -133,4 +133,5 @@ def moved(field: PyTree, z: PyTree, y0: PyTree, compensation: PyTree) -> PyTree:
             return z
         return z + f.increment(y0 + z) if isinstance(c, jax.Array) else flow_at(f, z)
 
-    return jtu.tree_map(part, field, z, compensation, y0, is_leaf=is_field)
+    moved = jtu.tree_map(part, field, z, compensation, y0, is_leaf=is_field)
+    return materialised_in_rows(moved, alone=True)

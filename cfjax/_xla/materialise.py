@@ -15,7 +15,7 @@ from jaxtyping import Array, PyTree
 
 from .limits import MAX_RESULTS, MAX_SIZE
 from .pack import pack, sharding, unpack
-from .scope import has_rows, is_short, where
+from .scope import has_rows, is_on, is_short, where
 
 
 def materialised(
@@ -62,15 +62,20 @@ def materialised_together(tree: PyTree, alone: bool) -> PyTree:
     )
 
 
-def materialised_in_rows(tree: PyTree) -> PyTree:
+def materialised_in_rows(tree: PyTree, alone: bool = False) -> PyTree:
     """The same arrays, computed once in states with leading axes.
 
-    Along these axes a point needs its neighbours, and would compute them anew.
+    Along these axes a point needs its neighbours, and would compute them anew. With `alone` also in
+    a program that is not rewritten, as it stands: in a long chain of flows XLA computes each again
+    for all that follow.
     """
-    if not has_rows():
+    is_plain = alone and is_on() and not where()
+    if not (has_rows() or is_plain):
         return tree
     leaves, structure = jtu.tree_flatten(tree)
-    places = [k for k, x in enumerate(leaves) if np.size(x) > MAX_SIZE]
+    places = [
+        k for k, x in enumerate(leaves) if (np.ndim(x) > 1 if is_plain else np.size(x) > MAX_SIZE)
+    ]
     for k in places:
         (leaves[k],) = materialised([leaves[k]], in_batches=True)
     return structure.unflatten(leaves)
