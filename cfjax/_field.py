@@ -225,10 +225,12 @@ def flow(field: PyTree, point: PyTree) -> PyTree:
 
     `field` is a pytree whose structure is a prefix of `point`'s. An array in it is a constant
     field, whose flow is a translation; an `AbstractFrozenField` acts on the part of `point` at the
-    same place.
+    same place; where there is None, the part rests.
     """
 
     def flow_leaf(f, p):
+        if f is None:
+            return p
         if not is_field(f):
             return p + f
         moved = f.flow(p)
@@ -241,14 +243,21 @@ def flow(field: PyTree, point: PyTree) -> PyTree:
             )
         return moved
 
-    return jtu.tree_map(flow_leaf, field, point, is_leaf=is_field)
+    return jtu.tree_map(flow_leaf, field, point, is_leaf=_is_field_or_none)
 
 
 def tangent(field: PyTree, point: PyTree) -> PyTree:
     """The velocity of `field` at `point`, in the ambient space. Structures as in `flow`."""
-    return jtu.tree_map(
-        lambda f, p: f.tangent(p) if is_field(f) else f, field, point, is_leaf=is_field
-    )
+    def velocity(f, p):
+        if f is None:
+            return jtu.tree_map(jnp.zeros_like, p)
+        return f.tangent(p) if is_field(f) else f
+
+    return jtu.tree_map(velocity, field, point, is_leaf=_is_field_or_none)
+
+
+def _is_field_or_none(x: Any) -> bool:
+    return x is None or is_field(x)
 
 
 def combine(weights: Sequence[Weight], fields: Sequence[PyTree]) -> PyTree:

@@ -105,14 +105,16 @@ def check_terms(term: diffrax.MultiTerm, t: Any, y: PyTree, args: PyTree = None)
     if not isinstance(term, diffrax.MultiTerm):
         raise TypeError(f"term must be a diffrax.MultiTerm, got {term!r}.")
     y = jtu.tree_map(jnp.asarray, y)
-    unit = float(np.sqrt(max(jnp.finfo(leaf.dtype).eps for leaf in jtu.tree_leaves(y))))
+    eps = float(max(jnp.finfo(leaf.dtype).eps for leaf in jtu.tree_leaves(y)))
+    # What a flow of some roundings leaves of a state that it hardly moves.
+    rounding = 16 * eps * float(_size(y))
     for k, part in enumerate(term.terms):
         if is_driven(part):
             continue
         whole = _carried(part, t, y, args, 1.0)
         halves = _carried(part, t, _carried(part, t, y, args, 0.5), args, 0.5)
         way, off = (float(_size(jtu.tree_map(jnp.subtract, whole, x))) for x in (y, halves))
-        if not off <= unit * way:
+        if not off <= np.sqrt(eps) * way + rounding:
             raise ValueError(
                 f"The field of terms[{k}] must not change along its own flow, and its flow in one "
                 f"unit of time is off by {off:.1g}, where it moves the state by {way:.1g}. Split "

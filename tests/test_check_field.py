@@ -294,6 +294,10 @@ def test_terms_with_exact_flows_pass():
     bath = cfjax.LieControlTerm(lambda t, y, args, dw: {"q": None, "p": dw}, noise)
     terms = sum_of(kick, drift, about_one_axis).terms
     cfjax.check_terms(diffrax.MultiTerm(*terms, bath), 0.0, BODY, 2.0)
+    # A term that hardly moves the state: what is left is rounding.
+    cfjax.check_terms(
+        sum_of(kick, lambda t, y, args: {"q": None, "p": 1e-16 * y["q"]}), 0.0, BODY, 2.0
+    )
     # Frozen in a chart of its own, and on leading axes.
     sphere = lambda t, y, args: cfjax.SphereRotation(0 * y)  # noqa: E731
     cfjax.check_terms(sum_of(sphere, sphere), 0.0, BODY["q"] / jnp.linalg.norm(BODY["q"]))

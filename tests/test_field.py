@@ -123,6 +123,18 @@ def test_tangent_is_the_velocity_of_the_flow(mixed):
     jax.tree.map(lambda a, b: np.testing.assert_allclose(a, b, rtol=0, atol=40 * EPS), got, want)
 
 
+def test_none_is_a_part_at_rest():
+    field, point = (
+        {"a": None, "b": jnp.ones(2)},
+        {"a": (jnp.ones(3), jnp.ones(())), "b": jnp.ones(2)},
+    )
+    moved, velocity = cfjax.flow(field, point), cfjax.tangent(field, point)
+    np.testing.assert_array_equal(moved["b"], [2.0, 2.0])
+    np.testing.assert_array_equal(moved["a"][0], np.ones(3))
+    np.testing.assert_array_equal(velocity["a"][0], np.zeros(3))
+    assert jax.tree.structure(velocity) == jax.tree.structure(point)
+
+
 @pytest.mark.parametrize("traced", [False, True])
 def test_combine_is_linear_and_carries_structure(mixed, traced):
     field, _ = mixed

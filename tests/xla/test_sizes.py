@@ -98,3 +98,22 @@ def test_a_few_steps_keep_one_state_each_for_a_gradient():
 
     # A state a step and what its compensated sum has lost, where all of a step is some 30 states.
     assert memory(9) - memory(3) < 6 * 3
+
+
+def test_a_splitting_of_few_points_is_no_longer_than_one_of_many():
+    """XLA would compute each flow of the chain again for all that follow."""
+
+    def turn(axis):
+        def field(t, y, inertia):
+            return cfjax.Rotation(-jnp.eye(3)[axis][None] * y / inertia)
+
+        return cfjax.LieTerm(field)
+
+    term = diffrax.MultiTerm(*map(turn, (0, 1, 2, 0)))
+
+    def end(y, inertia):
+        inertia = inertia[None]
+        return cfjax.integrate(term, cfjax.Strang(), 0.0, 1.0, y, inertia, num_steps=9).ys
+
+    few, many = (size(end, jnp.broadcast_to(BODY, (n, 3))) for n in (16, 1000))
+    assert few < 1.5 * many
