@@ -680,9 +680,8 @@ def energy() -> list[list[str]]:
     def text(row: Row) -> str:
         if row["largest"] < 1e-12:
             return f"{power(row['largest'])}, rounding"
-        slope, uncertain = f"{row['slope']:.1e}", f"{3 * row['standard error']:.0e}"
-        says = slope if row["drifts"] else f"flat to {uncertain}"
-        return f"{row['largest']:.1e}, {says}".replace("e-0", "e-")
+        slope = f"{row['slope']:.0e}" if row["drifts"] else "flat"
+        return f"{row['largest']:.1e}, {slope}".replace("e-0", "e-")
 
     ends = {name: rows[0]["step"] * rows[0]["steps"] for name, rows in systems.items()}
     head = ["", *(f"{ENERGY_OF[name]}, to t = {_long(end)}" for name, end in ends.items())]
@@ -722,6 +721,13 @@ def energy_lattice() -> str:
     rows = [row for row in load("energy")["rows"] if row.get("system") == "lattice" and "t" in row]
     (row,) = pick(rows, **{"evaluations a unit": 1.0})
     return f"{power(row['largest'])} in {_long(row['steps'])} steps of {row['step']:.0f}"
+
+
+@number
+def energy_ahead() -> str:
+    rows = pick(load("energy")["rows"], other="RKMK8")
+    of = {name: _break_even(one(rows, system=name)) for name in ("top", "spins", "vortices")}
+    return ", ".join(f"{after} units of time of {ENERGY_OF[name]}" for name, after in of.items())
 
 
 _TOO_LARGE = "top, large steps"
