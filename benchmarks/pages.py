@@ -670,7 +670,11 @@ def _energies() -> dict[str, list[Row]]:
 
 
 def _long(t: float) -> str:
-    return two_digits(t) if t < 1e5 else f"{t:.1e}".replace("e+0", "e").replace("e+", "e")
+    return (
+        two_digits(float(f"{t:.2g}"))
+        if t < 1e7
+        else f"{t:.0e}".replace("e+0", "e").replace("e+", "e")
+    )
 
 
 @table
@@ -686,12 +690,11 @@ def energy() -> list[list[str]]:
     ends = {name: rows[0]["step"] * rows[0]["steps"] for name, rows in systems.items()}
     head = ["", *(f"{ENERGY_OF[name]}, to t = {_long(end)}" for name, end in ends.items())]
     methods = values(itertools.chain(*systems.values()), "method")
-    # The symplectic ones first.
-    methods.sort(key=lambda method: method != "ImplicitMidpoint" and method not in methods[:3])
+    splittings, others = methods[:3], [m for m in methods[3:] if m != "ImplicitMidpoint"]
     return [head] + [
         [f"`{method}`"]
         + ["".join(map(text, pick(rows, method=method))) for rows in systems.values()]
-        for method in methods
+        for method in (*splittings, "ImplicitMidpoint", *others)
     ]
 
 
@@ -702,7 +705,7 @@ def _break_even(row: Row) -> str:
     if after < 2:
         return "at once"
     # Beyond the end it is from a slope, so one digit.
-    return _long(after) if after < row["end"] else f"about {power(after)}".replace("e+0", "e")
+    return _long(after) if after < row["end"] else f"about {_long(float(f'{after:.1g}'))}"
 
 
 @table
@@ -720,14 +723,15 @@ def energy_break_even() -> list[list[str]]:
 def energy_lattice() -> str:
     rows = [row for row in load("energy")["rows"] if row.get("system") == "lattice" and "t" in row]
     (row,) = pick(rows, **{"evaluations a unit": 1.0})
-    return f"{power(row['largest'])} in {_long(row['steps'])} steps of {row['step']:.0f}"
+    return f"{power(row['largest'])} a spin until t = {_long(row['step'] * row['steps'])}"
 
 
 @number
 def energy_ahead() -> str:
     rows = pick(load("energy")["rows"], other="RKMK8")
-    of = {name: _break_even(one(rows, system=name)) for name in ("top", "spins", "vortices")}
-    return ", ".join(f"{after} units of time of {ENERGY_OF[name]}" for name, after in of.items())
+    of = [f"{_break_even(one(rows, system=name))} for {ENERGY_OF[name]}" for name in ENERGY_OF]
+    top, spins, vortices, *_ = of
+    return f"{top.replace('for', 'units of time for a', 1)}, {spins} and {vortices}"
 
 
 _TOO_LARGE = "top, large steps"
@@ -741,7 +745,9 @@ def energy_steps() -> list[list[str]]:
 
     def text(row: Row) -> str:
         largest = row["largest"]
-        return "not finite" if largest is None else f"{largest:.1e}".replace("e-0", "e-")
+        if largest is None:
+            return "not finite"
+        return two_digits(largest) if largest > 0.1 else f"{largest:.1e}".replace("e-0", "e-")
 
     def at(**where: str) -> list[Row]:
         return [one(rows, **{"evaluations a unit": rate}, **where) for rate in rates]
