@@ -29,6 +29,7 @@ PICTURES = {
     "batch": 120,
     "chain": 120,
     "charts": 200,
+    "energy": 120,
     "noise": 120,
     "peers": 120,
     "stability": 100,
@@ -645,6 +646,128 @@ def noise_gradients() -> list[list[str]]:
             two_digits(row["MiB"]),
             in_units(row["seconds"][2]),
             cell(row["over the solve"]),
+        ]
+        for row in rows
+    ]
+
+
+# What the pages call the systems whose energy is measured.
+ENERGY_OF = {
+    "top": "heavy top",
+    "spins": "six spins",
+    "vortices": "six vortices",
+    "fluid": "fluid",
+    "lattice": "lattice",
+}
+
+
+def _energies() -> dict[str, list[Row]]:
+    """What is measured of each system at equal numbers of evaluations."""
+    rows = [row for row in load("energy")["rows"] if "t" in row]
+    systems = {name: pick(rows, system=name) for name in ENERGY_OF}
+    rate = "evaluations a unit"
+    return {name: pick(few, **{rate: few[0][rate]}) for name, few in systems.items()}
+
+
+def _long(t: float) -> str:
+    return (
+        two_digits(float(f"{t:.2g}"))
+        if t < 1e7
+        else f"{t:.0e}".replace("e+0", "e").replace("e+", "e")
+    )
+
+
+@table
+def energy() -> list[list[str]]:
+    systems = _energies()
+
+    def text(row: Row) -> str:
+        if row["largest"] < 1e-12:
+            return f"{power(row['largest'])}, rounding"
+        slope = f"{row['slope']:.0e}" if row["drifts"] else "flat"
+        return f"{row['largest']:.1e}, {slope}".replace("e-0", "e-")
+
+    ends = {name: rows[0]["step"] * rows[0]["steps"] for name, rows in systems.items()}
+    head = ["", *(f"{ENERGY_OF[name]}, to t = {_long(end)}" for name, end in ends.items())]
+    methods = values(itertools.chain(*systems.values()), "method")
+    splittings, others = methods[:3], [m for m in methods[3:] if m != "ImplicitMidpoint"]
+    return [head] + [
+        [f"`{method}`"]
+        + ["".join(map(text, pick(rows, method=method))) for rows in systems.values()]
+        for method in (*splittings, "ImplicitMidpoint", *others)
+    ]
+
+
+def _break_even(row: Row) -> str:
+    after = row["break-even"]
+    if after is None:
+        return f"after {_long(row['end'])}"
+    if after < 2:
+        return "at once"
+    # Beyond the end it is from a slope, so one digit.
+    return _long(after) if after < row["end"] else f"about {_long(float(f'{after:.1g}'))}"
+
+
+@table
+def energy_break_even() -> list[list[str]]:
+    rows = [row for row in load("energy")["rows"] if "other" in row]
+    few = {name: pick(rows, system=name) for name in ENERGY_OF}
+    head = ["", *(f"{ENERGY_OF[name]}, `{found[0]['best']}`" for name, found in few.items())]
+    return [head] + [
+        [f"`{other}`", *(_break_even(one(found, other=other)) for found in few.values())]
+        for other in values(rows, "other")
+    ]
+
+
+@number
+def energy_lattice() -> str:
+    rows = [row for row in load("energy")["rows"] if row.get("system") == "lattice" and "t" in row]
+    (row,) = pick(rows, **{"evaluations a unit": 1.0})
+    return f"{power(row['largest'])} a spin until t = {_long(row['step'] * row['steps'])}"
+
+
+@number
+def energy_ahead() -> str:
+    rows = pick(load("energy")["rows"], other="RKMK8")
+    of = [f"{_break_even(one(rows, system=name))} for {ENERGY_OF[name]}" for name in ENERGY_OF]
+    top, spins, vortices, *_ = of
+    return f"{top.replace('for', 'units of time for a', 1)}, {spins} and {vortices}"
+
+
+_TOO_LARGE = "top, large steps"
+
+
+@table
+def energy_steps() -> list[list[str]]:
+    rows = pick(load("energy")["rows"], system=_TOO_LARGE)
+    measured = [row for row in rows if "largest" in row]
+    rates = values(measured, "evaluations a unit")
+
+    def text(row: Row) -> str:
+        largest = row["largest"]
+        if largest is None:
+            return "not finite"
+        return two_digits(largest) if largest > 0.1 else f"{largest:.1e}".replace("e-0", "e-")
+
+    def at(**where: str) -> list[Row]:
+        return [one(rows, **{"evaluations a unit": rate}, **where) for rate in rates]
+
+    return [
+        ["", *(f"{rate:.0f} torques" for rate in rates)],
+        *([f"`{m}`", *map(text, at(method=m))] for m in values(measured, "method")),
+        ["`RKMK8` is ahead of the best until t =", *map(_break_even, at(other="RKMK8"))],
+    ]
+
+
+@table
+def energy_longest() -> list[list[str]]:
+    rows = [row for row in load("energy")["rows"] if "oscillator" in row]
+    return [["", "forces", "longest step", "over the forces"]] + [
+        [
+            f"`{row['oscillator']}`",
+            str(row["forces"] or "iterations"),
+            f"{row['longest step']:.2f}",
+            f"{row['longest step'] / row['forces']:.2f}" if row["forces"] else "",
         ]
         for row in rows
     ]

@@ -410,3 +410,36 @@ def test_single_precision_does_not_get_worse_with_more_steps():
     # flow itself lets an error grow a few times. Without, it is a random walk.
     assert np.all((floor > 0.3 * 2.0**-24) & (floor < 6 * 2.0**-24))
     assert abs(problems.slope(steps, floor)) < 0.25
+
+
+# Splittings
+
+
+KICK = cfjax.LieTerm(lambda t, y, args: {"q": None, "p": -y["q"]})
+DRIFT = cfjax.LieTerm(lambda t, y, args: {"q": y["p"], "p": None})
+
+
+def growth(solver, h):
+    """How far 500 steps of q'' = -q come from two starts of length one."""
+    term, start = diffrax.MultiTerm(KICK, DRIFT), {"q": jnp.eye(2)[0], "p": jnp.eye(2)[1]}
+    options = dict(num_steps=500, save_every=10)
+    ys = cfjax.integrate(term, solver, 0.0, jnp.asarray(500 * h), start, **options).ys
+    return np.max(np.abs([ys["q"], ys["p"]]))
+
+
+LAMBDA = 0.1931833275037836  # Omelyan, Mryglod & Folk, doi:10.1016/S0010-4655(02)00754-3
+
+
+@pytest.mark.parametrize(
+    "stages, quartic",
+    [((0.5, 0.5), 0.0), ((LAMBDA, 0.5 - LAMBDA, 0.5 - LAMBDA, LAMBDA), LAMBDA * (0.5 - LAMBDA))],
+    ids=["Strang", "Omelyan2"],
+)
+def test_the_longest_step_of_an_oscillator(stages, quartic):
+    """The trace of a step's matrix is 2 - h^2 + quartic h^4, and a step is stable up to -2."""
+    limit = np.sqrt(8 / (1 + np.sqrt(1 - 16 * quartic)))
+    solver = cfjax.Splitting(stages)
+    # Close to the limit the ellipse of a stable orbit is long, by the inverse root of the distance.
+    assert growth(solver, 0.999 * limit) < 100
+    # Beyond it a step grows by more than one in twenty.
+    assert growth(solver, 1.001 * limit) > 1.05**500
