@@ -74,7 +74,7 @@ def materialised_in_rows(tree: PyTree, alone: bool = False) -> PyTree:
         return tree
     leaves, structure = jtu.tree_flatten(tree)
     places = [
-        k for k, x in enumerate(leaves) if (np.ndim(x) > 1 if is_plain else np.size(x) > MAX_SIZE)
+        k for k, x in enumerate(leaves) if (np.ndim(x) > 0 if is_plain else np.size(x) > MAX_SIZE)
     ]
     for k in places:
         (leaves[k],) = materialised([leaves[k]], in_batches=True)

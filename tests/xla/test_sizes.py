@@ -117,3 +117,24 @@ def test_a_splitting_of_few_points_is_no_longer_than_one_of_many():
 
     few, many = (size(end, jnp.broadcast_to(BODY, (n, 3))) for n in (16, 1000))
     assert few < 1.5 * many
+
+
+def test_a_splitting_of_six_vectors_has_each_flow_once():
+    """They are more numbers than are scalarised, and the chain of flows is as above."""
+    coupling = jnp.cos(jnp.arange(36.0)).reshape(6, 6)
+
+    def fields(t, y, parts):
+        sums = (sum(coupling[i, k] * y[k] for k in range(6)) for i in range(6))
+        return tuple(cfjax.Rotation(parts * x) for x in sums)
+
+    def along(axis):
+        return cfjax.LieTerm(lambda t, y, _: fields(t, y, jnp.eye(3)[axis]))
+
+    def end(term, solver):
+        return lambda y, parts: cfjax.integrate(term, solver, 0.0, 1.0, y, parts, num_steps=9).ys
+
+    y = tuple(jnp.roll(BODY, k) * (-1) ** k for k in range(6))
+    split = size(end(diffrax.MultiTerm(*map(along, range(3))), cfjax.Strang()), y)
+    rolled = size(end(cfjax.LieTerm(fields), cfjax.CF4()), y)
+    # Five flows, where the other program has one in a loop.
+    assert split < 4 * rolled
