@@ -248,6 +248,7 @@ def flow(field: PyTree, point: PyTree) -> PyTree:
 
 def tangent(field: PyTree, point: PyTree) -> PyTree:
     """The velocity of `field` at `point`, in the ambient space. Structures as in `flow`."""
+
     def velocity(f, p):
         if f is None:
             return jtu.tree_map(jnp.zeros_like, p)
