@@ -134,6 +134,7 @@ def test_a_way_back_that_misses_the_start(throw):
         assert np.all(np.isnan(jax.grad(end)(y0)))
 
 
+@pytest.mark.slow
 def test_a_batch():
     def gradients(step_back):
         one = jax.grad(lambda args: swing(args, 20, step_back=step_back))

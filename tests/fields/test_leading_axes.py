@@ -231,6 +231,7 @@ def assert_empty_like(found, expected):
     jax.tree.map(lambda a, b: np.testing.assert_array_equal(a, b, strict=True), found, expected)
 
 
+@pytest.mark.representatives(2)
 @pytest.mark.parametrize("name", EMPTY)
 def test_the_motions_of_an_empty_batch(name):
     field, y = empty(name)

@@ -83,7 +83,7 @@ COLUMNS = problems.arrays(
 )
 
 
-@pytest.mark.representatives(3)
+@pytest.mark.representatives(2)
 @pytest.mark.parametrize("name", SOLVERS)
 def test_a_step_in_coordinates_that_grow(name):
     """In a loop there is room for all of them from the start."""
@@ -92,6 +92,7 @@ def test_a_step_in_coordinates_that_grow(name):
     assert_same(*both(fun, name, *COLUMNS), 1000)
 
 
+@pytest.mark.slow
 def test_a_gradient_in_coordinates_that_grow_in_a_batch():
     def fun(solver, y0, args):
         loss = lambda y0, args: jnp.sum(jnp.sin(moved(solver, columns, y0, args)[0]))  # noqa: E731
@@ -175,6 +176,7 @@ def test_a_field_that_varies_is_unrolled():
     np.testing.assert_allclose(found, expected, rtol=1e-15)
 
 
+@pytest.mark.representatives(1)
 @pytest.mark.parametrize(
     "solver",
     [cfjax.CF4(unroll=False), cfjax.RKMK5(unroll=False), cfjax.Magnus4(unroll=False)],

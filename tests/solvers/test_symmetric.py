@@ -71,7 +71,7 @@ def end_of_top(solver, num_steps):
     [
         (cfjax.Strang(), 2, (16, 32)),
         (cfjax.BlanesMoan4(), 4, (8, 16)),
-        (cfjax.BlanesMoan6(), 6, (4, 8)),
+        pytest.param(cfjax.BlanesMoan6(), 6, (4, 8), marks=pytest.mark.slow),
         (cfjax.Composition(cfjax.Strang(), 4), 4, (16, 32)),
         pytest.param(cfjax.Composition(cfjax.Strang(), 6), 6, (8, 16), marks=pytest.mark.slow),
         pytest.param(cfjax.Composition(cfjax.Strang(), 8), 8, (6, 12), marks=pytest.mark.slow),
@@ -86,6 +86,7 @@ def test_order_of_splittings_of_four_terms(solver, order, num_steps, top_answer)
     assert solver.order(TOP) == order
 
 
+@pytest.mark.representatives(2)
 @pytest.mark.parametrize("kind", ["body", "left", "right", "flight"])
 def test_order_of_the_midpoint(kind, request, matrix_problems):
     if kind in ("left", "right"):
