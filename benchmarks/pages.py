@@ -734,6 +734,12 @@ def energy_ahead() -> str:
     return f"{top.replace('for', 'units of time for a', 1)}, {spins} and {vortices}"
 
 
+@number
+def energy_midpoint() -> str:
+    rows = pick(load("energy")["rows"], system="fluid")
+    return f"{_break_even(one(rows, other='CF4'))} units of time"
+
+
 _TOO_LARGE = "top, large steps"
 
 

@@ -13,6 +13,7 @@ from jax import lax
 from jax.core import Tracer
 from jaxtyping import Array, Bool, Int, PyTree, Real
 
+from ._control_term import is_driven
 from ._numerics.checks import Fault, checked, error_if, needing
 from ._numerics.squaring import max_over_batch
 from ._solvers.base import is_finite, result_of
@@ -66,7 +67,8 @@ def integrate(
       alone, and computes all others by steps backwards. For symmetric solvers, which undo a step to
       rounding: `cfjax.Strang` and other splittings, `cfjax.ImplicitMidpoint`, `cfjax.Composition`
       and Magnus methods. What grows forwards in time is well conditioned, but what decays grows on
-      the way back, and so does its rounding. Forward mode is not possible.
+      the way back, and so does its rounding. Forward mode and noise are
+      not possible, and fields must have a derivative in time too.
     - `throw`: whether a failure is an error, as in diffrax. If not, `result` of the solution says
       what happened, and invalid values of the arguments give NaN. In a batch made by `jax.vmap` one
       failure is an error for the whole batch. An error check within a function that you compile is
@@ -104,6 +106,10 @@ def integrate(
         raise ValueError(
             "step_back takes a symmetric solver, such as cfjax.Strang(), cfjax.ImplicitMidpoint() "
             f"or cfjax.Magnus4(), got {type(solver).__name__}. With others use checkpoint_every."
+        )
+    if step_back and is_driven(term):
+        raise ValueError(
+            "step_back takes no noise, or what else a path drives: use checkpoint_every."
         )
     dtype = time_dtype(y0)
     if num_steps > _most_steps(dtype):
@@ -204,11 +210,11 @@ def equal_steps(
     order = 0 if isinstance(num_steps, int) and num_steps < _FEW else 1
 
     def advance(carry, number):
-        # XLA would scalarise a loop of one turn, and compute the step anew for each of its uses.
-        if isinstance(number, int) and number == 1 and not step_back:
-            return step(carry)
         if step_back:
             return repeat_and_undo(step, lambda carry: step(carry, -1), carry, number, throw)
+        # XLA would scalarise a loop of one turn, and compute the step anew for each of its uses.
+        if isinstance(number, int) and number == 1:
+            return step(carry)
         if checkpoint_every is None:
             return repeat(step, carry, number, order=order)[0]
         length, rest = checkpoint_every, number % checkpoint_every

@@ -7,11 +7,11 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 import jax.tree_util as jtu
-import numpy as np
 from jax import lax
 from jaxtyping import Array, Bool, PyTree
 
 from ._numerics.checks import Fault
+from ._solvers.base import largest
 from ._xla import repeat, within_equal_steps
 
 Step = Callable[[PyTree], PyTree]
@@ -82,11 +82,10 @@ def _parts(tree: PyTree) -> tuple[PyTree, PyTree]:
 
 
 def _misses(start: PyTree, found: PyTree, end: PyTree) -> Bool[Array, ""]:
-    """Whether two states differ by more than half of the digits of what is on the way."""
+    """Whether two states differ by more than half of the digits of what is on the way.
 
-    def size(*trees: PyTree) -> Any:
-        leaves = jtu.tree_leaves(trees)
-        return jnp.max(jnp.asarray([jnp.max(jnp.abs(x), initial=0) for x in leaves]), initial=0)
-
-    off = size(jtu.tree_map(jnp.subtract, found, start))
-    return ~(off <= np.sqrt(jnp.finfo(off.dtype).eps) * size(start, end))
+    The digits are those of the part of lowest precision.
+    """
+    eps = max((float(jnp.finfo(x.dtype).eps) for x in jtu.tree_leaves(start)), default=0.0)
+    off = largest(jtu.tree_map(jnp.subtract, found, start))
+    return ~(off <= eps**0.5 * largest((start, end)))

@@ -113,6 +113,32 @@ def source(t, y, args):
     return jnp.ones_like(y)
 
 
+@pytest.mark.slow
+def test_parts_of_two_precisions():
+    """The digits are those of the part of lowest precision."""
+    y0 = {"q": jnp.asarray([0.3], jnp.float32), "p": jnp.asarray([0.1], jnp.float32)}
+    both = {"a": y0, "b": jax.tree.map(lambda x: x.astype(jnp.float64), y0)}
+
+    def parts(field):
+        def of_both(t, y, args):
+            return {name: field(t, y[name], args) for name in "ab"}
+
+        return cfjax.LieTerm(of_both)
+
+    term = diffrax.MultiTerm(
+        parts(lambda t, y, args: {"q": None, "p": -jnp.sin(y["q"])}),
+        parts(lambda t, y, args: {"q": y["p"], "p": None}),
+    )
+
+    def end(y0):
+        ys = cfjax.integrate(term, cfjax.Strang(), 0.0, 2.0, y0, num_steps=200, step_back=True).ys
+        return jnp.sum(ys["b"]["q"]) + jnp.sum(ys["a"]["q"]).astype(jnp.float64)
+
+    found = eqx.filter_jit(jax.grad(end))(both)
+    # Two hundred roundings of float32.
+    np.testing.assert_allclose(found["a"]["q"], found["b"]["q"], rtol=0, atol=200 * 1.2e-7)
+
+
 def decay(t, y, args):
     return cfjax.Scaling(jnp.full_like(y, -40.0))
 
@@ -148,5 +174,10 @@ def test_what_is_refused():
     term = cfjax.LieTerm(whole)
     with pytest.raises(ValueError, match=r"step_back takes a symmetric solver, .* got CF4"):
         loss(jnp.asarray(0.7), START, term, cfjax.CF4(), step_back=True)
+    path = diffrax.UnsafeBrownianPath((3,), jax.random.key(0))
+    bath = cfjax.LieControlTerm(lambda t, y, args, dw: {"q": None, "p": dw}, path)
+    noisy = diffrax.MultiTerm(*SPLIT.terms, bath)
+    with pytest.raises(ValueError, match="step_back takes no noise"):
+        loss(jnp.asarray(0.7), START, noisy, cfjax.Strang(), step_back=True)
     with pytest.raises(ValueError, match="either step_back or checkpoint_every, got both"):
         loss(jnp.asarray(0.7), START, SPLIT, cfjax.Strang(), step_back=True, checkpoint_every=4)

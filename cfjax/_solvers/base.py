@@ -7,6 +7,7 @@ from typing import Any, ClassVar
 
 import diffrax
 import equinox as eqx
+import jax
 import jax.numpy as jnp
 import jax.tree_util as jtu
 import numpy as np
@@ -248,6 +249,14 @@ def check_choice(name: str, value: Any, *choices: Any) -> None:
 
 def is_finite(y: PyTree) -> Bool[Array, ""]:
     return jnp.asarray([jnp.all(jnp.isfinite(leaf)) for leaf in jtu.tree_leaves(y)], bool).all()
+
+
+def largest(y: PyTree) -> Real[Array, ""]:
+    """The largest modulus of an entry."""
+    sizes = [jnp.max(jnp.abs(leaf), initial=0) for leaf in jtu.tree_leaves(y)]
+    # Parts may be of different precisions.
+    with jax.numpy_dtype_promotion("standard"):
+        return jnp.max(jnp.asarray(sizes), initial=0)
 
 
 def result_of(y: PyTree) -> diffrax.RESULTS:

@@ -8,12 +8,12 @@ import equinox as eqx
 import jax.numpy as jnp
 import jax.tree_util as jtu
 from jax import lax
-from jaxtyping import Array, Bool, PyTree, Real
+from jaxtyping import Array, Bool, PyTree
 
 from .._control_term import is_driven
 from .._field import is_field, to_chart
 from .._term import product
-from .base import AbstractLieSolver, begun, ended, shared_end, time_at
+from .base import AbstractLieSolver, begun, ended, largest, shared_end, time_at
 from .chart import moved
 from .compensation import with_sums
 from .dense import Interpolation, Path
@@ -127,20 +127,20 @@ def fixed_point(
         def goes_on(carry: Any) -> Array:
             y, k, last, before = carry
             is_falling = (last < before[0]) | (k < 4)
-            return (k < max_steps) & (last > unit * _size(y)) & is_falling
+            return (k < max_steps) & (last > unit * largest(y)) & is_falling
 
         def turn(carry: Any) -> Any:
             y, k, last, before = carry
             new = step(y)
-            change = _size(jtu.tree_map(jnp.subtract, new, y))
+            change = largest(jtu.tree_map(jnp.subtract, new, y))
             return new, k + 1, change, jnp.stack([before[1], last])
 
-        infinite = jnp.full((), jnp.inf, jnp.result_type(_size(start)))
+        infinite = jnp.full((), jnp.inf, jnp.result_type(largest(start)))
         carry = start, 0, infinite, jnp.stack([infinite, infinite])
         y, _, last, _ = lax.while_loop(goes_on, turn, carry)
         # Where changes no longer fall they are of the size that the rounding of the field leaves.
         least = 1e4 * eps if rtol is None else max(rtol, 1e4 * eps)
-        return y, (last <= least * _size(y)).astype(infinite.dtype)
+        return y, (last <= least * largest(y)).astype(infinite.dtype)
 
     def residual(y: PyTree) -> PyTree:
         return jtu.tree_map(jnp.subtract, y, fun(y))
@@ -159,7 +159,3 @@ def fixed_point(
 
     y, has_converged = lax.custom_root(residual, start, solve, tangent_solve, has_aux=True)
     return y, has_converged > 0
-
-
-def _size(y: PyTree) -> Real[Array, ""]:
-    return jnp.max(jnp.asarray([jnp.max(jnp.abs(x), initial=0) for x in jtu.tree_leaves(y)]))
