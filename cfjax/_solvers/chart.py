@@ -95,6 +95,15 @@ class Chart:
         """How far two points are apart in the ambient space."""
         return jtu.tree_map(jnp.subtract, self.from_start(a), self.from_start(b))
 
+    def way(self, end: PyTree) -> PyTree:
+        """How far the end of the step, as `from_start` returns it, is from the start."""
+        return with_sums(
+            lambda c, y, z: jtu.tree_map(jnp.subtract, z, y) if c is None else z,
+            self._compensation,
+            self._y0,
+            end,
+        )
+
     def shared(self, tree: PyTree) -> PyTree:
         """The same arrays, of each of which several results are made.
 

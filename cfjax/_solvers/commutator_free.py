@@ -110,8 +110,8 @@ class AbstractCommutatorFree(AbstractChartSolver):
         apart = chart.difference(end, reach(alpha[-1]))
         # All of them are needed before the ratio of their sizes.
         end, error, apart = chart.shared((chart.from_start(end), error, apart))
-        way = jtu.tree_map(jnp.subtract, end, chart.from_start(chart.start))
-        return Step(end, path, jtu.tree_map(_seen, error, apart, way), is_shared=True)
+        error = jtu.tree_map(_seen, error, apart, chart.way(end))
+        return Step(end, path, error, is_shared=True)
 
     @property
     def _embedded(self) -> Product | None:
