@@ -65,6 +65,7 @@ if TYPE_CHECKING:
     from ._measure.work_precision import WorkPrecision as WorkPrecision
     from ._measure.work_precision import work_precision as work_precision
     from ._methods.stability import stability_function as stability_function
+    from ._numerics.diagonalised import diagonalised as diagonalised
     from ._numerics.transforms import AbstractTransform as AbstractTransform
     from ._numerics.transforms import CosineTransform as CosineTransform
     from ._numerics.transforms import FourierTransform as FourierTransform
@@ -121,6 +122,7 @@ _NAMES_LATER = {
     "_batch.batch": ("BatchResult", "map_batch"),
     "_measure.work_precision": ("WorkPrecision", "work_precision"),
     "_methods.stability": ("stability_function",),
+    "_numerics.diagonalised": ("diagonalised",),
     "_numerics.transforms": (
         "AbstractTransform",
         "CosineTransform",

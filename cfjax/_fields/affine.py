@@ -49,9 +49,9 @@ class Affine(AbstractAlgebraElement):
     - `spectrum`: the eigenvalues, shaped like the coefficients of `b` or, if these have more axes,
       like their first axes: with shape `(m,)` every column has the same eigenvalues. It has all
       axes that a `cfjax.TensorTransform` transforms. Real, or complex if the coefficients are.
-    - `transform`: a `cfjax.AbstractTransform`, for example `cfjax.SineTransform()`, or None. A
-      transform of your own provides `forward(point)`, the coefficients, and
-      `inverse(coefficients)`.
+    - `transform`: a `cfjax.AbstractTransform`, for example `cfjax.SineTransform()` or that of
+      `cfjax.diagonalised`, or None. A transform of your own provides `forward(point)`, the
+      coefficients, and `inverse(coefficients)`.
 
     **Raises** `ValueError` for shapes that do not match, `TypeError` for dtypes that do not match,
     or for another kind of transform.
