@@ -1,7 +1,7 @@
 """Affine fields with a linear part that a fast transform makes diagonal."""
 
 from collections.abc import Sequence
-from typing import Any
+from typing import Any, ClassVar
 
 import equinox as eqx
 import jax
@@ -159,6 +159,8 @@ class Affine(AbstractAlgebraElement):
 
 class _InCoefficients(Affine):
     """A field with a transform within a step: its b and its points there are coefficients."""
+
+    is_entrywise: ClassVar[bool] = True
 
     def __init__(self, field: Affine):
         self.alpha, self.spectrum, self.transform = field.alpha, field.spectrum, field.transform

@@ -111,6 +111,18 @@ class Chart:
         """
         return materialised_together(tree, alone=True)
 
+    def branching(self, point: PyTree) -> PyTree:
+        """The same point, where the field is evaluated and from where flows go on.
+
+        Otherwise XLA would compute flows that are arithmetic entry by entry anew for each of both,
+        back to the start.
+        """
+
+        def part(f: Any, p: PyTree) -> PyTree:
+            return materialised_in_rows(p, alone=True) if is_field(f) and f.is_entrywise else p
+
+        return jtu.tree_map(part, self.fields[0], point, is_leaf=is_field)
+
     def narrow(self, point: PyTree) -> PyTree:
         """The same point, on which all depends that follows: where a long step may be cut."""
         return materialised_if_long(point)

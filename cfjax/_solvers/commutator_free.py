@@ -86,8 +86,12 @@ class AbstractCommutatorFree(AbstractChartSolver):
         # Two stages at one point would be one flow with two times.
         if self._is_usual and len(set(alpha)) == len(alpha):
             reach.points |= rolled(self.unroll, chart, [*alpha, beta], tableau.c)
+        prefixes = {rows[:n] for rows in (*alpha, beta) for n in range(1, len(rows))}
         for c, rows in list(zip(tableau.c, alpha, strict=True))[len(chart.fields) :]:
-            chart.frozen(float(c), reach(rows))
+            point = reach(rows)
+            if rows in prefixes:
+                point = reach.points[rows] = chart.branching(point)
+            chart.frozen(float(c), point)
         end = reach(beta)
         if self.first_same_as_last:
             # The end, the last field and the error are made of it.

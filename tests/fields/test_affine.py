@@ -581,6 +581,22 @@ SOLVERS = {
 }
 
 
+@pytest.mark.parametrize(
+    "solver, points", [(cfjax.CF4(), 1), (cfjax.CF43(), 4), (cfjax.CK54(), 4), (cfjax.RKMK4(), 0)]
+)
+def test_points_that_are_computed_once(solver, points):
+    """Where the field is evaluated and flows go on: back from there flows would be repeated."""
+    term = cfjax.LieTerm(
+        lambda t, y, args: Affine(1.0, jnp.sin(y), -jnp.arange(200.0), cfjax.SineTransform())
+    )
+
+    def run(y0):
+        return cfjax.integrate(term, solver, 0.0, 1.0, y0, num_steps=2).ys
+
+    program = str(jax.make_jaxpr(run)(jnp.ones(200)))
+    assert program.count("cfjax_materialised[") == points
+
+
 @pytest.mark.filterwarnings("ignore:Complex dtype support")
 @pytest.mark.representatives(3)
 @pytest.mark.parametrize("solver", SOLVERS)
