@@ -57,6 +57,9 @@ PROMISED = [
     "Magnus6",
     "Magnus8",
     "Magnus10",
+    "ETDRK4",
+    "ETD43",
+    "ETD54",
     "RKMK3",
     "RKMK4",
     "RKMK5",
@@ -79,6 +82,12 @@ PROMISED = [
     "check_terms",
     "expm",
     "stumpff",
+    "phi",
+    "diagonalised",
+    "stiff_order",
+    "ExponentialTableau",
+    "ExponentialRungeKutta",
+    "AbstractSemilinearField",
 ]
 SOLVERS = [*PROMISED[PROMISED.index("LieEuler") : PROMISED.index("RKMK")], "CayleyRK4"]
 PUBLIC = [

@@ -25,8 +25,6 @@ from typing import Any, TypeAlias
 import numpy as np
 
 from .coefficients import Product, Row, uncertainty
-from .exponential import ExponentialTableau
-from .stiff_order import classical_order
 from .tableau import Tableau
 
 
@@ -74,7 +72,7 @@ Defects: TypeAlias = list[tuple[Fraction, float]]
 
 
 @lru_cache
-def order(tableau: Tableau | ExponentialTableau) -> int:
+def order(tableau: Any) -> int:
     """The order of a commutator-free method, at least 1 as every tableau is consistent.
 
     Of an exponential Runge-Kutta method it is the classical order, for steps that are short for the
@@ -85,9 +83,13 @@ def order(tableau: Tableau | ExponentialTableau) -> int:
 
     **Raises:** `TypeError` if `tableau` is neither a `Tableau` nor an `ExponentialTableau`.
     """
-    if isinstance(tableau, ExponentialTableau):
-        return classical_order(tableau)
     if not isinstance(tableau, Tableau):
+        # Here, as an import of cfjax makes few of the methods.
+        from .exponential import ExponentialTableau
+        from .stiff_order import classical_order
+
+        if isinstance(tableau, ExponentialTableau):
+            return classical_order(tableau)
         raise TypeError(f"order: tableau must be a cfjax.Tableau, got {tableau!r}.")
     return _largest_order(_defects(_end_weights(tableau), exact_weight), tableau)
 

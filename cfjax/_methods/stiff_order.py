@@ -53,8 +53,8 @@ def stiff_order(tableau: ExponentialTableau) -> int:
     _check(tableau)
 
     def holds(p: int) -> bool:
-        strongly = all(_is_zero(_conditions(tableau, q, _exactly, _exactly)) for q in range(2, p))
-        return strongly and _is_zero(_conditions(tableau, p, _exactly, _at_zero))
+        below = (_conditions(tableau, q, _exactly, _exactly) for q in range(2, p))
+        return all(map(_is_zero, below)) and _is_zero(_conditions(tableau, p, _exactly, _at_zero))
 
     return _largest(holds)
 

@@ -36,7 +36,9 @@ _Pair = tuple[Array, Array]
 _RADIUS = 4.0
 
 
-def phi(k: int, z: Inexact[Array | np.ndarray, "*batch"]) -> Inexact[Array, "*batch"]:
+def phi(
+    k: int, z: Inexact[Array | np.ndarray, "*batch"] | float | complex
+) -> Inexact[Array, "*batch"]:
     """The function `phi_k(z) = sum_j z^j / (j + k)!` of exponential integrators, entry by entry.
 
     So `phi_0 = exp`, `phi_1(z) = (exp(z) - 1) / z` and `phi_(k+1)(z) = (phi_k(z) - 1 / k!) / z`. In

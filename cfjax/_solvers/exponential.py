@@ -16,7 +16,7 @@ from .._control_term import is_driven
 from .._field import AbstractSemilinearField, Rest, combine, from_chart, is_field
 from .._methods import exponential as _exponential
 from .._methods.exponential import Columns, Combination, ExponentialTableau
-from .._methods.proved import order_of
+from .._methods.proved import order_of, proved
 from .base import AbstractChartSolver, Step, check_choice
 from .chart import Chart
 from .dense import AbstractPath
@@ -248,7 +248,7 @@ class ETDRK4(AbstractExponential):
     (2002), doi:10.1006/jcph.2002.6995.
     """
 
-    tableau: ClassVar[ExponentialTableau] = _exponential.ETDRK4
+    tableau: ClassVar[ExponentialTableau] = proved(_exponential.ETDRK4, 4)
 
 
 class ETD43(AbstractExponential, diffrax.AbstractAdaptiveSolver):
@@ -262,7 +262,7 @@ class ETD43(AbstractExponential, diffrax.AbstractAdaptiveSolver):
     (2005), doi:10.1137/040611434.
     """
 
-    tableau: ClassVar[ExponentialTableau] = _exponential.ETD43
+    tableau: ClassVar[ExponentialTableau] = proved(_exponential.ETD43, 4, 3)
 
 
 class ETD54(AbstractExponential, diffrax.AbstractAdaptiveSolver):
@@ -274,4 +274,4 @@ class ETD54(AbstractExponential, diffrax.AbstractAdaptiveSolver):
     the stiff case, SIAM J. Numer. Anal. 51 (2013), doi:10.1137/130920204.
     """
 
-    tableau: ClassVar[ExponentialTableau] = _exponential.ETD54
+    tableau: ClassVar[ExponentialTableau] = proved(_exponential.ETD54, 5, 4)

@@ -1,4 +1,9 @@
-"""phi_1, as `cfjax.Affine` moves the origin by it: every argument, derivatives, not finite ones."""
+"""phi_1, as `cfjax.Affine` moves the origin by it: every argument, derivatives, not finite ones.
+
+Then all of phi_0 to phi_5.
+"""
+
+import math
 
 import jax
 import jax.numpy as jnp
@@ -130,3 +135,84 @@ def test_shapes(shape):
     z = jnp.linspace(-5.0, 2.0, int(np.prod(shape))).reshape(shape)
     assert phi_1(z).shape == shape
     assert jax.vmap(phi_1)(z[None]).shape == (1, *shape)
+
+
+# phi_k, as exported.
+
+
+def exact_phi(k, z):
+    with mpmath.workdps(60):
+        z = mpmath.mpmathify(complex(z))
+        if abs(z) < 8:
+            return mpmath.fsum(z**j / mpmath.factorial(j + k) for j in range(120))
+        value = mpmath.exp(z)
+        for m in range(k):
+            value = (value - 1 / mpmath.factorial(m)) / z
+        return value
+
+
+@pytest.mark.representatives(2)
+@pytest.mark.parametrize("dtype", [np.float32, np.float64, np.complex64, np.complex128])
+def test_phi_against_sixty_digits(dtype):
+    """On both sides of the switch at 4, and to 1e5 in the left half plane and on its edge."""
+    is_complex = np.issubdtype(dtype, np.complexfloating)
+    rng = np.random.default_rng(0)
+    sizes = np.concatenate([[0], 10 ** rng.uniform(-8, 5, 40), rng.uniform(0, 12, 40), [3.9999, 4]])
+    z = [-sizes, sizes[sizes < 20]]
+    if is_complex:
+        z += [1j * sizes, sizes * np.exp(1j * rng.uniform(np.pi / 2, 3 * np.pi / 2, len(sizes)))]
+    z = np.concatenate(z).astype(dtype)
+    units = 5 if np.finfo(dtype).eps < 1e-10 else 10
+    for k in range(6):
+        found = np.asarray(cfjax.phi(k, z))
+        assert found.dtype == dtype
+        for value, x in zip(found, z, strict=True):
+            wanted = exact_phi(k, x)
+            # XLA's own exponential of a complex number has the error of its angle, which phi_0 has
+            # whole, and phi_1 as much as is left near its zeros.
+            size = abs(wanted)
+            if k < 2:
+                size = max(size, abs(mpmath.exp(complex(x))) / max(abs(complex(x)), 1) ** k)
+            if k == 0 and is_complex:
+                continue
+            off = abs(mpmath.mpmathify(complex(value)) - wanted)
+            limit = units * float(np.finfo(dtype).eps) * size + float(np.finfo(dtype).tiny)
+            assert off <= limit, (k, x, float(off / size))
+
+
+@pytest.mark.parametrize("mode", [jax.grad, jax.jacfwd])
+def test_derivatives_of_phi(mode):
+    """phi_k' = phi_k - k phi_(k+1) off zero, in terms of w = phi_k: (w - ...) / z; and the series."""
+    for k in range(6):
+        value, first, second = (
+            f(0.0)
+            for f in (lambda z: cfjax.phi(k, z), *_derivatives(k, mode))  # noqa: B023
+        )
+        wanted = [1 / math.factorial(k), 1 / math.factorial(k + 1), 2 / math.factorial(k + 2)]
+        # A few units of rounding: the powers of a series, and two doublings.
+        np.testing.assert_allclose([value, first, second], wanted, rtol=0, atol=4e-16)
+        for z in (-30.0, -4.0, -3.9, 2.5):
+            # d/dz of the integral of exp((1 - s) z) s^(k-1) / (k-1)!: phi_k - k phi_(k+1).
+            slope = float(_derivatives(k, mode)[0](z))
+            wanted = float(exact_phi(k, z) - k * exact_phi(k + 1, z))
+            # Terms of order one that cancel.
+            assert slope == pytest.approx(wanted, rel=1e-13, abs=4e-16)
+
+
+def _derivatives(k, mode):
+    first = mode(lambda z: cfjax.phi(k, z))
+    return first, mode(first)
+
+
+@pytest.mark.parametrize(
+    "k, z, error, text",
+    [
+        (6, 1.0, ValueError, "k must be an integer from 0 to 5, got 6"),
+        (-1, 1.0, ValueError, "k must be an integer from 0 to 5, got -1"),
+        (True, 1.0, ValueError, "k must be an integer from 0 to 5, got True"),
+        (2, 1, TypeError, "z must be one of float32, complex64, float64, complex128, got int64"),
+    ],
+)
+def test_phi_refuses(no_shape_hook, k, z, error, text):
+    with pytest.raises(error, match=text):
+        cfjax.phi(k, z)
