@@ -31,7 +31,8 @@ from jaxtyping import Array, Float
 
 from .. import (
     CF4,
-    CF43,
+    ETD43,
+    ETD54,
     Affine,
     FourierTransform,
     LieTerm,
@@ -143,7 +144,8 @@ def chart(**options: Any) -> WorkPrecision:
         **given,
         methods={
             "CF4": CF4(),
-            "CF43": CF43(),
+            "ETD43": ETD43(),
+            "ETD54": ETD54(),
             "Tsit5": (diffrax.ODETerm(velocity), diffrax.Tsit5()),
         },
         reference=reference(t1, given["y0"], given["args"]),
@@ -157,8 +159,8 @@ def picture(n: int = 64) -> "Figure":
     from matplotlib.figure import Figure
 
     start = jax.tree.map(jnp.asarray, y0(n))
-    options: Any = dict(num_steps=1200, save_every=100)
-    ys: Any = integrate(LieTerm(field), CF4(), 0.0, 6000.0, start, Reactor(), **options).ys
+    options: Any = dict(num_steps=600, save_every=50)
+    ys: Any = integrate(LieTerm(field), ETD54(), 0.0, 6000.0, start, Reactor(), **options).ys
     times = (0, 500, 1000, 1500, 2500, 6000)
     figure = Figure((12.0, 2.2), layout="constrained")
     side = Reactor().side
