@@ -13,7 +13,8 @@ Uniform states stay uniform, and follow the equations without diffusion, those o
 The mass obeys `d/dt mean(u + v) = F (1 - mean(u)) - (F + K) mean(v)`. Concentrations stay positive,
 up to the error of the grid.
 
-The problem is mildly stiff: diffusion is some 50 times as fast as the reaction. On larger grids the
+The problem is mildly stiff: diffusion is some 40 times as fast as the reaction. So for small errors
+Tsit5 in plain space keeps up with the methods that solve diffusion exactly. On larger grids the
 ratio grows with the square of n.
 
 Source: Pearson, Complex patterns in a simple system, Science 261 (1993),
@@ -138,7 +139,7 @@ def invariants(y: State, args: Any = None) -> dict[str, Array]:
 
 
 def chart(**options: Any) -> WorkPrecision:
-    """Gray and Scott's reaction, 64 x 64 points, to t = 100, 10 to 640 equal steps."""
+    """Gray and Scott's reaction, 64 x 64 points, to t = 100, 10 to 320 equal steps."""
     given = problem()
     return work_precision(
         **given,
@@ -149,7 +150,7 @@ def chart(**options: Any) -> WorkPrecision:
             "Tsit5": (diffrax.ODETerm(velocity), diffrax.Tsit5()),
         },
         reference=reference(t1, given["y0"], given["args"]),
-        num_steps=[10 * 2**k for k in range(7)],
+        num_steps=[10 * 2**k for k in range(6)],
         **options,
     )
 
