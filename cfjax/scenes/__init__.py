@@ -1,11 +1,14 @@
 """Problems with known answers, one to a module."""
 
+from . import allen_cahn as allen_cahn
 from . import annealing as annealing
 from . import covariance as covariance
+from . import gray_scott as gray_scott
 from . import heat as heat
 from . import heavy_top as heavy_top
 from . import hmc as hmc
 from . import imu as imu
+from . import kuramoto_sivashinsky as kuramoto_sivashinsky
 from . import landau_zener as landau_zener
 from . import macrospin as macrospin
 from . import rigid_body as rigid_body

@@ -1,0 +1,119 @@
+"""The Allen-Cahn equation: an exact solution, the energy that it descends, and drops."""
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+import cfjax
+from cfjax.scenes import allen_cahn
+
+TERM = cfjax.LieTerm(allen_cahn.field)
+WIDTH = allen_cahn.WIDTH
+
+
+def end(start, t, num_steps, width=WIDTH, solver=None):
+    found = cfjax.integrate(TERM, solver or cfjax.CF4(), 0.0, t, start, width, num_steps=num_steps)
+    return np.asarray(found.ys[-1])
+
+
+def test_the_exact_solution_solves_the_equation():
+    n, t, h = 2000, 2.7, 1e-3
+    u = allen_cahn.reference(t, n)
+    before, after = allen_cahn.reference(t - h, n), allen_cahn.reference(t + h, n)
+    curvature = np.diff(u, 2) * n**2
+    want = WIDTH**2 * curvature + (u - u**3)[1:-1]
+    # Second differences, of steps of 1/32 of a width and of 1e-3: squares of these over 12 and 6.
+    np.testing.assert_allclose((after - before)[1:-1] / (2 * h), want, rtol=0, atol=2e-4)
+    # They meet at 3, and stand still later on.
+    z = ((np.arange(n) + 0.5) / n - 0.5) / (2**0.5 * WIDTH)
+    np.testing.assert_allclose(allen_cahn.reference(40.0, n), np.tanh(z), rtol=0, atol=1e-15)
+    np.testing.assert_allclose(allen_cahn.reference(3.0, n), np.tanh(z / 2), rtol=0, atol=1e-15)
+
+
+def test_the_field_descends_the_energy():
+    for shape in ((12,), (5, 8)):
+        y = jnp.asarray(np.random.default_rng(0).normal(size=shape))
+        slope = jax.grad(allen_cahn.energy)(y, 0.1)
+        # The energy is a mean. Eigenvalues up to 14.
+        want = allen_cahn.velocity(0.0, y, 0.1)
+        np.testing.assert_allclose(-slope * y.size, want, rtol=0, atol=1e-12)
+
+
+def test_the_field_and_the_energy_of_a_wave():
+    x, y = (np.arange(12) + 0.5) / 12, (np.arange(10) + 0.5) / 10
+    wave = np.cos(2 * np.pi * x)[:, None] * np.cos(3 * np.pi * y)
+    square = (0.1 * np.pi) ** 2 * 13
+    u = jnp.asarray(0.3 * wave)
+    want = -square * u + u - u**3
+    np.testing.assert_allclose(allen_cahn.velocity(0.0, u, 0.1), want, rtol=0, atol=1e-14)
+    # The means of the wave's square and fourth power are 1/4 and 9/64.
+    energy = 0.09 * square / 8 + (1 - 0.09 / 2 + 0.0081 * 9 / 64) / 4
+    assert float(allen_cahn.energy(u, 0.1)) == pytest.approx(energy, rel=1e-14)
+
+
+def test_the_energy_of_a_front():
+    front = jnp.asarray(allen_cahn.reference(40.0))
+    # To the resolution of the cells, as of the exact solution.
+    want = WIDTH * 8**0.5 / 3
+    assert float(allen_cahn.energy(front, WIDTH)) == pytest.approx(want, rel=1e-10)
+
+
+@pytest.mark.parametrize(
+    "solver, num_steps, least, most",
+    [
+        (cfjax.CF4(), (40, 80), 14, 20),
+        pytest.param(cfjax.ETD43(), (20, 40), 14, 20, marks=pytest.mark.slow),
+        # At first it falls faster than with the fifth power of the step.
+        pytest.param(cfjax.ETD54(), (20, 40), 32, 90, marks=pytest.mark.slow),
+    ],
+    ids=["CF4", "ETD43", "ETD54"],
+)
+def test_order_on_the_exact_solution(solver, num_steps, least, most):
+    start, want = allen_cahn.y0(), allen_cahn.reference(6.0)
+    errors = [np.abs(end(start, 6.0, n, solver=solver) - want).max() for n in num_steps]
+    assert least < errors[0] / errors[1] < most
+    # Far above the error of the cells.
+    assert errors[1] > 1e-10
+
+
+def test_every_axis_is_like_the_line():
+    start = allen_cahn.reference(0.0, 32, 0.1)
+    line = end(start, 1.0, 5, 0.1)
+    for shape in ((32, 3), (3, 32)):
+        spread = start[:, None] if shape[0] == 32 else start
+        found = end(np.broadcast_to(spread, shape), 1.0, 5, 0.1)
+        want = np.broadcast_to(line[:, None] if shape[0] == 32 else line, shape)
+        # Rounding of products with dense matrices.
+        np.testing.assert_allclose(found, want, rtol=0, atol=1e-13)
+
+
+@pytest.mark.slow
+def test_the_error_of_the_reference():
+    found = end(allen_cahn.y0(), 6.0, 1280)
+    assert np.abs(found - allen_cahn.reference(6.0)).max() < 1e-11
+
+
+@pytest.mark.slow
+def test_the_area_of_a_drop():
+    width, t, n = 0.02, 40.0, 128
+    ys = cfjax.integrate(
+        TERM, cfjax.CF4(), 0.0, t, allen_cahn.drop(n), width, num_steps=160, save_every=4
+    ).ys
+    area = np.mean((1 + np.asarray(ys)) / 2, axis=(1, 2))
+    slopes = np.diff(area)
+    # To leading order in the width over the radius of curvature, 0.02 / 0.2 here.
+    np.testing.assert_allclose(slopes, -2 * np.pi * width**2, rtol=0.1)
+    energies = jax.vmap(lambda y: allen_cahn.energy(y, width))(ys)
+    assert np.all(np.diff(energies) < 0)
+    # By then it is nearly round: as far out along an axis as along a diagonal.
+    u = np.asarray(ys[-1])
+    middle = n // 2
+    axis = np.sum((1 + u[middle:, middle]) / 2)
+    diagonal = np.sum((1 + np.diag(u)[middle:]) / 2) * 2**0.5
+    assert diagonal == pytest.approx(axis, rel=0.1)
+
+
+@pytest.mark.slow
+def test_the_picture_has_five_panels():
+    assert len(allen_cahn.picture(n=16).axes) == 5
