@@ -29,7 +29,7 @@ import results
 from cfjax._integrate import equal_steps, without_estimate
 from cfjax._measure import style as _style
 from cfjax._measure.work_precision import take_turns
-from stiff_problems import IN_G, PROBLEMS, Problem, of_heat
+from stiff_problems import OTHERS, PROBLEMS, Problem
 
 TARGETS = (1e-3, 1e-6, 1e-9)
 TOLERANCES = (1e-4, 1e-6, 1e-8)
@@ -91,6 +91,9 @@ class Program:
     def to(self, target: float, cap: float) -> Run | float:
         """The cheapest run found with at most this error, or the seconds that were not enough."""
         search = self._tolerance if self.is_adaptive else self._count
+        if self.is_adaptive and any(math.isinf(run.error) for run in self.runs.values()):
+            # Too many steps, and a smaller tolerance takes more.
+            return cap
         begin = time.perf_counter()
         for setting in search(target):
             last = max(self.runs.values(), key=lambda run: run.seconds, default=None)
@@ -228,9 +231,10 @@ def measure(quick: bool) -> Iterator[results.Row]:
             yield from _to_target(name, found, target, quick)
         yield from _orders(name, problem, found)
         yield from _tolerances(name, found)
+        yield from _parts(name, found)
         if name == "Korteweg-de Vries":
             yield from _dispersion(name, found)
-    for name, make in IN_G.items():
+    for name, make in OTHERS.items():
         problem = make()
         reference = problem.reference()
         few = {
@@ -238,7 +242,7 @@ def measure(quick: bool) -> Iterator[results.Row]:
             for n, s in ORDERS.items()
         }
         yield from _orders(name, problem, few)
-    yield from _parts_of_heat()
+        yield from _parts(name, few)
 
 
 def _to_target(
@@ -247,11 +251,14 @@ def _to_target(
     cap, budget = (5.0, 1.0) if quick else (20.0, 4.0)
     chosen = {program: p.to(target, cap) for program, p in found.items()}
     met = {program: run for program, run in chosen.items() if isinstance(run, Run)}
-    # In the turns of a slow one the others would have few: it has some of its own, beside CF4.
-    slow = [n for n, run in met.items() if run.seconds > 0.5 and n != "CF4"]
-    turns = [[n for n in met if n not in slow], *(["CF4", n] for n in slow if "CF4" in met)]
+    # In the turns of a slow one the others would have few: it has some of its own, beside a few.
+    slow = [n for n, run in met.items() if run.seconds > 0.5 and n not in ORDERS]
+    turns = [[n for n in met if n not in slow]]
+    turns += [[*(m for m in ORDERS if m in met), n] for n in slow]
     times: dict[str, np.ndarray] = {}
-    over: dict[str, dict[str, list[float]]] = {n: {} for n in met}
+    # None where there is none, so that all rows have the same entries.
+    keys = [*(f"over {base}" for base in BASES), "step over an equal one"]
+    over: dict[str, dict[str, Any]] = {n: dict.fromkeys(keys) for n in met}
     for names in turns:
         timed = [found[n].timed(met[n].setting) for n in names]
         # The first of a turn would pay for cold caches, after a slow one: it runs before.
@@ -259,8 +266,8 @@ def _to_target(
         spent = dict(zip(names, seconds, strict=True))
         for n in names:
             for base in BASES:
-                if base in spent and base != n:
-                    over[n].setdefault(f"over {base}", results.ratios(spent[n], spent[base]))
+                if base in spent and base != n and over[n][f"over {base}"] is None:
+                    over[n][f"over {base}"] = results.ratios(spent[n], spent[base])
             equal = n.removesuffix(CONTROLLED)
             if equal != n and equal in spent:
                 a_step, of_equal = (spent[m] / met[m].steps for m in (n, equal))
@@ -273,10 +280,9 @@ def _to_target(
             yield row | {"to": target, "not in seconds": cap}
             continue
         run = met[program]
-        if p.is_adaptive:
-            row["tolerance"] = run.setting
         yield row | {
             "to": target,
+            "tolerance": run.setting if p.is_adaptive else None,
             "steps": run.steps,
             "error": results.digits(run.error),
             "seconds": results.spread(times[program]),
@@ -323,21 +329,15 @@ def _dispersion(name: str, found: dict[str, Program]) -> Iterator[results.Row]:
                 yield {"problem": name, "program": program, "dispersion, steps": n, "error": error}
 
 
-def _parts_of_heat() -> Iterator[results.Row]:
+def _parts(name: str, found: dict[str, Program]) -> Iterator[results.Row]:
     """Errors of the heat problem, by how much of its diffusivity is in M."""
-    parts: dict[str, Callable] = {
-        "the mean": np.mean,
-        "0.8 of the largest": lambda mu: 0.8 * np.max(mu),
-        "the largest": np.max,
-    }
-    for part, constant in parts.items():
-        problem = of_heat(constant)
-        reference = problem.reference()
-        for program, solver in ORDERS.items():
-            found = Program(with_equal_steps(problem, solver), problem, reference, "cfjax")
-            for n in (50, 100, 200, 400):
-                error = results.digits(found.run(n).error)
-                yield {"in M": part, "program": program, "steps": n, "error": error}
+    if not name.startswith("heat, "):
+        return
+    for program in ORDERS:
+        for n in (50, 100, 200, 400):
+            error = results.digits(found[program].run(n).error)
+            part = name.removeprefix("heat, ").removesuffix(" in M")
+            yield {"in M": part, "program": program, "steps": n, "error": error}
 
 
 LOOKS: dict[str, tuple[str, str]] = {
