@@ -784,6 +784,19 @@ def stiff_times() -> list[list[str]]:
 
 
 @table
+def stiff_others() -> list[list[str]]:
+    rows = pick(_stiff("to"), program="ETD54")
+    others = {"exponax": "exponax, ETDRK4", "Kvaerno5": "Kvaerno5", "Tsit5": "Tsit5"}
+    table = [["", "error", *others.values()]]
+    for row in rows:
+        spreads = [row.get(f"over {other}") for other in others]
+        if any(spreads):
+            cells = [cell(over) if over else "" for over in spreads]
+            table.append([row["problem"], power(row["to"]), *cells])
+    return table
+
+
+@table
 def stiff_steps() -> list[list[str]]:
     return _stiff_table(lambda row: str(row.get("steps", "")), (1e-6,))
 

@@ -219,7 +219,9 @@ def programs(problem: Problem, reference: np.ndarray) -> dict[str, Program]:
         solves["Kvaerno5"] = ("diffrax", stock)
     stock = with_control(problem, space, diffrax.Tsit5(), problem.values, 200_000)
     solves["Tsit5"] = ("diffrax", stock)
-    return {n: Program(solve, problem, reference, package) for n, (package, solve) in solves.items()}
+    return {
+        n: Program(solve, problem, reference, package) for n, (package, solve) in solves.items()
+    }
 
 
 def measure(quick: bool) -> Iterator[results.Row]:

@@ -278,9 +278,7 @@ def burgers() -> Problem:
 def korteweg_de_vries() -> Problem:
     n, period = 256, 2 * np.pi
     x = period * np.arange(n) / n - np.pi
-    solitons = (
-        3 * a**2 / np.cosh(a / 2 * (x + at)) ** 2 for a, at in ((25.0, 2.0), (16.0, 1.0))
-    )
+    solitons = (3 * a**2 / np.cosh(a / 2 * (x + at)) ** 2 for a, at in ((25.0, 2.0), (16.0, 1.0)))
     k = np.arange(n // 2 + 1)
     return periodic(
         0.006,
@@ -337,9 +335,7 @@ def gray_scott() -> Problem:
     n, feed, kill = 64, 0.04, 0.06
     x = np.arange(n) / n
     x, y = x[:, None], x[None, :]
-    spots = sum(
-        np.exp(-80 * ((x - a) ** 2 + (y - b) ** 2)) for a, b in ((0.4, 0.45), (0.6, 0.6))
-    )
+    spots = sum(np.exp(-80 * ((x - a) ** 2 + (y - b) ** 2)) for a, b in ((0.4, 0.45), (0.6, 0.6)))
     start = np.stack([1 - spots / 2, spots / 4])
     i, j = np.fft.fftfreq(n, 1 / n)[:, None], np.arange(n // 2 + 1)
     laplacian = -((2 * np.pi) ** 2) * (i**2 + j**2)
