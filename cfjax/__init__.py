@@ -12,6 +12,7 @@ if _signals.is_command():
 from ._control_term import LieControlTerm as LieControlTerm
 from ._field import AbstractAlgebraElement as AbstractAlgebraElement
 from ._field import AbstractFrozenField as AbstractFrozenField
+from ._field import AbstractSemilinearField as AbstractSemilinearField
 from ._field import bracket as bracket
 from ._field import combine as combine
 from ._field import flow as flow
@@ -64,7 +65,10 @@ if TYPE_CHECKING:
     from ._fields.sphere import SphereRotation as SphereRotation
     from ._measure.work_precision import WorkPrecision as WorkPrecision
     from ._measure.work_precision import work_precision as work_precision
+    from ._methods.exponential import ExponentialTableau as ExponentialTableau
     from ._methods.stability import stability_function as stability_function
+    from ._methods.stiff_order import stiff_order as stiff_order
+    from ._numerics.phi import phi as phi
     from ._numerics.transforms import AbstractTransform as AbstractTransform
     from ._numerics.transforms import CosineTransform as CosineTransform
     from ._numerics.transforms import FourierTransform as FourierTransform
@@ -72,6 +76,10 @@ if TYPE_CHECKING:
     from ._numerics.transforms import SineTransform as SineTransform
     from ._numerics.transforms import TensorTransform as TensorTransform
     from ._solvers.composition import Composition as Composition
+    from ._solvers.exponential import ETD43 as ETD43
+    from ._solvers.exponential import ETD54 as ETD54
+    from ._solvers.exponential import ETDRK4 as ETDRK4
+    from ._solvers.exponential import ExponentialRungeKutta as ExponentialRungeKutta
     from ._solvers.implicit_midpoint import ImplicitMidpoint as ImplicitMidpoint
     from ._solvers.low_storage import BWRRK33 as BWRRK33
     from ._solvers.low_storage import BWRRK53 as BWRRK53
@@ -120,7 +128,10 @@ _NAMES_LATER = {
     "_fields.sphere": ("SphereRotation",),
     "_batch.batch": ("BatchResult", "map_batch"),
     "_measure.work_precision": ("WorkPrecision", "work_precision"),
+    "_methods.exponential": ("ExponentialTableau",),
     "_methods.stability": ("stability_function",),
+    "_methods.stiff_order": ("stiff_order",),
+    "_numerics.phi": ("phi",),
     "_numerics.transforms": (
         "AbstractTransform",
         "CosineTransform",
@@ -130,6 +141,7 @@ _NAMES_LATER = {
         "TensorTransform",
     ),
     "_solvers.composition": ("Composition",),
+    "_solvers.exponential": ("ETD43", "ETD54", "ETDRK4", "ExponentialRungeKutta"),
     "_solvers.implicit_midpoint": ("ImplicitMidpoint",),
     "_solvers.low_storage": (
         "BWRRK33",

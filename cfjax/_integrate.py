@@ -18,7 +18,7 @@ from ._numerics.checks import Fault, checked, error_if, needing
 from ._numerics.squaring import max_over_batch
 from ._solvers.base import is_finite, result_of
 from ._step_back import repeat_and_undo
-from ._xla import repeat
+from ._xla import invariants_first, repeat
 
 # Steps whose derivative is not rewritten.
 _FEW = 10
@@ -205,6 +205,9 @@ def equal_steps(
     zero = (fault.error if throw else fault.nan)(jnp.zeros((), t0.dtype))
     start, t1 = needing(zero, (y0, t1))
     carry = (n, start, solver_state, diffrax.RESULTS.successful)
+    if hasattr(solver, "for_equal_steps"):
+        solver = cast(Any, solver).for_equal_steps((t1 - t0) / intervals)
+        step = invariants_first(step, carry)
 
     # Of a few steps the derivative takes longer to compile than it will ever save.
     order = 0 if isinstance(num_steps, int) and num_steps < _FEW else 1

@@ -9,13 +9,20 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Inexact
 
-from .._field import AbstractAlgebraElement, Weight, combine, describe, struct
+from .._field import (
+    AbstractAlgebraElement,
+    AbstractSemilinearField,
+    Weight,
+    combine,
+    describe,
+    struct,
+)
 from .._numerics.checks import needing
-from .._numerics.phi import phi_1
+from .._numerics.phi import phi_1, phis
 from .._numerics.transforms import DTYPES, AbstractTransform, TensorTransform
 
 
-class Affine(AbstractAlgebraElement):
+class Affine(AbstractAlgebraElement, AbstractSemilinearField):
     """The field `x' = alpha M x + b` with a fixed operator M, for stiff semilinear problems.
 
     M is diagonal in the coefficients of a transform, with the eigenvalues `spectrum`. The flow of
@@ -115,6 +122,21 @@ class Affine(AbstractAlgebraElement):
     def tangent(self, point: Inexact[Array, "*point"]) -> Inexact[Array, "*point"]:
         self._check(point)
         return self._point(_times(self._exponent(), self._coefficients(point))) + self.b
+
+    def functions(self, pairs: Sequence[tuple[float, int]]) -> list[Array]:
+        nodes = sorted({c for c, _ in pairs})
+        z = jnp.stack([c * self._exponent() for c in nodes])
+        found = phis(z, max(k for _, k in pairs))
+        return [found[k][nodes.index(c)] for c, k in pairs]
+
+    def times(self, function: Array, x: Inexact[Array, "*point"]) -> Inexact[Array, "*point"]:
+        return self._point(_times(function, self._coefficients(x)))
+
+    def rest(self, first: Any, point: Inexact[Array, "*point"]) -> Inexact[Array, "*point"]:
+        # The alpha of a field may vary, though mostly it does not.
+        b = _of_one_operator([first, self])[1]
+        more = (self.alpha - first.alpha).astype(self.spectrum.dtype) * self.spectrum
+        return b + self._point(_times(more, self._coefficients(point)))
 
     def bracket(self, other: Any) -> "Affine":
         # The commutator of the matrices [[alpha M, b], [0, 0]].

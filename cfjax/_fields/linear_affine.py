@@ -1,18 +1,20 @@
 """Affine fields with a dense matrix."""
 
+from collections.abc import Sequence
 from typing import Any
 
 import equinox as eqx
 import jax.numpy as jnp
 from jaxtyping import Array, Inexact
 
+from .._field import AbstractSemilinearField
 from .._numerics.matmul import matmul, promoted
-from .._numerics.phi_1_times import phi_1_times
+from .._numerics.phi import matrix_phis, phi_1_times
 from .elementwise import check_other, check_point, each
 from .matrix import AbstractMatrix, check_companion
 
 
-class LinearAffine(AbstractMatrix):
+class LinearAffine(AbstractMatrix, AbstractSemilinearField):
     """The affine field `x' = a x + b` with a dense matrix.
 
     Its flow is `x -> exp(a) x + phi_1(a) b` with `phi_1(z) = (exp(z) - 1) / z`, also if `a` has no
@@ -54,6 +56,21 @@ class LinearAffine(AbstractMatrix):
         for name in ("a", "b"):
             check_point(self, name, self._num_axes, [(n,)], point)
         return jnp.add(*promoted(self._times(self.a, point), self.b))
+
+    def functions(self, pairs: Sequence[tuple[float, int]]) -> list[Array]:
+        nodes = sorted({c for c, _ in pairs})
+        most = max(k for _, k in pairs)
+        found = each(lambda a: matrix_phis(a, nodes, most), self._num_axes)(self.a)
+        return [found[nodes.index(c)][k] for c, k in pairs]
+
+    def times(
+        self, function: Inexact[Array, "*batch n n"], x: Inexact[Array, "*batch n"]
+    ) -> Inexact[Array, "*batch n"]:
+        return self._times(function, x)
+
+    def rest(self, first: Any, point: Inexact[Array, "*batch n"]) -> Inexact[Array, "*batch n"]:
+        check_other(first, self)
+        return jnp.add(*promoted(self._times(self.a - first.a, point), self.b))
 
     def bracket(self, other: Any) -> "LinearAffine":
         check_other(self, other)

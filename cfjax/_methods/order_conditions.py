@@ -25,6 +25,8 @@ from typing import Any, TypeAlias
 import numpy as np
 
 from .coefficients import Product, Row, uncertainty
+from .exponential import ExponentialTableau
+from .stiff_order import classical_order
 from .tableau import Tableau
 
 
@@ -72,14 +74,19 @@ Defects: TypeAlias = list[tuple[Fraction, float]]
 
 
 @lru_cache
-def order(tableau: Tableau) -> int:
+def order(tableau: Tableau | ExponentialTableau) -> int:
     """The order of a commutator-free method, at least 1 as every tableau is consistent.
+
+    Of an exponential Runge-Kutta method it is the classical order, for steps that are short for the
+    linear part too; `cfjax.stiff_order` is the order for long ones.
 
     For exact tableaus the result is exact. Floats are taken as rounded coefficients, and the result
     is the order that the unrounded method may have; see `_defects`.
 
-    **Raises:** `TypeError` if `tableau` is not a `Tableau`.
+    **Raises:** `TypeError` if `tableau` is neither a `Tableau` nor an `ExponentialTableau`.
     """
+    if isinstance(tableau, ExponentialTableau):
+        return classical_order(tableau)
     if not isinstance(tableau, Tableau):
         raise TypeError(f"order: tableau must be a cfjax.Tableau, got {tableau!r}.")
     return _largest_order(_defects(_end_weights(tableau), exact_weight), tableau)

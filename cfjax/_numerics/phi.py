@@ -1,13 +1,93 @@
-"""The function phi_1 of exponential integrators, smooth at zero and everywhere."""
+"""The functions phi_k of exponential integrators: of numbers, of matrices, times a vector.
+
+`phi_0 = exp`, and `phi_k(z) = sum_j z^j / (j + k)!`.
+"""
 
 import functools
+from collections.abc import Callable, Sequence
 from math import factorial
 
 import jax
 import jax.numpy as jnp
+import numpy as np
+from jax import lax
 from jaxtyping import Array, Inexact
 
+from .expm import (
+    TAYLOR_SCHEMES,
+    by_norm,
+    in_full_register,
+    one_norm,
+    taylor_from_second,
+)
+from .expm_multiply import FIRST_DEGREE, LONGEST
+from .matmul import matmul, plus_identity, promoted, small_product
 from .polynomial import polynomial
+from .squaring import max_over_batch
+from .vectors import materialised_in_rows
+
+# So many terms of Taylor's series.
+_DEGREES = {"float32": (5, 10, 15), "float64": (12, 16, 20, 25)}
+# A matrix a and a vector v, for the block matrix `[[a, v], [0, 0]]`.
+_Pair = tuple[Array, Array]
+
+# Below it a series, beyond it the recursion from phi_1 upwards, which divides by z.
+_RADIUS = 4.0
+
+
+def phi(k: int, z: Inexact[Array | np.ndarray, "*batch"]) -> Inexact[Array, "*batch"]:
+    """The function `phi_k(z) = sum_j z^j / (j + k)!` of exponential integrators, entry by entry.
+
+    So `phi_0 = exp`, `phi_1(z) = (exp(z) - 1) / z` and `phi_(k+1)(z) = (phi_k(z) - 1 / k!) / z`. In
+    terms of integrals `phi_k(z)` is that of `exp((1 - s) z) s^(k-1) / (k-1)!` over s from 0 to 1.
+
+    **Arguments:**
+
+    - `k`: 0 to 5, static.
+    - `z`: float32, float64, complex64 or complex128, of any shape.
+
+    **Accuracy:** within 5 units of rounding in double precision, and 10 in single, in the left half
+    plane and on the imaginary axis up to `|z| = 1e5`. (Near the zeros `2 pi i n` of `phi_1` the
+    error is relative to `1 / |z|`.) Derivatives of any order work, forward and reverse, at zero
+    too.
+
+    **Cost:** some 30 operations more than two exponentials.
+
+    **Raises:** `ValueError` for another k, `TypeError` for another dtype.
+    """
+    if isinstance(k, bool) or not isinstance(k, int | np.integer) or not 0 <= k <= 5:
+        raise ValueError(f"k must be an integer from 0 to 5, got {k!r}.")
+    z = jnp.asarray(z)
+    if z.dtype.name not in TAYLOR_SCHEMES:
+        raise TypeError(f"z must be one of {', '.join(TAYLOR_SCHEMES)}, got {z.dtype}.")
+    return phi_1(z) if k == 1 else phis(z, int(k), once=lambda x: x)[k]
+
+
+def phis(
+    z: Inexact[Array, "*batch"],
+    most: int,
+    once: Callable[[list[Array]], list[Array]] = functools.partial(
+        materialised_in_rows, alone=True
+    ),
+) -> list[Inexact[Array, "*batch"]]:
+    """`phi_0(z)` to `phi_most(z)`. XLA would compute what goes through `once` for each of them."""
+    if most == 0:
+        return [jnp.exp(z)]
+    is_small = jnp.abs(z) < _RADIUS
+    half = jnp.where(is_small, z, 0) / 2
+    top = polynomial([1 / factorial(j + most) for j in range(_terms(_RADIUS / 2))], half)
+    top, of_half, of_z, first = once([top, jnp.exp(half), jnp.exp(z), jnp.expm1(z)])
+    inner = [top]
+    for k in range(most, 1, -1):
+        inner.insert(0, half * inner[0] + 1 / factorial(k - 1))
+    found, outer = [of_z], first / jnp.where(is_small, 1, z)
+    for k in range(1, most + 1):
+        # phi_k(2 w), in which all terms are positive for real w.
+        terms = (inner[j - 1] * (1 / factorial(k - j)) for j in range(1, k + 1))
+        doubled = sum(terms, start=of_half * inner[k - 1]) * 0.5**k
+        found.append(jnp.where(is_small, doubled, outer))
+        outer = (outer - 1 / factorial(k)) / jnp.where(is_small, 1, z)
+    return found
 
 
 def phi_1(z: Inexact[Array, "*batch"]) -> Inexact[Array, "*batch"]:
@@ -52,3 +132,134 @@ def _terms(radius: float) -> int:
     while radius**j / factorial(j) > 2.0**-54:
         j += 1
     return j
+
+
+def phi_1_times(a: Inexact[Array, "n n"], v: Inexact[Array, " n"]) -> Inexact[Array, " n"]:
+    """`phi_1(a) v = v + a v / 2! + a^2 v / 3! + ...`, with a rounding as small as `v`.
+
+    **Cost:** 11, 15, 19 or 24 products with a vector for 1-norms up to 0.3, 0.78, 1.4 and 2.4; in
+    single precision 4, 9 or 14 up to 0.13, 0.99 and 2.2. Beyond, 5 matrix products (4 in single
+    precision), and one for each squaring. Under `jax.vmap` the largest norm decides.
+
+    **Accuracy:** a backward error of a few units in the last place. The number of terms depends on
+    `a` alone and not on `v`, so derivatives are as accurate.
+
+    A real `a` may meet a complex `v` of the same precision.
+
+    Source: Al-Mohy & Higham, Computing the action of the matrix exponential, SIAM J. Sci. Comput.
+    33 (2011), doi:10.1137/100788860.
+    """
+    precision = jnp.finfo(v.dtype).dtype.name
+    degrees = _DEGREES[precision]
+    thetas = [LONGEST[precision][degree - FIRST_DEGREE[precision]] for degree in degrees]
+    norm = max_over_batch(lax.stop_gradient(one_norm(a)))
+
+    # One branch within the other: a loop over all of them has a far slower derivative.
+    def add(term: Array, total: Array, first: int, n: int) -> Array:
+        for k in range(first, degrees[n] + 1):
+            term = _times(a, term) / k
+            total = total + term
+        if n + 1 == len(degrees):
+            return total
+        return lax.cond(
+            norm > thetas[n],
+            lambda term, total: add(term, total, degrees[n] + 1, n + 1),
+            lambda term, total: total,
+            term,
+            total,
+        )
+
+    # Without a checkpoint the branch not taken must still hand out room for what the other saves.
+    return lax.cond(
+        norm > thetas[-1],
+        jax.checkpoint(lambda v: _by_squaring(a, v)),
+        lambda v: add(v, v, 2, 0),
+        v,
+    )
+
+
+def _by_squaring(a: Array, v: Array) -> Array:
+    """From exp([[a, v], [0, 0]]) = [[exp(a), phi_1(a) v], [0, 1]]."""
+    scheme = TAYLOR_SCHEMES[a.dtype.name][-1]
+
+    def approximate(_: int, first: _Pair, second: _Pair) -> _Pair:
+        rest, moved = taylor_from_second(scheme, first, second, _product)
+        return rest, first[1] + moved
+
+    n = len(v)
+    a = in_full_register(a)
+    v = jnp.pad(v, (0, len(a) - n))
+    _, (_, moved) = by_norm(
+        [scheme.theta],
+        (a, v),
+        _product((a, v), (a, v)),
+        approximate,
+        lambda first, small: (plus_identity(small[0] + first[0]), small[1]),
+        _doubled,
+    )
+    return moved[:n]
+
+
+def _product(x: _Pair, y: _Pair) -> _Pair:
+    return small_product(x[0], y[0]), _times(x[0], y[1])
+
+
+def _doubled(x: _Pair) -> _Pair:
+    e, v = x
+    return small_product(e, e), v + _times(e, v)
+
+
+def _times(a: Array, v: Array) -> Array:
+    return matmul(*promoted(a, v))
+
+
+def matrix_phis(
+    a: Inexact[Array, "n n"], nodes: Sequence[float], most: int
+) -> list[list[Inexact[Array, "n n"]]]:
+    """For each node c the matrices `phi_0(c a)` to `phi_most(c a)`.
+
+    **Cost:** with m = `most` and s = max(0, log2(norm / 1.5)), rounded up, 7 + m products of
+    matrices and (m + 1) s more. Nodes that are doublings of others cost m + 1 for each doubling.
+    """
+    found: dict[float, tuple[Array, ...]] = {}
+    for c in sorted(set(nodes)):
+        # Twice as many doublings cost no more than to begin anew.
+        halves = [(c / 2**k, k) for k in (1, 2) if c / 2**k in found]
+        if not halves:
+            found[c] = _matrix_phis(c * a, most)
+            continue
+        start, number = halves[0]
+        value = found[start]
+        for _ in range(number):
+            value = _doubled_phis(value)
+        found[c] = value
+    return [list(found[c]) for c in nodes]
+
+
+def _matrix_phis(a: Array, most: int) -> tuple[Array, ...]:
+    def approximate(_: int, a: Array, a2: Array) -> tuple[Array, ...]:
+        # The series of phi_most in powers of a^4 (Paterson & Stockmeyer), then downwards.
+        powers = [jnp.eye(len(a), dtype=a.dtype), a, a2, small_product(a2, a)]
+        a4 = small_product(a2, a2)
+        top = jnp.zeros_like(a)
+        for block in reversed(range(5)):
+            weights = [1 / factorial(4 * block + r + most) for r in range(4)]
+            row = sum(w * x for w, x in zip(weights, powers, strict=True))
+            top = row if block == 4 else small_product(a4, top) + row
+        found = [top]
+        for k in range(most, 0, -1):
+            found.insert(0, small_product(a, found[0]) + powers[0] * (1 / factorial(k - 1)))
+        return tuple(found)
+
+    second = small_product(a, a)
+    return by_norm([1.5], a, second, approximate, lambda _, small: small, _doubled_phis)[1]
+
+
+def _doubled_phis(phis: tuple[Array, ...]) -> tuple[Array, ...]:
+    """Those of twice the argument."""
+    e = phis[0]
+    doubled = [small_product(e, e)]
+    for k in range(1, len(phis)):
+        terms = (phis[j] * (1 / factorial(k - j)) for j in range(1, k + 1))
+        doubled.append(sum(terms, start=small_product(e, phis[k])) * 0.5**k)
+    return tuple(doubled)

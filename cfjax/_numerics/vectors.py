@@ -10,6 +10,7 @@ from jaxtyping import Array, Float
 
 from .._xla import is_rewritten as is_rewritten
 from .._xla import materialised as materialised
+from .._xla import materialised_in_rows as materialised_in_rows
 from .._xla import pack as pack
 from .._xla import smooth as smooth
 from .._xla import unpack as unpack

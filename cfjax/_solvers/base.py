@@ -22,7 +22,7 @@ from .._term import product, velocity
 from .._xla import is_rewritten, materialised_in_rows, materialised_together, scalarised
 from .chart import Chart
 from .compensation import added, at, no_compensation, with_sums, zeros
-from .dense import Interpolation, Path
+from .dense import AbstractPath, Interpolation
 
 
 class _OfInstances(property):
@@ -138,7 +138,11 @@ class AbstractChartSolver(AbstractLieSolver):
     def step_in(self, chart: Chart) -> "Step":
         """A step from `chart.start`, with the fields that `chart.frozen` evaluates."""
 
-    def extended(self, path: Path, field: Callable[[Any, PyTree], PyTree]) -> Path:
+    def interval(self, t0: Any, t1: Any) -> tuple[Any, Any]:
+        """Two times that are as far apart as the ends of the step."""
+        return t0, t1
+
+    def extended(self, path: AbstractPath, field: Callable[[Any, PyTree], PyTree]) -> AbstractPath:
         """The way of a step with what only output within it takes.
 
         `field(c, y)` is `h f(t + c h, y)`. Apart from `step_in`, which is compiled whether anybody
@@ -166,7 +170,7 @@ class AbstractChartSolver(AbstractLieSolver):
             return materialised_in_rows(terms.vf(time_at(c, t0, t1), y, args))
 
         def stepped(y0):
-            control = control_of(terms, t0, t1)
+            control = control_of(terms, *self.interval(t0, t1))
             values = []
 
             def field(c: float | Real[Array, ""], y: PyTree) -> PyTree:
@@ -202,7 +206,7 @@ class Step(eqx.Module):
     """
 
     end: PyTree
-    path: Path
+    path: AbstractPath
     error: PyTree = None
     is_shared: bool = eqx.field(static=True, default=False)
 

@@ -9,7 +9,7 @@ import jax.tree_util as jtu
 from jaxtyping import Array, PyTree, Real
 
 from .._field import Rest, flow, from_chart, is_field, to_chart
-from .._xla import materialised_if_long, materialised_in_rows, materialised_together
+from .._xla import invariant, materialised_if_long, materialised_in_rows, materialised_together
 from .compensation import at, with_sums
 
 
@@ -101,6 +101,13 @@ class Chart:
         XLA computes them once then, and not anew for each result.
         """
         return materialised_together(tree, alone=True)
+
+    def constant(self, tree: PyTree) -> PyTree:
+        """The same arrays, which in equal steps mostly do not change from step to step.
+
+        Where they do not, the loop of equal steps computes them once.
+        """
+        return invariant(tree)
 
     def narrow(self, point: PyTree) -> PyTree:
         """The same point, on which all depends that follows: where a long step may be cut."""

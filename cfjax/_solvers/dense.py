@@ -1,5 +1,6 @@
 """Output within a step, on the manifold."""
 
+import abc
 from collections.abc import Callable, Sequence
 from functools import lru_cache
 from typing import Any
@@ -27,7 +28,7 @@ class Interpolation(diffrax.AbstractLocalInterpolation):
 
     t0: Any
     t1: Any
-    path: "Path"
+    path: "AbstractPath"
 
     def evaluate(self, t0: Any, t1: Any = None, left: bool = True) -> PyTree:
         """The solution at time `t0`, or what is added to it from `t0` to `t1`."""
@@ -77,7 +78,15 @@ def part_of_step(step: Any, t: Any) -> Real[Array, ""]:
         return (t - step.t0) / jnp.where(length == 0, 1, length)
 
 
-class Path(eqx.Module):
+class AbstractPath(eqx.Module):
+    """The way of a step, for output within it."""
+
+    @abc.abstractmethod
+    def point(self, theta: Any) -> PyTree:
+        """The solution at a part `theta` of the step."""
+
+
+class Path(AbstractPath):
     """The fields of a step, where it starts, and the continuous extension that they go into.
 
     Arrays that occur several times are kept once: of fields on a common span, every block of

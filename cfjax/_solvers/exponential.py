@@ -1,0 +1,279 @@
+"""Exponential Runge-Kutta methods: flows along polynomials in time, for stiff semilinear fields."""
+
+import functools
+from collections.abc import Sequence
+from fractions import Fraction
+from math import factorial
+from typing import Any, ClassVar, Literal
+
+import diffrax
+import equinox as eqx
+import jax.numpy as jnp
+import jax.tree_util as jtu
+from jaxtyping import Array, PyTree, Real
+
+from .._control_term import is_driven
+from .._field import AbstractSemilinearField, Rest, combine, from_chart, is_field, tangent
+from .._methods import exponential as _exponential
+from .._methods.exponential import Columns, Combination, ExponentialTableau
+from .._methods.proved import order_of
+from .base import AbstractChartSolver, Step, check_choice
+from .chart import Chart
+from .dense import AbstractPath
+
+
+class AbstractExponential(AbstractChartSolver):
+    """Steps for `x' = L x + g(t, x)` that are exact in L, with g as a polynomial in time.
+
+    The field must return `cfjax.Affine`, `cfjax.LinearAffine`, another
+    `cfjax.AbstractSemilinearField`, or an array for each part of the state. A step takes L from the
+    first field, and g from every field: its velocity less L times the point. So L may depend on
+    time, state and parameters. An array is the case L = 0: in a linear space each method is a
+    Runge-Kutta method.
+
+    L should hold nearly all of the stiffness: see *Stiff equations* in the documentation.
+
+    With a stiff order p the error is of order p however stiff L is, also where g does not vanish at
+    a boundary. No commutator-free method has a stiff order above 2.
+
+    The functions `phi_k(c h L)` are made for each step. `cfjax.integrate` makes them once, if L
+    depends on neither time nor state.
+
+    `estimate=None` switches off the estimate of the error. (`cfjax.integrate` does so.)
+
+    **Raises** `TypeError` when the program is traced for a field of another class, or a term that a
+    path drives; `ValueError` for another `estimate`.
+    """
+
+    tableau: eqx.AbstractVar[ExponentialTableau]
+    estimate: Literal["group"] | None = eqx.field(static=True, default="group", kw_only=True)
+    # Differences of times would differ from step to step by their rounding.
+    equal_length: Real[Array, ""] | None = eqx.field(default=None, kw_only=True)
+
+    def __check_init__(self):
+        check_choice("estimate", self.estimate, "group", None)
+
+    @property
+    def first_same_as_last(self) -> bool:
+        return self.estimate is not None and self.tableau.uses_last
+
+    def order(self, terms) -> int:
+        return order_of(self.tableau)
+
+    def error_order(self, terms) -> int | None:
+        embedded = self.tableau.embedded_method
+        return None if embedded is None else order_of(embedded) + 1
+
+    def for_terms(self, terms):
+        if is_driven(terms):
+            raise TypeError(
+                f"{type(self).__name__} takes no terms that a path drives: use a commutator-free "
+                "method, for example cfjax.CF4()."
+            )
+        return self
+
+    def for_equal_steps(self, length: Real[Array, ""]) -> "AbstractExponential":
+        """The same method for steps of this length alone."""
+        return self._with(equal_length=length)
+
+    def interval(self, t0: Any, t1: Any) -> tuple[Any, Any]:
+        if self.equal_length is None:
+            return t0, t1
+        return jnp.zeros_like(self.equal_length), self.equal_length
+
+    def step_in(self, chart):
+        tableau = self.tableau
+        first, start = chart.frozen(0.0, chart.start), chart.without_sums(chart.start)
+        linear = _LinearPart(type(self).__name__, first, [*self._rows, self._error or ()], chart)
+        # The velocity at the start, and by how much g differs there and at each later stage.
+        changes = {1: tangent(first, start)}
+        g = _rest(first, first, start)
+
+        def reach(row: Columns) -> PyTree:
+            return jtu.tree_map(jnp.add, chart.start, linear.increment(row, changes))
+
+        def evaluate(stage: int, c: float, point: PyTree) -> None:
+            later = _rest(chart.frozen(c, point), first, chart.without_sums(point))
+            changes[stage] = jtu.tree_map(jnp.subtract, later, g)
+
+        *rows, last = self._rows
+        for stage, row in enumerate(rows, 2):
+            evaluate(stage, float(tableau.c[stage - 1]), reach(row))
+        end = reach(last)
+        powers = [
+            combine([float(w) for _, w in power], [changes[j] for j, _ in power])
+            for power in tableau.powers
+        ]
+        path = _Path(type(self).__name__, first, start, changes[1], powers)
+        if self._error is None:
+            return Step(chart.from_start(end), path)
+        if tableau.uses_last:
+            end = chart.narrow(end)
+            evaluate(tableau.num_stages + 1, 1.0, end)
+        error = from_chart(first, linear.increment(self._error, changes))
+        return Step(chart.from_start(end), path, error)
+
+    @property
+    def _error(self) -> Columns | None:
+        return None if self.estimate is None else self.tableau.error
+
+    @property
+    def _rows(self) -> list[Columns]:
+        """With the coefficient of the velocity as the first column: stages from 2 on, the end."""
+        tableau = self.tableau
+        ends = zip((*tableau.c[1:], 1), (*tableau.a[1:], tableau.b), strict=True)
+        return [((1, ((1, c, c),)), *row) for c, row in ends]
+
+
+class _LinearPart:
+    """The coefficients of a step: functions of the linear part of its first field."""
+
+    def __init__(self, solver: str, first: PyTree, rows: Sequence[Columns], chart: Chart | None):
+        paths, self.structure = jtu.tree_flatten_with_path(first, is_leaf=is_field)
+        for path, part in paths:
+            if is_field(part) and not isinstance(part, AbstractSemilinearField | Rest):
+                raise TypeError(_has_no_linear_part(solver, jtu.keystr(path), part))
+        self.parts = [part for _, part in paths]
+        combinations = list(dict.fromkeys(terms for row in rows for _, terms in row))
+        self.coefficients = [_coefficients(part, combinations) for part in self.parts]
+        if chart is not None:
+            self.coefficients = [chart.constant(each) for each in self.coefficients]
+
+    def increment(self, row: Columns, changes: dict[int, PyTree]) -> PyTree:
+        """The sum over the columns of a row, of which each multiplies a change."""
+        flat = {j: self.structure.flatten_up_to(changes[j]) for j, _ in row}
+
+        def of_part(k: int, part: Any) -> PyTree:
+            coefficients = self.coefficients[k]
+            terms = [_times(part, coefficients[terms], flat[j][k]) for j, terms in row]
+            return jtu.tree_map(lambda *xs: functools.reduce(jnp.add, xs), *terms)
+
+        return self.structure.unflatten(of_part(k, part) for k, part in enumerate(self.parts))
+
+
+def _coefficients(part: Any, combinations: Sequence[Combination]) -> dict[Combination, Any]:
+    if not isinstance(part, AbstractSemilinearField):
+        # phi_k(0) is 1 / k!.
+        return {terms: float(sum(w / factorial(k) for k, _, w in terms)) for terms in combinations}
+    pairs = list(dict.fromkeys((float(c), k) for terms in combinations for k, c, _ in terms))
+    functions = dict(zip(pairs, part.functions(pairs), strict=True))
+
+    def combined(terms: Combination) -> Any:
+        used = [(float(w), functions[float(c), k]) for k, c, w in terms]
+        return jtu.tree_map(
+            lambda *xs: functools.reduce(jnp.add, (w * x for (w, _), x in zip(used, xs))),
+            *(function for _, function in used),
+        )
+
+    return {terms: combined(terms) for terms in combinations}
+
+
+def _times(part: Any, coefficient: Any, x: PyTree) -> PyTree:
+    if isinstance(part, AbstractSemilinearField):
+        return part.times(coefficient, x)
+    return jtu.tree_map(lambda x: coefficient * x, x)
+
+
+def _rest(field: PyTree, first: PyTree, point: PyTree) -> PyTree:
+    """The velocity less that of the linear part of the first field."""
+
+    def part(f: Any, first: Any, x: PyTree) -> PyTree:
+        if not is_field(f):
+            return f
+        return f.rest(first, x) if isinstance(f, AbstractSemilinearField) else f.tangent(x)
+
+    return jtu.tree_map(part, field, first, point, is_leaf=is_field)
+
+
+def _has_no_linear_part(solver: str, place: str, part: Any) -> str:
+    return (
+        f"{solver} takes fields x' = L x + g: cfjax.Affine, cfjax.LinearAffine, another "
+        f"cfjax.AbstractSemilinearField, or an array. For y{place} the field is "
+        f"{type(part).__name__}. Use a commutator-free method, for example cfjax.CF4()."
+    )
+
+
+class _Path(AbstractPath):
+    """The way of a step: the flow along a polynomial in time."""
+
+    solver: str = eqx.field(static=True)
+    first: PyTree
+    start: PyTree
+    velocity: PyTree
+    # Of g less its value at the start, the coefficients of the powers of the time from the first.
+    powers: list[PyTree]
+
+    def point(self, theta: Any) -> PyTree:
+        """The solution at a part `theta` of the step."""
+        theta = jnp.asarray(theta)
+        rows = [
+            (m, ((m, Fraction(1), Fraction(factorial(m - 1))),))
+            for m in range(1, 2 + len(self.powers))
+        ]
+        changes = {
+            m: combine([theta**m], [change])
+            for m, change in enumerate((self.velocity, *self.powers), 1)
+        }
+        first = combine([theta], [self.first])
+        linear = _LinearPart(self.solver, first, [tuple(rows)], None)
+        point = jtu.tree_map(jnp.add, self.start, linear.increment(tuple(rows), changes))
+        return from_chart(self.first, point)
+
+
+class ExponentialRungeKutta(AbstractExponential, diffrax.AbstractAdaptiveSolver):
+    """The exponential Runge-Kutta method of a `cfjax.ExponentialTableau`.
+
+    A step costs `tableau.num_evaluations` evaluations. Its order is `cfjax.order(tableau)`, its
+    stiff order `cfjax.stiff_order(tableau)`. Output within a step is that of the polynomial in time
+    which leads to its end.
+
+    It is a `diffrax.AbstractAdaptiveSolver` for every tableau, as its class does not depend on the
+    tableau. diffrax refuses adaptive steps if the tableau has no estimate.
+
+    **Raises** `TypeError` if `tableau` is not a `cfjax.ExponentialTableau`.
+    """
+
+    tableau: ExponentialTableau = eqx.field(static=True)
+
+    def __check_init__(self):
+        if not isinstance(self.tableau, ExponentialTableau):
+            raise TypeError(f"tableau must be a cfjax.ExponentialTableau, got {self.tableau!r}.")
+
+
+class ETDRK4(AbstractExponential):
+    """Cox & Matthews' method, for comparison: order 4, stiff order 2, 4 evaluations.
+
+    It has no estimate of the error. Dense output of order 3. `ETD43` has a stiff order of 4 for one
+    evaluation more.
+
+    Source: Cox & Matthews, Exponential time differencing for stiff systems, J. Comput. Phys. 176
+    (2002), doi:10.1006/jcph.2002.6995.
+    """
+
+    tableau: ClassVar[ExponentialTableau] = _exponential.ETDRK4
+
+
+class ETD43(AbstractExponential, diffrax.AbstractAdaptiveSolver):
+    """Order 4 and stiff order 4, with an embedded method of order 3: 5 evaluations.
+
+    Its estimate uses the field at the end, with which the next step begins. For stiff problems at
+    loose tolerances, and in two dimensions. Dense output of order 3.
+
+    Source: derived for this package, with the conditions of Hochbruck & Ostermann, Explicit
+    exponential Runge-Kutta methods for semilinear parabolic problems, SIAM J. Numer. Anal. 43
+    (2005), doi:10.1137/040611434.
+    """
+
+    tableau: ClassVar[ExponentialTableau] = _exponential.ETD43
+
+
+class ETD54(AbstractExponential, diffrax.AbstractAdaptiveSolver):
+    """Order 5 and stiff order 5, with an embedded method of order 4: 8 evaluations.
+
+    The choice for stiff semilinear problems. Dense output of order 4.
+
+    Source: derived for this package, with the conditions of Luan & Ostermann, Exponential B-series:
+    the stiff case, SIAM J. Numer. Anal. 51 (2013), doi:10.1137/130920204.
+    """
+
+    tableau: ClassVar[ExponentialTableau] = _exponential.ETD54
