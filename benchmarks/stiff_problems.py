@@ -189,7 +189,7 @@ def advection_diffusion() -> Problem:
         return inflow(t) - rate - slope(v)
 
     lift = np.asarray(w(1.0))
-    return dirichlet(1.0, 0.01, 1.0, np.zeros(n), g, counts=(20, 160), lift=lift)
+    return dirichlet(1.0, 0.01, 1.0, np.zeros(n), g, counts=(40, 160), lift=lift)
 
 
 def advection_diffusion_in_g() -> Problem:
@@ -201,7 +201,7 @@ def advection_diffusion_in_g() -> Problem:
     def g(t: Any, u: Any) -> Any:
         return (0.01 * (n + 1) ** 2 + (n + 1) / 2) * inflow(t) * first - slope(u)
 
-    return dirichlet(1.0, 0.01, 1.0, np.zeros(n), g, counts=(20, 160))
+    return dirichlet(1.0, 0.01, 1.0, np.zeros(n), g, counts=(40, 160))
 
 
 def slope(u: Any) -> Any:
@@ -365,7 +365,7 @@ def nonlinear_diffusion() -> Problem:
 
     def velocity(t: Any, u: Any, args: Any = None) -> Any:
         padded = jnp.pad(u, 1)
-        middle = 0.1 + ((padded[1:] + padded[:-1]) / 2) ** 2
+        middle = 1 + ((padded[1:] + padded[:-1]) / 2) ** 2
         return (n + 1) ** 2 * jnp.diff(middle * jnp.diff(padded)) + u - u**3
 
     def field(t: Any, u: Any, args: Any) -> cfjax.LinearAffine:
@@ -375,8 +375,8 @@ def nonlinear_diffusion() -> Problem:
     def as_it_is(u: Any) -> Any:
         return u
 
-    start = jnp.asarray(np.sin(np.pi * x) * (1 + x))
-    return Problem(0.5, start, field, as_it_is, as_it_is, velocity, (10, 40))
+    start = jnp.asarray(np.sin(np.pi * x))
+    return Problem(0.2, start, field, as_it_is, as_it_is, velocity, (20, 80))
 
 
 PROBLEMS: dict[str, Callable[[], Problem]] = {
