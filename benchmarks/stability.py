@@ -263,8 +263,9 @@ def _growth(solver: Any, exact: np.ndarray, explicit: np.ndarray) -> np.ndarray:
     def field(t, u, explicit):
         return cfjax.Affine(1.0, explicit * u, exact)
 
-    u0, explicit = jnp.ones_like(jnp.asarray(explicit)), jnp.asarray(explicit)
-    sol = cfjax.integrate(cfjax.LieTerm(field), solver, 0.0, 1.0, u0, explicit, num_steps=1)
+    w = jnp.asarray(explicit)
+    u0 = jnp.ones_like(w)
+    sol = cfjax.integrate(cfjax.LieTerm(field), solver, 0.0, 1.0, u0, w, num_steps=1)
     return np.abs(np.asarray(jax.tree.leaves(sol.ys)[0][-1]))
 
 

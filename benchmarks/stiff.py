@@ -23,6 +23,7 @@ import diffrax
 import jax
 import jax.numpy as jnp
 import numpy as np
+from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
 import cfjax
@@ -149,6 +150,7 @@ def with_equal_steps(problem: Problem, solver: Any) -> Callable:
     def solve(y0: Any, num_steps: Any) -> tuple:
         options = (num_steps, None, False, None, False)
         sol, _ = equal_steps(term, solver, t0, t1, y0, None, *options, throw=False)
+        assert sol.ys is not None
         return problem.values(sol.ys[-1]), num_steps, 0, True
 
     return solve
@@ -371,25 +373,27 @@ def draw() -> dict[str, Figure]:
     figure = _style.new_figure((13, 10.5))
     panels = dict(zip(PROBLEMS, figure.subplots(3, 4).flat, strict=True))
     for problem, axes in panels.items():
-        for program, (color, marker) in LOOKS.items():
+        for program in LOOKS:
             curve = results.pick(rows, problem=problem, program=program)
             # The fastest run, which other programs of the machine disturb least.
-            times, errors = [r["seconds"][0] for r in curve], [r["error"] for r in curve]
-            dashes = "--" if program.endswith(CONTROLLED) else "-"
-            style = dict(color=color, marker=marker, linestyle=dashes, markersize=5, linewidth=1)
-            axes.plot(times, errors, **style)
+            _line(axes, program, [r["seconds"][0] for r in curve], [r["error"] for r in curve])
         axes.set(title=problem, yscale="log")
         _style.logarithmic(axes, "time", unit="s")
         axes.title.set_fontsize(10)
-    for program, (color, marker) in LOOKS.items():
-        if results.pick(rows, program=program):
-            dashes = "--" if program.endswith(CONTROLLED) else "-"
-            style = dict(color=color, marker=marker, linestyle=dashes, markersize=5, linewidth=1)
-            figure.axes[0].plot([], [], label=NAMES.get(program, program), **style)
+    # The first panel has them all in the legend, with or without a curve.
+    for program in (name for name in LOOKS if results.pick(rows, program=name)):
+        _line(figure.axes[0], program, [], [], label=NAMES.get(program, program))
     for axes in figure.axes[::4]:
         axes.set(ylabel="relative error at the end")
     _style.finish(figure, columns=5)
     return {"stiff": figure}
+
+
+def _line(axes: Axes, program: str, times: list, errors: list, label: str | None = None) -> None:
+    color, marker = LOOKS[program]
+    dashes = "--" if program.endswith(CONTROLLED) else "-"
+    look: dict[str, Any] = dict(color=color, marker=marker, linestyle=dashes, label=label)
+    axes.plot(times, errors, markersize=5, linewidth=1, **look)
 
 
 if __name__ == "__main__":
