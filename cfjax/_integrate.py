@@ -1,6 +1,7 @@
 """Integration with a fixed number of steps, as one compiled loop."""
 
 import typing
+from collections.abc import Callable
 from typing import Any, cast
 
 import diffrax
@@ -205,25 +206,26 @@ def equal_steps(
     zero = (fault.error if throw else fault.nan)(jnp.zeros((), t0.dtype))
     start, t1 = needing(zero, (y0, t1))
     carry = (n, start, solver_state, diffrax.RESULTS.successful)
+    forward: Callable[[Any], Any] = step
     if hasattr(solver, "for_equal_steps"):
         solver = cast(Any, solver).for_equal_steps((t1 - t0) / intervals)
-        step = invariants_first(step, carry)
+        forward = invariants_first(step, carry)
 
     # Of a few steps the derivative takes longer to compile than it will ever save.
     order = 0 if isinstance(num_steps, int) and num_steps < _FEW else 1
 
     def advance(carry, number):
         if step_back:
-            return repeat_and_undo(step, lambda carry: step(carry, -1), carry, number, throw)
+            return repeat_and_undo(forward, lambda carry: step(carry, -1), carry, number, throw)
         # XLA would scalarise a loop of one turn, and compute the step anew for each of its uses.
         if isinstance(number, int) and number == 1:
-            return step(carry)
+            return forward(carry)
         if checkpoint_every is None:
-            return repeat(step, carry, number, order=order)[0]
+            return repeat(forward, carry, number, order=order)[0]
         length, rest = checkpoint_every, number % checkpoint_every
-        block = jax.checkpoint(lambda carry, _: (repeat(step, carry, length, order=order)[0], None))
-        carry, _ = lax.scan(block, carry, length=number // length)
-        return repeat(step, carry, rest, order=order)[0]
+        block = jax.checkpoint(lambda carry: repeat(forward, carry, length, order=order)[0])
+        carry, _ = lax.scan(lambda x, _: (block(x), None), carry, length=number // length)
+        return repeat(forward, carry, rest, order=order)[0]
 
     def steps_and_save(carry, _):
         carry = advance(carry, length if save_every is None else save_every)
@@ -231,7 +233,7 @@ def equal_steps(
 
     num_saves: Any = 1 if save_every is None else num_steps // save_every
     if save_every == 1 and num_saves > 1 and not step_back:
-        carry, ys = repeat(step, carry, num_saves, lambda carry: carry[1], order)
+        carry, ys = repeat(forward, carry, num_saves, lambda carry: carry[1], order)
     else:
         carry, ys = lax.scan(steps_and_save, carry, length=num_saves)
     ts = time(

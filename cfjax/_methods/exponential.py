@@ -8,8 +8,6 @@ from math import factorial, prod
 from numbers import Rational
 from typing import Any
 
-from .coefficients import Row
-
 # `sum_i weight_i phi_(k_i)(c_i z)`, with terms (k, c, weight).
 Combination = tuple[tuple[int, F, F], ...]
 # Of column j. The first column follows from the others.
@@ -48,7 +46,7 @@ class ExponentialTableau:
     method is implicit, or a function is not one of `phi_1` to `phi_5`.
     """
 
-    c: Row
+    c: tuple[F, ...]
     a: tuple[Columns, ...]
     b: Columns
     error: Columns | None
@@ -156,7 +154,7 @@ def _mapping(terms: Combination) -> dict[tuple[int, F], F]:
 def _rational(name: str, value: Any) -> F:
     if isinstance(value, bool) or not isinstance(value, Rational):
         raise TypeError(f"{name} must be an int or a Fraction, got {value!r}.")
-    return F(value.numerator, value.denominator)
+    return F(value)
 
 
 def _divided_difference(nodes: Mapping[int, F], factor: Mapping[int, F]) -> dict[int, dict[int, F]]:

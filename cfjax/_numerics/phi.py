@@ -4,6 +4,7 @@
 """
 
 import functools
+import operator
 from collections.abc import Callable, Sequence
 from math import factorial
 
@@ -63,12 +64,14 @@ def phi(k: int, z: Inexact[Array | np.ndarray, "*batch"]) -> Inexact[Array, "*ba
     return phi_1(z) if k == 1 else phis(z, int(k), once=lambda x: x)[k]
 
 
+def _once(arrays: list[Array]) -> list[Array]:
+    return materialised_in_rows(arrays, alone=True)
+
+
 def phis(
     z: Inexact[Array, "*batch"],
     most: int,
-    once: Callable[[list[Array]], list[Array]] = functools.partial(
-        materialised_in_rows, alone=True
-    ),
+    once: Callable[[list[Array]], list[Array]] = _once,
 ) -> list[Inexact[Array, "*batch"]]:
     """`phi_0(z)` to `phi_most(z)`. XLA would compute what goes through `once` for each of them."""
     if most == 0:
@@ -84,7 +87,7 @@ def phis(
     for k in range(1, most + 1):
         # phi_k(2 w), in which all terms are positive for real w.
         terms = (inner[j - 1] * (1 / factorial(k - j)) for j in range(1, k + 1))
-        doubled = sum(terms, start=of_half * inner[k - 1]) * 0.5**k
+        doubled = functools.reduce(jnp.add, terms, of_half * inner[k - 1]) * 0.5**k
         found.append(jnp.where(is_small, doubled, outer))
         outer = (outer - 1 / factorial(k)) / jnp.where(is_small, 1, z)
     return found
@@ -239,16 +242,17 @@ def matrix_phis(
 def _matrix_phis(a: Array, most: int) -> tuple[Array, ...]:
     def approximate(_: int, a: Array, a2: Array) -> tuple[Array, ...]:
         # The series of phi_most in powers of a^4 (Paterson & Stockmeyer), then downwards.
-        powers = [jnp.eye(len(a), dtype=a.dtype), a, a2, small_product(a2, a)]
+        one = jnp.eye(len(a), dtype=a.dtype)
+        powers = [one, a, a2, small_product(a2, a)]
         a4 = small_product(a2, a2)
         top = jnp.zeros_like(a)
         for block in reversed(range(5)):
             weights = [1 / factorial(4 * block + r + most) for r in range(4)]
-            row = sum(w * x for w, x in zip(weights, powers, strict=True))
+            row = functools.reduce(jnp.add, map(operator.mul, weights, powers))
             top = row if block == 4 else small_product(a4, top) + row
         found = [top]
         for k in range(most, 0, -1):
-            found.insert(0, small_product(a, found[0]) + powers[0] * (1 / factorial(k - 1)))
+            found.insert(0, small_product(a, found[0]) + one * (1 / factorial(k - 1)))
         return tuple(found)
 
     second = small_product(a, a)
@@ -261,5 +265,5 @@ def _doubled_phis(phis: tuple[Array, ...]) -> tuple[Array, ...]:
     doubled = [small_product(e, e)]
     for k in range(1, len(phis)):
         terms = (phis[j] * (1 / factorial(k - j)) for j in range(1, k + 1))
-        doubled.append(sum(terms, start=small_product(e, phis[k])) * 0.5**k)
+        doubled.append(functools.reduce(jnp.add, terms, small_product(e, phis[k])) * 0.5**k)
     return tuple(doubled)

@@ -142,7 +142,7 @@ class AbstractChartSolver(AbstractLieSolver):
         """Two times that are as far apart as the ends of the step."""
         return t0, t1
 
-    def extended(self, path: AbstractPath, field: Callable[[Any, PyTree], PyTree]) -> AbstractPath:
+    def extended(self, path: Any, field: Callable[[Any, PyTree], PyTree]) -> AbstractPath:
         """The way of a step with what only output within it takes.
 
         `field(c, y)` is `h f(t + c h, y)`. Apart from `step_in`, which is compiled whether anybody

@@ -72,7 +72,7 @@ class AbstractExponential(AbstractChartSolver):
             )
         return self
 
-    def for_equal_steps(self, length: Real[Array, ""]) -> "AbstractExponential":
+    def for_equal_steps(self, length: Real[Array, ""]) -> Any:
         """The same method for steps of this length alone."""
         return self._with(equal_length=length)
 
@@ -121,7 +121,7 @@ class AbstractExponential(AbstractChartSolver):
     def _rows(self) -> list[Columns]:
         """With the coefficient of the velocity as the first column: stages from 2 on, the end."""
         tableau = self.tableau
-        ends = zip((*tableau.c[1:], 1), (*tableau.a[1:], tableau.b), strict=True)
+        ends = zip((*tableau.c[1:], Fraction(1)), (*tableau.a[1:], tableau.b), strict=True)
         return [((1, ((1, c, c),)), *row) for c, row in ends]
 
 
@@ -146,9 +146,13 @@ class _LinearPart:
         def of_part(k: int, part: Any) -> PyTree:
             coefficients = self.coefficients[k]
             terms = [_times(part, coefficients[terms], flat[j][k]) for j, terms in row]
-            return jtu.tree_map(lambda *xs: functools.reduce(jnp.add, xs), *terms)
+            return _sum(terms)
 
         return self.structure.unflatten(of_part(k, part) for k, part in enumerate(self.parts))
+
+
+def _sum(trees: Sequence[PyTree]) -> PyTree:
+    return functools.reduce(lambda a, b: jtu.tree_map(jnp.add, a, b), trees)
 
 
 def _coefficients(part: Any, combinations: Sequence[Combination]) -> dict[Combination, Any]:
@@ -160,10 +164,7 @@ def _coefficients(part: Any, combinations: Sequence[Combination]) -> dict[Combin
 
     def combined(terms: Combination) -> Any:
         used = [(float(w), functions[float(c), k]) for k, c, w in terms]
-        return jtu.tree_map(
-            lambda *xs: functools.reduce(jnp.add, (w * x for (w, _), x in zip(used, xs))),
-            *(function for _, function in used),
-        )
+        return _sum([jtu.tree_map(lambda x: w * x, function) for w, function in used])  # noqa: B023
 
     return {terms: combined(terms) for terms in combinations}
 
@@ -206,17 +207,14 @@ class _Path(AbstractPath):
     def point(self, theta: Any) -> PyTree:
         """The solution at a part `theta` of the step."""
         theta = jnp.asarray(theta)
-        rows = [
-            (m, ((m, Fraction(1), Fraction(factorial(m - 1))),))
-            for m in range(1, 2 + len(self.powers))
-        ]
         changes = {
             m: combine([theta**m], [change])
             for m, change in enumerate((self.velocity, *self.powers), 1)
         }
-        first = combine([theta], [self.first])
-        linear = _LinearPart(self.solver, first, [tuple(rows)], None)
-        point = jtu.tree_map(jnp.add, self.start, linear.increment(tuple(rows), changes))
+        # The flow of s^(m-1) is (m-1)! phi_m.
+        row = tuple((m, ((m, Fraction(1), Fraction(factorial(m - 1))),)) for m in changes)
+        linear = _LinearPart(self.solver, combine([theta], [self.first]), [row], None)
+        point = jtu.tree_map(jnp.add, self.start, linear.increment(row, changes))
         return from_chart(self.first, point)
 
 

@@ -268,7 +268,7 @@ class RKMK(AbstractMuntheKaas, diffrax.AbstractAdaptiveSolver):
             elements.append(dexpinv(u, chart.frozen_after(elements, c, here), self._degree))
         return elements
 
-    def extended(self, path, field):
+    def extended(self, path: Any, field: Callable[[Any, PyTree], PyTree]):
         n = len(self.b)
         _, rows, times = self._extension
         if not rows:
