@@ -275,7 +275,7 @@ def stiff_explicit_part(axes: Axes) -> None:
     axes.axhline(1, color="0.5", linewidth=1, linestyle=":")
     axes.set(
         title="u' = (z + w) u, z < 0 exact and w = r |z| explicit:\nlargest growth of a step",
-        xlabel="r: how much more damping is explicit",
+        xlabel="r: the explicit part over |z|, damping where negative",
         ylabel="largest |R| for |z| from 1 to 10 000",
         ylim=(1e-2, 1e4),
     )
