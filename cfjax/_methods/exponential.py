@@ -55,8 +55,8 @@ class ExponentialTableau:
         self,
         c: Iterable[Any],
         a: Mapping[int, Mapping[int, Mapping[Any, Any]]],
-        b: Mapping[int, Mapping[int, Any]],
-        error: Mapping[int, Mapping[int, Any]] | None = None,
+        b: Mapping[int, Mapping[Any, Any]],
+        error: Mapping[int, Mapping[Any, Any]] | None = None,
     ) -> None:
         nodes = tuple(_rational(f"c[{i}]", x) for i, x in enumerate(c, 1))
         s = len(nodes)

@@ -1,6 +1,6 @@
 """What is the same in every turn of a loop, computed once, before it."""
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from typing import Any
 
 import jax
@@ -9,39 +9,43 @@ from jax.ad_checkpoint import checkpoint_name
 from jax.extend.core import ClosedJaxpr, jaxpr_as_fun
 from jaxtyping import PyTree
 
-from .jaxprs import altered, narrowed, without_dead_code
-
-_NAME = "cfjax_invariant"
+from .jaxprs import altered, narrowed, variables, without_dead_code
+from .understood import INVARIANT, is_invariant
 
 
 def invariant(tree: PyTree) -> PyTree:
-    """The same arrays, marked. Where they are the same in every turn of a loop, and
+    """The same tree, its arrays marked. Where they are the same in every turn of a loop, and
     `invariants_first` knows of it, they are computed before it.
+
+    A program with marks is not scalarised: these are arrays that much is made of, such as functions
+    of an operator, and it would be long.
     """
-    return jtu.tree_map(lambda x: checkpoint_name(x, _NAME), tree)
+    return jtu.tree_map(
+        lambda x: checkpoint_name(x, INVARIANT) if isinstance(x, jax.Array) else x, tree
+    )
 
 
 def invariants_first(turn: Callable[[PyTree], PyTree], carry: PyTree) -> Callable[[PyTree], PyTree]:
     """`turn`, for a loop over carries like this one, with all that is marked computed here.
 
     That is, all of it that does not depend on the carry. XLA leaves such values in the loop, and
-    reverse mode would store or compute them for each turn. No operation changes; only where it
-    stands does.
+    reverse mode would store them for each turn. No operation changes; only where it stands does.
     """
-    leaves, structure = jtu.tree_flatten(carry)
+    _, structure = jtu.tree_flatten(carry)
     program, shapes = jax.make_jaxpr(turn, return_shape=True)(carry)
     jaxpr = program.jaxpr
-    marks = [eqn for eqn in jaxpr.eqns if eqn.params.get("name") == _NAME]
-    marked = [v for eqn in marks for v in eqn.outvars]
+    marked = variables(eqn.invars[0] for eqn in jaxpr.eqns if is_invariant(eqn))
 
-    def of_marks(vs: list[Any]) -> tuple[ClosedJaxpr, Any]:
+    def computing(vs: list[Any]) -> tuple[ClosedJaxpr, Sequence[int]]:
         return narrowed(ClosedJaxpr(altered(jaxpr, outvars=vs), program.consts))
 
-    fixed = [v for v in marked if not of_marks([v])[1]]
+    # Those that need nothing of the carry.
+    fixed = [v for v in dict.fromkeys(marked) if not computing([v])[1]]
     if not fixed:
         return turn
-    before, _ = of_marks(fixed)
-    values = jaxpr_as_fun(before)()
+    before, _ = computing(fixed)
+    # As one program, where nothing else is one.
+    values = jax.jit(jaxpr_as_fun(before))()
     done = set(fixed)
     rest = altered(
         jaxpr,
@@ -49,10 +53,5 @@ def invariants_first(turn: Callable[[PyTree], PyTree], carry: PyTree) -> Callabl
         eqns=[eqn for eqn in jaxpr.eqns if done.isdisjoint(eqn.outvars)],
     )
     run = jaxpr_as_fun(ClosedJaxpr(without_dead_code(rest), [*program.consts, *values]))
-    ends = jtu.tree_structure(shapes)
-    del leaves
-
-    def turned(carry: PyTree) -> PyTree:
-        return ends.unflatten(run(*structure.flatten_up_to(carry)))
-
-    return turned
+    end = jtu.tree_structure(shapes)
+    return lambda carry: end.unflatten(run(*structure.flatten_up_to(carry)))

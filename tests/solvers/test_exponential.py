@@ -1,0 +1,607 @@
+"""Exponential Runge-Kutta methods: one step against an interpreter of their tableaus, stiff orders.
+
+Orders are proved in methods/test_stiff_order.py.
+"""
+
+import functools
+from fractions import Fraction
+from math import factorial
+from typing import Any
+
+import diffrax
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+import scipy.linalg
+from problems import QUICK
+
+import cfjax
+
+KROGSTAD = cfjax.ExponentialTableau(
+    c=[0, Fraction(1, 2), Fraction(1, 2), 1],
+    a={3: {2: {2: 1}}, 4: {3: {2: 2}}},
+    b={2: {2: 2, 3: -4}, 3: {2: 2, 3: -4}, 4: {2: -1, 3: 4}},
+)
+SOLVERS: dict[str, Any] = {
+    "ETDRK4": cfjax.ETDRK4(),
+    "ETD43": cfjax.ETD43(),
+    "ETD54": cfjax.ETD54(),
+    "Krogstad": cfjax.ExponentialRungeKutta(KROGSTAD),
+}
+T0, H, THETA = 0.3, 0.25, 0.4
+
+
+# One step, of a state of all kinds of parts.
+
+
+N = 5
+DENSE = np.random.default_rng(0).normal(size=(N, N)) - 4 * np.eye(N)
+SINE = cfjax.SineTransform()
+SPECTRUM = 6.0**2 * SINE.second_difference(N)
+SECOND = 36.0 * (np.eye(N, k=1) - 2 * np.eye(N) + np.eye(N, k=-1))
+
+
+def coefficients(xp, t, y):
+    """Matrices that vary in time and state, and what else there is in the velocity."""
+    mixed = xp.sum(y["dense"]) * xp.sin(y["grid"]) + xp.cos(3 * t)
+    return (
+        (1 + 0.2 * xp.sin(t) + 0.1 * y["plain"][0]) * DENSE,
+        xp.cos(t + y["dense"]) + y["plain"],
+        1 + 0.3 * xp.cos(t) * y["dense"][0],
+        mixed,
+        -(y["plain"] ** 2) + y["grid"],
+    )
+
+
+def mixed_field(t, y, args):
+    del args
+    a, b, alpha, g, velocity = coefficients(jnp, t, y)
+    return {
+        "dense": cfjax.LinearAffine(a, b),
+        "grid": cfjax.Affine(alpha, g, SPECTRUM, SINE),
+        "plain": velocity,
+        "rest": None,
+    }
+
+
+START = {
+    "dense": np.linspace(-1.0, 1.0, N),
+    "grid": np.sin(np.arange(1.0, N + 1)),
+    "plain": np.cos(np.arange(N)),
+    "rest": np.ones(2),
+}
+
+
+def phi(k, a):
+    """From the exponential of a block matrix (Sidje 1998)."""
+    n = len(a)
+    blocks = np.eye((k + 1) * n, k=n)
+    blocks[:n] = 0
+    blocks[:n, :n] = a
+    if k:
+        blocks[:n, n : 2 * n] = np.eye(n)
+    return scipy.linalg.expm(blocks)[:n, k * n :]
+
+
+def interpreted(tableau, theta=THETA):
+    """The end of a step in NumPy, its estimate, and the point at a part of it."""
+    names = ["dense", "grid", "plain"]
+
+    def parts(u):
+        return dict(zip(names, np.split(u, 3), strict=True)) | {"rest": START["rest"]}
+
+    def linear(t, u):
+        a, _, alpha, *_ = coefficients(np, t, parts(u))
+        return scipy.linalg.block_diag(a, alpha * SECOND, np.zeros((N, N)))
+
+    def velocity(t, u):
+        y = parts(u)
+        a, b, alpha, g, plain = coefficients(np, t, y)
+        return np.concatenate([a @ y["dense"] + b, alpha * SECOND @ y["grid"] + g, plain])
+
+    u = np.concatenate([START[name] for name in names])
+    first = linear(T0, u)
+
+    def function(terms, scale=1.0):
+        return sum(float(w) * phi(k, float(c) * scale * H * first) for k, c, w in terms)
+
+    def g(t, u):
+        return velocity(t, u) - first @ u
+
+    stages = [g(T0, u)]
+
+    def changes(columns):
+        return sum(
+            (H * function(terms) @ (stages[j - 1] - stages[0]) for j, terms in columns),
+            np.zeros_like(u),
+        )
+
+    def flow(c):
+        """Of the first g alone."""
+        return phi(0, c * H * first) @ u + c * H * phi(1, c * H * first) @ stages[0]
+
+    for c, columns in list(zip(map(float, tableau.c), tableau.a, strict=True))[1:]:
+        stages.append(g(T0 + c * H, flow(c) + changes(columns)))
+    end = flow(1.0) + changes(tableau.b)
+    stages.append(g(T0 + H, end))
+    error = changes(tableau.error or ())
+    within = flow(theta)
+    for m, weights in enumerate(tableau.powers, 1):
+        power = sum(float(w) * (stages[j - 1] - stages[0]) for j, w in weights)
+        kernel = theta ** (m + 1) * factorial(m) * H * phi(m + 1, theta * H * first)
+        within = within + kernel @ power
+    return tuple(map(parts, (end, error, within)))
+
+
+@pytest.mark.parametrize("name", SOLVERS)
+def test_one_step(name):
+    solver = SOLVERS[name]
+    term, y0 = cfjax.LieTerm(mixed_field), jax.tree.map(jnp.asarray, START)
+
+    def step(y0):
+        state = solver.init(term, T0, T0 + H, y0, None)
+        y1, error, dense, _, result = solver.step(term, T0, T0 + H, y0, None, state, False)
+        within = solver.interpolation_cls(t0=T0, t1=T0 + H, **dense).evaluate(T0 + THETA * H)
+        assert result is diffrax.RESULTS.successful or result is not None
+        return y1, error, within
+
+    found = jax.jit(step).lower(y0).compile(QUICK)(y0)
+    for got, expected in zip(found, interpreted(solver.tableau), strict=True):
+        if got is None:
+            continue
+        for part in ("dense", "grid", "plain"):
+            # Coefficients of up to 274 with alternating signs, of functions right to rounding.
+            np.testing.assert_allclose(got[part], expected[part], rtol=0, atol=2e-13)
+    np.testing.assert_array_equal(found[0]["rest"], START["rest"])
+
+
+# Stiff orders, where g does not vanish at the boundary. The exact solution is a parabola in x, for
+# which differences are exact (Hochbruck & Ostermann 2005, Section 6).
+
+
+POINTS = 199
+X = np.arange(1, POINTS + 1) / (POINTS + 1)
+STIFF = (POINTS + 1) ** 2 * SINE.second_difference(POINTS)
+PARABOLA = X * (1 - X)
+
+
+def local(t, u, xp=jnp):
+    exact = PARABOLA * xp.exp(t)
+    return 1 / (1 + u**2) + exact + 2 * xp.exp(t) - 1 / (1 + exact**2)
+
+
+def integral(t, u):
+    mean = np.mean(PARABOLA) * POINTS / (POINTS + 1)
+    return jnp.sum(u) / (POINTS + 1) + (PARABOLA + 2 - mean) * jnp.exp(t)
+
+
+PROBLEMS = {"local": local, "integral": integral}
+
+
+def term_of(g):
+    return cfjax.LieTerm(lambda t, u, args: cfjax.Affine(1.0, g(t, u), STIFF, SINE))
+
+
+def errors(g, solver, counts):
+    def error(num_steps):
+        term = term_of(g)
+        end = cfjax.integrate(term, solver, 0.0, 1.0, jnp.asarray(PARABOLA), num_steps=num_steps)
+        return jnp.max(jnp.abs(end.ys[-1] - PARABOLA * np.exp(1)))
+
+    program = jax.jit(error)
+    return [float(program(n)) for n in counts]
+
+
+@pytest.mark.representatives(3)
+@pytest.mark.parametrize(
+    "solver, least, most",
+    [
+        (cfjax.CF4(), 1.8, 2.2),
+        # Between its stiff order and the 3 of stages whose errors are smooth.
+        (cfjax.ETDRK4(), 1.7, 2.9),
+        (cfjax.ETD43(), 3.6, 4.5),
+        (cfjax.ETD54(), 4.4, 5.6),
+    ],
+)
+@pytest.mark.parametrize("name", PROBLEMS)
+def test_stiff_order(name, solver, least, most):
+    """From both sides. The largest eigenvalue times a step is 16 000 at first, and 2000 at last."""
+    coarse, fine = errors(PROBLEMS[name], solver, [10, 80])
+    assert least < np.log2(coarse / fine) / 3 < most
+
+
+# Orders without stiffness, on problems with a reference in plain space.
+
+
+def nls(t, c, args):
+    """Schrödinger's equation with a potential and a cubic term, in coefficients."""
+    del t, args
+    n = len(c)
+    x = 2 * np.pi * np.arange(n) / n
+    k = np.fft.fftfreq(n, 1 / n)
+    u = jnp.fft.ifft(c, norm="ortho")
+    g = jnp.fft.fft(-1j * (np.cos(x) - jnp.abs(u) ** 2) * u, norm="ortho")
+    return cfjax.Affine(1.0, g, -1j * k**2)
+
+
+def burgers(t, c, args):
+    del t, args
+    n = 2 * (len(c) - 1)
+    k = np.arange(n // 2 + 1.0)
+    u = jnp.fft.irfft(c, n)
+    return cfjax.Affine(1.0, -0.5j * k * jnp.fft.rfft(u**2), -0.1 * k**2)
+
+
+def wave(n):
+    x = 2 * np.pi * np.arange(n) / n
+    return np.fft.fft(np.exp(np.sin(x)) / 2, norm="ortho")
+
+
+SMOOTH = {
+    "nls": (nls, wave(16)),
+    "burgers": (burgers, np.fft.rfft(np.exp(np.sin(2 * np.pi * np.arange(32) / 32)) / 2)),
+}
+
+
+@pytest.mark.slow
+@pytest.mark.filterwarnings("ignore:Complex dtype support in Diffrax")
+@pytest.mark.parametrize("solver, order", [("ETDRK4", 4), ("ETD43", 4), ("ETD54", 5)])
+@pytest.mark.parametrize("name", SMOOTH)
+def test_classical_order(name, solver, order):
+    field, y0 = SMOOTH[name]
+    y0 = jnp.asarray(y0)
+    plain = diffrax.ODETerm(lambda t, y, args: cfjax.tangent(field(t, y, args), y))
+    control = diffrax.PIDController(rtol=1e-12, atol=1e-13)
+    reference = diffrax.diffeqsolve(
+        plain, diffrax.Dopri8(), 0.0, 1.0, 1e-3, y0, stepsize_controller=control, max_steps=20_000
+    ).ys[-1]
+
+    def error(num_steps):
+        end = cfjax.integrate(
+            cfjax.LieTerm(field), SOLVERS[solver], 0.0, 1.0, y0, num_steps=num_steps
+        )
+        return jnp.linalg.norm(end.ys[-1] - reference)
+
+    program = jax.jit(error)
+    coarse, fine = (float(program(n)) for n in (20, 80))
+    # Half an order on both sides, as between steps that are not yet short.
+    assert order - 0.5 < np.log2(coarse / fine) / 2 < order + 0.7
+
+
+@functools.cache
+def defective():
+    """One Jordan block, which has one eigenvector."""
+    return -3 * np.eye(50) + 4 * np.eye(50, k=1)
+
+
+def test_a_defective_matrix():
+    """With g of degree 3 in time, which ETD54 integrates exactly."""
+    a = defective()
+    g = np.random.default_rng(1).normal(size=(4, 50))
+    end = cfjax.integrate(
+        cfjax.LieTerm(
+            lambda t, u, args: cfjax.LinearAffine(a, jnp.polyval(g[::-1], t, unroll=8) + 0 * u)
+        ),
+        cfjax.ETD54(),
+        0.0,
+        2.0,
+        jnp.ones(50),
+        num_steps=2,
+    ).ys[-1]
+    # x' = a x + g(t), t' = 1 and its powers, as one linear system.
+    size = 54
+    whole = np.zeros((size, size))
+    whole[:50, :50], whole[:50, 50:] = a, g.T
+    for k in range(1, 4):
+        whole[50 + k, 50 + k - 1] = k
+    start = np.concatenate([np.ones(50), [1.0, 0, 0, 0]])
+    exact = (scipy.linalg.expm(2 * whole) @ start)[:50]
+    # The norm of the exponential is some 5, that of its block matrix 400.
+    np.testing.assert_allclose(end, exact, rtol=0, atol=1e-12 * np.abs(exact).max())
+
+
+# What equal steps compute once.
+
+
+def loop_operations(term, y0, num_steps=10):
+    """The operations in the body of the loop."""
+    program = jax.make_jaxpr(
+        lambda y0: cfjax.integrate(term, cfjax.ETD54(), 0.0, 1.0, y0, num_steps=num_steps).ys
+    )(y0)
+    found = set()
+
+    def visit(jaxpr, is_inside):
+        for eqn in jaxpr.eqns:
+            if is_inside:
+                found.add(eqn.primitive.name)
+            for inner in jax.extend.core.jaxprs_in_params(eqn.params):
+                inside = is_inside or (
+                    eqn.primitive.name == "scan" and eqn.params["length"] == num_steps
+                )
+                visit(inner, inside)
+
+    visit(program.jaxpr, False)
+    return found
+
+
+def test_equal_steps_compute_functions_once():
+    y0 = jnp.asarray(PARABOLA)
+    # The field itself has an exponential, of the time.
+    term = cfjax.LieTerm(lambda t, u, args: cfjax.Affine(1.0, u - u**3 + t, STIFF, SINE))
+    found = loop_operations(term, y0)
+    assert "mul" in found
+    assert not {"exp", "expm1"} & found
+    varying = cfjax.LieTerm(lambda t, u, args: cfjax.Affine(1.0 + t, u - u**3, STIFF, SINE))
+    assert "expm1" in loop_operations(varying, y0)
+
+
+def test_reverse_mode_does_not_keep_functions():
+    """A step more takes the room of a state, and not that of 23 functions."""
+
+    def room(num_steps):
+        def loss(nu):
+            term = cfjax.LieTerm(lambda t, u, nu: cfjax.Affine(1.0, u - u**3, nu * STIFF, SINE))
+            sol = cfjax.integrate(
+                term, cfjax.ETD54(), 0.0, 1.0, jnp.asarray(PARABOLA), nu, num_steps=num_steps
+            )
+            return jnp.sum(sol.ys[-1])
+
+        compiled = jax.jit(jax.grad(loss)).lower(1.0).compile(QUICK)
+        return compiled.memory_analysis().temp_size_in_bytes
+
+    # With time, number and result beside it.
+    assert (room(300) - room(100)) / 200 < 1.2 * 8 * POINTS
+
+
+@pytest.mark.slow
+def test_a_linear_part_that_jumps():
+    """alpha doubles half way, at the end of a step: functions may not be those of before."""
+    y0 = jnp.asarray(PARABOLA)
+
+    def field(t, u, args):
+        alpha = jnp.where(t < 0.5, 0.01, 0.02)
+        return cfjax.Affine(alpha, u - u**3, STIFF, SINE)
+
+    end = cfjax.integrate(cfjax.LieTerm(field), cfjax.ETD54(), 0.0, 1.0, y0, num_steps=40).ys[-1]
+
+    def half(alpha, y):
+        term = cfjax.LieTerm(lambda t, u, args: cfjax.Affine(alpha, u - u**3, STIFF, SINE))
+        return cfjax.integrate(term, cfjax.ETD54(), 0.0, 0.5, y, num_steps=80).ys[-1]
+
+    # Stages before the jump see the old alpha, in one step at the end alone. The error of the
+    # method is some 1e-9.
+    np.testing.assert_allclose(end, half(0.02, half(0.01, y0)), rtol=0, atol=1e-6)
+
+
+# Controlled steps.
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("solver", [cfjax.ETD43(), cfjax.ETD54()])
+@pytest.mark.parametrize("name", PROBLEMS)
+@pytest.mark.parametrize("tol", [1e-4, 1e-7])
+def test_error_over_tolerance(name, solver, tol):
+    term, y0 = term_of(PROBLEMS[name]), jnp.asarray(PARABOLA)
+    sol = diffrax.diffeqsolve(
+        term,
+        solver,
+        0.0,
+        1.0,
+        0.01,
+        y0,
+        stepsize_controller=diffrax.PIDController(rtol=tol, atol=tol),
+        saveat=diffrax.SaveAt(ts=jnp.array([0.37, 1.0])),
+    )
+    exact = PARABOLA * np.exp(np.array([[0.37], [1.0]]))
+    error = np.abs(np.asarray(sol.ys) - exact).max(axis=1) / tol
+    # Neither blind nor wasteful; output within a step is of an order less.
+    assert 1e-3 < error[1] < 25
+    assert error[0] < 25
+
+
+@pytest.mark.parametrize("solver, number", [(cfjax.ETD43(), 5), (cfjax.ETD54(), 8)])
+def test_evaluations_of_a_step(solver, number):
+    """With the estimate, whose last evaluation is the first one of the next step."""
+    calls = []
+
+    def field(t, u, args):
+        calls.append(t)
+        return cfjax.Affine(1.0, jnp.sin(u), SPECTRUM, SINE)
+
+    term, y0 = cfjax.LieTerm(field), jnp.ones(N)
+    state = jax.eval_shape(lambda: solver.init(term, 0.0, 0.1, y0, None))
+    state = jax.tree.map(lambda x: jnp.zeros(x.shape, x.dtype), state)
+    calls.clear()
+    jax.eval_shape(lambda: solver.step(term, 0.0, 0.1, y0, None, state, made_jump=False))
+    assert len(calls) == number
+
+
+# Derivatives.
+
+
+@pytest.mark.slow
+def test_gradients_against_the_variational_equation():
+    """Of the end by the diffusivity and the start, in both modes, also of controlled steps."""
+    n = 15
+    x = np.arange(1, n + 1) / (n + 1)
+    second = (n + 1) ** 2 * (np.eye(n, k=1) - 2 * np.eye(n) + np.eye(n, k=-1))
+    spectrum = (n + 1) ** 2 * SINE.second_difference(n)
+    y0, nu, direction = np.sin(np.pi * x), 0.05, np.cos(3 * x)
+
+    def g(t, u):
+        return u - u**3 + np.cos(x) * t
+
+    def rate(t, both, args):
+        u, s = both
+        moved = second @ u + nu * second @ s + (1 - 3 * u**2) * s
+        return nu * second @ u + g(t, u), moved
+
+    control = diffrax.PIDController(rtol=1e-11, atol=1e-12)
+    _, exact = diffrax.diffeqsolve(
+        diffrax.ODETerm(rate),
+        diffrax.Dopri8(),
+        0.0,
+        1.0,
+        1e-3,
+        (jnp.asarray(y0), jnp.asarray(direction)),
+        stepsize_controller=control,
+        max_steps=20_000,
+    ).ys
+
+    def end(nu, y0, controlled):
+        term = cfjax.LieTerm(lambda t, u, nu: cfjax.Affine(1.0, g(t, u), nu * spectrum, SINE))
+        if not controlled:
+            return cfjax.integrate(term, cfjax.ETD54(), 0.0, 1.0, y0, nu, num_steps=40).ys[-1]
+        control = diffrax.PIDController(rtol=1e-9, atol=1e-10)
+        return diffrax.diffeqsolve(
+            term, cfjax.ETD54(), 0.0, 1.0, 0.01, y0, nu, stepsize_controller=control
+        ).ys[-1]
+
+    weights = jnp.arange(1.0, n + 1)
+    expected = float(weights @ exact[-1])
+    for controlled in (False, True):
+        of_nu, of_start = jax.jit(
+            jax.grad(lambda *args: weights @ end(*args, controlled), argnums=(0, 1))  # noqa: B023
+        )(nu, jnp.asarray(y0))
+        assert float(of_nu + of_start @ direction) == pytest.approx(expected, rel=1e-6)
+    forward = jax.jvp(
+        lambda *args: weights @ end(*args, False),
+        (nu, jnp.asarray(y0)),
+        (1.0, jnp.asarray(direction)),
+    )[1]
+    assert float(forward) == pytest.approx(expected, rel=1e-6)
+
+
+@pytest.mark.parametrize("mode", [jax.grad, jax.jacfwd])
+def test_derivatives_of_a_step_of_length_zero_and_without_a_linear_part(mode):
+    """There all arguments of phi are zero, where it is smooth."""
+
+    def loss(args):
+        length, scale = args
+        term = cfjax.LieTerm(lambda t, u, scale: cfjax.Affine(1.0, jnp.sin(u), scale * SPECTRUM))
+        sol = cfjax.integrate(term, cfjax.ETD54(), 0.0, length, jnp.ones(N), scale, num_steps=1)
+        return jnp.sum(sol.ys[-1])
+
+    of_length, of_scale = mode(loss)(jnp.array([0.0, 1.0]))
+    # By the time it is the velocity.
+    expected = np.sum(np.sin(np.ones(N)) + SPECTRUM)
+    np.testing.assert_allclose(of_length, expected, rtol=1e-14)
+    assert of_scale == 0
+    of_scale = mode(loss)(jnp.array([0.01, 0.0]))[1]
+    # d/ds of exp(h s z) u and of the flow of g, to first order in s: h z (u + h g / 2 + ...), with
+    # g = sin(u) along the solution of u' = sin(u) from 1.
+    h, points = 0.01, 401
+    s = np.linspace(0, h, points)
+    path = 2 * np.arctan(np.tan(0.5) * np.exp(s))
+    # The variational equation v' = cos(u) v + z u, v(0) = 0, by the rule of Simpson.
+    growth = np.sin(path[-1]) / np.sin(path)
+    simpson = np.array([1, *[4, 2] * (points // 2 - 1), 4, 1]) * h / (points - 1) / 3
+    expected = np.sum(SPECTRUM) * np.sum(simpson * growth * path)
+    # One step: its error is some h^6.
+    np.testing.assert_allclose(of_scale, expected, rtol=1e-10)
+
+
+# Other kinds of states and fields.
+
+
+class Decay(cfjax.AbstractSemilinearField):
+    """A class of a user: `x' = rate x + b`, with rates that no transform makes."""
+
+    rate: jax.Array
+    b: jax.Array
+
+    def flow(self, point):
+        return jnp.exp(self.rate) * point + cfjax.phi(1, self.rate) * self.b
+
+    def tangent(self, point):
+        return self.rate * point + self.b
+
+    def functions(self, pairs):
+        return [cfjax.phi(k, c * self.rate) for c, k in pairs]
+
+    def times(self, function, x):
+        return function * x
+
+    def rest(self, first, point):
+        return (self.rate - first.rate) * point + self.b
+
+
+def test_a_class_of_a_user():
+    rates = -np.arange(1.0, N + 1)
+    y0 = jnp.ones(N)
+    ends = [
+        cfjax.integrate(cfjax.LieTerm(field), cfjax.ETD54(), 0.0, 1.0, y0, num_steps=3).ys[-1]
+        for field in (
+            lambda t, u, args: Decay(rates + 0.1 * t, jnp.sin(u)),
+            lambda t, u, args: cfjax.Affine(1.0, jnp.sin(u) + 0.1 * t * u, rates),
+        )
+    ]
+    # Two ways to split one velocity, with an error of 1e-7 each.
+    np.testing.assert_allclose(*ends, rtol=0, atol=1e-6)
+
+
+def test_terms_that_are_added():
+    """The sum of two terms is one field."""
+    y0 = jnp.ones(N)
+    linear = cfjax.LieTerm(lambda t, u, args: cfjax.Affine(1.0, jnp.zeros(N), SPECTRUM, SINE))
+    rest = cfjax.LieTerm(lambda t, u, args: cfjax.Affine(0.0, jnp.sin(u), SPECTRUM, SINE))
+    both = cfjax.LieTerm(lambda t, u, args: cfjax.Affine(1.0, jnp.sin(u), SPECTRUM, SINE))
+    ends = [
+        cfjax.integrate(term, cfjax.ETD43(), 0.0, 0.1, y0, num_steps=2).ys[-1]
+        for term in (diffrax.MultiTerm(linear, rest), both)
+    ]
+    # A few units of rounding.
+    np.testing.assert_allclose(*ends, rtol=0, atol=1e-14)
+
+
+def test_single_precision_and_batches():
+    """To rounding of float32, in a batch over the start and a parameter."""
+
+    def end(y0, nu, dtype):
+        spectrum = nu * jnp.asarray(SPECTRUM, dtype)
+        term = cfjax.LieTerm(lambda t, u, args: cfjax.Affine(1.0, jnp.sin(u), spectrum, SINE))
+        return cfjax.integrate(term, cfjax.ETD54(), 0.0, 1.0, y0, num_steps=10).ys[-1]
+
+    starts, nus = np.linspace(0.5, 1.5, 3 * N).reshape(3, N), np.array([0.01, 0.1, 1.0])
+    found, exact = (
+        jax.vmap(functools.partial(end, dtype=dtype))(
+            jnp.asarray(starts, dtype), jnp.asarray(nus, dtype)
+        )
+        for dtype in (jnp.float32, jnp.float64)
+    )
+    assert found.dtype == jnp.float32
+    # Some units of each of ten steps.
+    np.testing.assert_allclose(found, exact, rtol=0, atol=30 * 6e-8 * 1.5)
+    for k in range(3):
+        np.testing.assert_allclose(exact[k], end(jnp.asarray(starts[k]), nus[k], float), rtol=1e-13)
+
+
+# Errors.
+
+
+def test_fields_without_a_linear_part(no_shape_hook):
+    y0 = {"grid": jnp.ones(N), "attitude": jnp.array([1.0, 0.0, 0.0])}
+
+    def field(t, y, args):
+        return {
+            "grid": cfjax.Affine(1.0, y["grid"], SPECTRUM, SINE),
+            "attitude": cfjax.Rotation(y["attitude"]),
+        }
+
+    with pytest.raises(TypeError, match=r"ETD54 takes fields .* For y\['attitude'\] the .*CF4"):
+        cfjax.integrate(cfjax.LieTerm(field), cfjax.ETD54(), 0.0, 1.0, y0, num_steps=2)
+
+
+def test_paths_and_other_estimates():
+    path = diffrax.VirtualBrownianTree(0.0, 1.0, 0.05, (N,), jax.random.key(0))
+    noise = cfjax.LieControlTerm(lambda t, y, args, dw: dw, path)
+    drift = cfjax.LieTerm(lambda t, u, args: cfjax.Affine(1.0, jnp.sin(u), SPECTRUM, SINE))
+    with pytest.raises(TypeError, match="ETD43 takes no terms that a path drives"):
+        cfjax.integrate(
+            diffrax.MultiTerm(drift, noise), cfjax.ETD43(), 0.0, 1.0, jnp.ones(N), num_steps=2
+        )
+    with pytest.raises(ValueError, match="estimate must be 'group' or None, got 'algebra'"):
+        cfjax.ETD43(estimate="algebra")  # pyright: ignore[reportArgumentType]
+    with pytest.raises(ValueError, match="step_back"):
+        cfjax.integrate(drift, cfjax.ETD43(), 0.0, 1.0, jnp.ones(N), num_steps=2, step_back=True)
