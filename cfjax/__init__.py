@@ -68,6 +68,7 @@ if TYPE_CHECKING:
     from ._methods.exponential import ExponentialTableau as ExponentialTableau
     from ._methods.stability import stability_function as stability_function
     from ._methods.stiff_order import stiff_order as stiff_order
+    from ._numerics.diagonalised import diagonalised as diagonalised
     from ._numerics.phi import phi as phi
     from ._numerics.transforms import AbstractTransform as AbstractTransform
     from ._numerics.transforms import CosineTransform as CosineTransform
@@ -132,6 +133,7 @@ _NAMES_LATER = {
     "_methods.stability": ("stability_function",),
     "_methods.stiff_order": ("stiff_order",),
     "_numerics.phi": ("phi",),
+    "_numerics.diagonalised": ("diagonalised",),
     "_numerics.transforms": (
         "AbstractTransform",
         "CosineTransform",

@@ -44,6 +44,9 @@ class AbstractFrozenField(eqx.Module):
     # Whether the point that the field acts on is a pytree instead of one array.
     acts_on_subtree: ClassVar[bool] = False
 
+    # Whether a flow is arithmetic entry by entry, which the compiler may do several times.
+    is_entrywise: ClassVar[bool] = False
+
     def __init_subclass__(cls, **kwargs: Any):
         super().__init_subclass__(**kwargs)
         if "acts_on_subtree" in vars(cls):

@@ -3,6 +3,7 @@
 import abc
 from collections.abc import Callable, Sequence
 from math import sqrt
+from typing import ClassVar
 
 import equinox as eqx
 import jax.numpy as jnp
@@ -26,6 +27,10 @@ class AbstractTransform(eqx.Module):
     `cfjax.TensorTransform`, which applies transforms axis by axis, and for batches `jax.vmap`.
     """
 
+    # When it comes on a grid: 0 if it keeps real points real, 1 if it takes real points to complex
+    # coefficients, 2 if it takes complex points.
+    _rank: ClassVar[int] = 0
+
     @abc.abstractmethod
     def forward(self, point: Inexact[Array, "n *k"]) -> Inexact[Array, "m *k"]:
         """The coefficients of `point`."""
@@ -47,7 +52,7 @@ class SineTransform(AbstractTransform):
     """
 
     def forward(self, point: Inexact[Array, "n *k"]) -> Inexact[Array, "n *k"]:
-        return _real_transform(sine_matrix, _sine, _checked(self, point))
+        return _real_transform(sine_matrix, _sine, checked(self, point))
 
     def inverse(self, coefficients: Inexact[Array, "n *k"]) -> Inexact[Array, "n *k"]:
         return self.forward(coefficients)
@@ -70,10 +75,10 @@ class CosineTransform(AbstractTransform):
     """
 
     def forward(self, point: Inexact[Array, "n *k"]) -> Inexact[Array, "n *k"]:
-        return _real_transform(cosine_matrix, _cosine, _checked(self, point))
+        return _real_transform(cosine_matrix, _cosine, checked(self, point))
 
     def inverse(self, coefficients: Inexact[Array, "n *k"]) -> Inexact[Array, "n *k"]:
-        c = _checked(self, coefficients)
+        c = checked(self, coefficients)
         return _real_transform(lambda n: cosine_matrix(n).T, _inverse_cosine, c)
 
     def second_difference(self, n: int | np.integer) -> Float[np.ndarray, " n"]:
@@ -93,6 +98,8 @@ class FourierTransform(AbstractTransform):
     **Raises** `TypeError` for real arrays.
     """
 
+    _rank: ClassVar[int] = 2
+
     def forward(self, point: Complex[Array, "n *k"]) -> Complex[Array, "n *k"]:
         return jnp.fft.fft(self._complex(point), axis=0, norm="ortho")
 
@@ -104,7 +111,7 @@ class FourierTransform(AbstractTransform):
         return -4 * np.sin(np.pi * np.fft.fftfreq(_positive(n))) ** 2
 
     def _complex(self, x: Array) -> Array:
-        x = _checked(self, x)
+        x = checked(self, x)
         if not jnp.iscomplexobj(x):
             raise TypeError(
                 f"FourierTransform takes complex arrays, got {x.dtype}. Real points take a "
@@ -126,13 +133,14 @@ class RealFourierTransform(AbstractTransform):
     `TypeError` for complex points.
     """
 
+    _rank: ClassVar[int] = 1
     n: int = eqx.field(static=True)
 
     def __init__(self, n: int | np.integer):
         self.n = _positive(n)
 
     def forward(self, point: Float[Array, "n *k"]) -> Complex[Array, "m *k"]:
-        point = _checked(self, point)
+        point = checked(self, point)
         self._check_length("a point", len(point), self.n)
         if jnp.iscomplexobj(point):
             raise TypeError(
@@ -142,7 +150,7 @@ class RealFourierTransform(AbstractTransform):
         return jnp.fft.rfft(point, axis=0, norm="ortho")
 
     def inverse(self, coefficients: Complex[Array, "m *k"]) -> Float[Array, "n *k"]:
-        coefficients = _checked(self, coefficients)
+        coefficients = checked(self, coefficients)
         self._check_length("coefficients", len(coefficients), self.n // 2 + 1)
         return jnp.fft.irfft(coefficients, self.n, axis=0, norm="ortho")
 
@@ -180,15 +188,17 @@ class TensorTransform(AbstractTransform):
     its axis, and `FourierTransform` for the others. A difference of odd order must have the
     eigenvalue zero at `k = n/2` along each of them. Any axis may have any kind, as transforms of
     different axes commute: `forward` applies `RealFourierTransform` after those that keep real
-    points real and before `FourierTransform`, and `inverse` reverses the order.
+    points real and before `FourierTransform`, and `inverse` reverses the order. That of
+    `cfjax.diagonalised` counts as one of the three kinds, as its docstring says.
 
     Each axis costs its transform, with as many columns as there are other entries.
 
     **Arguments:** `transforms`, a sequence of `cfjax.AbstractTransform` or None, each of which
     transforms one axis.
 
-    **Raises** `TypeError` if they are anything else, `ValueError` if more than one of them is a
-    `RealFourierTransform`, or if an array has fewer axes.
+    **Raises** `TypeError` if they are anything else, `ValueError` if more than one of them takes
+    real points to complex coefficients, as `RealFourierTransform` does, or if an array has fewer
+    axes.
     """
 
     transforms: tuple[AbstractTransform | None, ...]
@@ -206,10 +216,12 @@ class TensorTransform(AbstractTransform):
                 raise TypeError(
                     "transforms must be of one axis each, got a TensorTransform among them."
                 )
-        if sum(isinstance(transform, RealFourierTransform) for transform in self.transforms) > 1:
+        if sum(one is not None and one._rank == 1 for one in self.transforms) > 1:
             raise ValueError(
-                "transforms must hold at most one RealFourierTransform, as its coefficients are "
-                f"complex, got {self.transforms!r}. Take FourierTransform() along the other axes."
+                "transforms must hold at most one RealFourierTransform, or cfjax.diagonalised of a "
+                "real matrix with complex eigenvalues, as its coefficients are complex, got "
+                f"{self.transforms!r}. Along the other axes take FourierTransform() or "
+                "diagonalised(matrix.astype(complex))."
             )
 
     def forward(self, point: Inexact[Array, "*point"]) -> Inexact[Array, "*coefficients"]:
@@ -234,8 +246,7 @@ class TensorTransform(AbstractTransform):
     def _in_order(self) -> list[tuple[int, AbstractTransform]]:
         """Axes and their transforms: real ones, that from real to complex, complex ones."""
         axes = [(k, one) for k, one in enumerate(self.transforms) if one is not None]
-        kinds = (FourierTransform, RealFourierTransform)
-        return sorted(axes, key=lambda axis: [isinstance(axis[1], kind) for kind in kinds])
+        return sorted(axes, key=lambda axis: axis[1]._rank)
 
 
 def sine_matrix(n: int) -> Float[np.ndarray, "n n"]:
@@ -318,7 +329,7 @@ def _along(axis: int, fun: Callable[[Array], Array], x: Array) -> Array:
     return jnp.moveaxis(fun(jnp.moveaxis(x, axis, 0)), 0, axis)
 
 
-def _checked(transform: AbstractTransform, x: Array) -> Array:
+def checked(transform: AbstractTransform, x: Array) -> Array:
     x, name = jnp.asarray(x), type(transform).__name__
     # In an integer dtype the entries of a dense matrix would be rounded to zero.
     if x.dtype.name not in DTYPES:

@@ -95,6 +95,15 @@ class Chart:
         """How far two points are apart in the ambient space."""
         return jtu.tree_map(jnp.subtract, self.from_start(a), self.from_start(b))
 
+    def way(self, end: PyTree) -> PyTree:
+        """How far the end of the step, as `from_start` returns it, is from the start."""
+        return with_sums(
+            lambda c, y, z: jtu.tree_map(jnp.subtract, z, y) if c is None else z,
+            self._compensation,
+            self._y0,
+            end,
+        )
+
     def shared(self, tree: PyTree) -> PyTree:
         """The same arrays, of each of which several results are made.
 
@@ -108,6 +117,18 @@ class Chart:
         Where they do not, the loop of equal steps computes them once.
         """
         return invariant(tree)
+
+    def branching(self, point: PyTree) -> PyTree:
+        """The same point, where the field is evaluated and from where flows go on.
+
+        Otherwise XLA would compute flows that are arithmetic entry by entry anew for each of both,
+        back to the start.
+        """
+
+        def part(f: Any, p: PyTree) -> PyTree:
+            return materialised_in_rows(p, alone=True) if is_field(f) and f.is_entrywise else p
+
+        return jtu.tree_map(part, self.fields[0], point, is_leaf=is_field)
 
     def narrow(self, point: PyTree) -> PyTree:
         """The same point, on which all depends that follows: where a long step may be cut."""

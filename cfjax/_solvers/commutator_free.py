@@ -86,8 +86,12 @@ class AbstractCommutatorFree(AbstractChartSolver):
         # Two stages at one point would be one flow with two times.
         if self._is_usual and len(set(alpha)) == len(alpha):
             reach.points |= rolled(self.unroll, chart, [*alpha, beta], tableau.c)
+        prefixes = {rows[:n] for rows in (*alpha, beta) for n in range(1, len(rows))}
         for c, rows in list(zip(tableau.c, alpha, strict=True))[len(chart.fields) :]:
-            chart.frozen(float(c), reach(rows))
+            point = reach(rows)
+            if rows in prefixes:
+                point = reach.points[rows] = chart.branching(point)
+            chart.frozen(float(c), point)
         end = reach(beta)
         if self.first_same_as_last:
             # The end, the last field and the error are made of it.
@@ -110,8 +114,8 @@ class AbstractCommutatorFree(AbstractChartSolver):
         apart = chart.difference(end, reach(alpha[-1]))
         # All of them are needed before the ratio of their sizes.
         end, error, apart = chart.shared((chart.from_start(end), error, apart))
-        way = jtu.tree_map(jnp.subtract, end, chart.from_start(chart.start))
-        return Step(end, path, jtu.tree_map(_seen, error, apart, way), is_shared=True)
+        error = jtu.tree_map(_seen, error, apart, chart.way(end))
+        return Step(end, path, error, is_shared=True)
 
     @property
     def _embedded(self) -> Product | None:

@@ -13,7 +13,7 @@ import jax.tree_util as jtu
 from jaxtyping import Array, PyTree, Real
 
 from .._control_term import is_driven
-from .._field import AbstractSemilinearField, Rest, combine, from_chart, is_field, tangent
+from .._field import AbstractSemilinearField, Rest, combine, from_chart, is_field
 from .._methods import exponential as _exponential
 from .._methods.exponential import Columns, Combination, ExponentialTableau
 from .._methods.proved import order_of
@@ -86,7 +86,7 @@ class AbstractExponential(AbstractChartSolver):
         first, start = chart.frozen(0.0, chart.start), chart.without_sums(chart.start)
         linear = _LinearPart(type(self).__name__, first, [*self._rows, self._error or ()], chart)
         # The velocity at the start, and by how much g differs there and at each later stage.
-        changes = {1: tangent(first, start)}
+        changes = {1: _rest(first, combine([0.0], [first]), start)}
         g = _rest(first, first, start)
 
         def reach(row: Columns) -> PyTree:

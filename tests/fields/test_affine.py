@@ -3,6 +3,7 @@
 import functools
 from typing import Any
 
+import diffrax
 import equinox as eqx
 import jax
 import jax.numpy as jnp
@@ -535,6 +536,147 @@ def test_order_of_a_nonlinear_problem(solver, order, case):
     assert abs(problems.slope(steps, errors) - order) < 0.15
 
 
+# Within a step: coefficients.
+
+
+def solved(field, solver, transform, y0, args, **kwargs):
+    """A solve on the grid, its output within a step and its end, and the same by coefficients.
+
+    The second has the coefficients as its state, and transforms in its field alone.
+    """
+
+    def in_coefficients(t, c, args):
+        f = field(t, transform.inverse(c), args)
+        return Affine(f.alpha, transform.forward(f.b), f.spectrum)
+
+    for fun, start, back in (
+        (field, y0, lambda y: y),
+        (in_coefficients, transform.forward(y0), jax.vmap(transform.inverse)),
+    ):
+        sol = diffrax.diffeqsolve(
+            cfjax.LieTerm(fun),
+            solver,
+            0.0,
+            0.5,
+            0.125,
+            start,
+            args,
+            saveat=diffrax.SaveAt(ts=jnp.asarray([0.05, 0.3, 0.5])),
+            **kwargs,
+        )
+        yield back(sol.ys)
+
+
+SOLVERS = {
+    "CF4": cfjax.CF4(),
+    "CF43, algebra": cfjax.CF43(estimate="algebra"),
+    "CF54": cfjax.CF54(),
+    "RKMK4": cfjax.RKMK4(),
+    "RKMK5": cfjax.RKMK5(),
+    "CK54": cfjax.CK54(),
+    "CK54, rolled": cfjax.CK54(unroll=False),
+    "Luscher3": cfjax.Luscher3(),
+    "ImplicitMidpoint": cfjax.ImplicitMidpoint(),
+    "Richardson": cfjax.Richardson(cfjax.CF3()),
+}
+
+
+@pytest.mark.parametrize(
+    "solver, points", [(cfjax.CF4(), 1), (cfjax.CF43(), 4), (cfjax.CK54(), 4), (cfjax.RKMK4(), 0)]
+)
+def test_points_that_are_computed_once(solver, points):
+    """Where the field is evaluated and flows go on: back from there flows would be repeated."""
+    term = cfjax.LieTerm(
+        lambda t, y, args: Affine(1.0, jnp.sin(y), -jnp.arange(200.0), cfjax.SineTransform())
+    )
+
+    def run(y0):
+        return cfjax.integrate(term, solver, 0.0, 1.0, y0, num_steps=2).ys
+
+    program = str(jax.make_jaxpr(run)(jnp.ones(200)))
+    assert program.count("cfjax_materialised[") == points
+
+
+@pytest.mark.filterwarnings("ignore:Complex dtype support")
+@pytest.mark.representatives(3)
+@pytest.mark.parametrize("solver", SOLVERS)
+@pytest.mark.parametrize("pair", [("sine", "real Fourier"), ("Fourier", "cosine")])
+def test_a_solve_is_that_of_the_coefficients(solver, pair):
+    transform, spectrum, _, dtype = on_grid(pair, (3, 4))
+
+    def field(t, y, args):
+        return Affine(1.0, y - y**3 + jnp.cos(3 * t).astype(y.dtype), args, transform)
+
+    y0 = jnp.asarray(random_points(dtype, (3, 4))[1]) / 2
+    ends = solved(field, SOLVERS[solver], transform, y0, spectrum)
+    # Some transforms a step, each with a few units; the implicit method stops at rounding too.
+    np.testing.assert_allclose(*ends, rtol=0, atol=200 * EPS)
+
+
+def test_controlled_steps_of_a_state_of_parts():
+    """A grid with another operator beside it, and a part of its own; with two terms on one part."""
+    transform, spectrum, _, _ = on_grid(("sine", "real Fourier"), (3, 4))
+    line = cfjax.SineTransform()
+    rates = line.second_difference(5)
+
+    def first(t, y, args):
+        mean = jnp.mean(y["grid"])
+        grid = Affine(1.0, jnp.sin(y["grid"]) + y["time"], args, transform)
+        return {"grid": grid, "line": Affine(0.5, mean * y["line"], rates, line), "time": 1.0}
+
+    def second(t, y, args):
+        return {"grid": Affine(1.0, -(y["grid"] ** 3), args, transform), "line": None, "time": None}
+
+    def both(t, y, args):
+        sum_ = Affine(2.0, first(t, y, args)["grid"].b - y["grid"] ** 3, args, transform)
+        return {**first(t, y, args), "grid": sum_}
+
+    _, u = random_points(float, (3, 4))
+    y0 = {"grid": jnp.asarray(u), "line": jnp.arange(5.0), "time": jnp.asarray(0.0)}
+    norm = cfjax.ErrorNorm({"grid": 1.0, "line": 2.0, "time": 1.0})
+    ends = [
+        diffrax.diffeqsolve(
+            term,
+            cfjax.CF4(),
+            0.0,
+            1.0,
+            0.05,
+            y0,
+            spectrum,
+            stepsize_controller=diffrax.PIDController(rtol=0.0, atol=1e-5, norm=norm),
+        )
+        for term in (
+            diffrax.MultiTerm(cfjax.LieTerm(first), cfjax.LieTerm(second)),
+            cfjax.LieTerm(both),
+        )
+    ]
+    # Sums in another order, over some 40 steps.
+    problems.assert_close(ends[0].ys, ends[1].ys, 1e-13)
+    assert ends[0].stats["num_steps"] == ends[1].stats["num_steps"]
+
+
+def test_derivatives_of_a_solve():
+    """With respect to the spectrum and the start, by reverse mode, against central differences."""
+    transform, spectrum, _, _ = on_grid(("real Fourier", "sine"), (4, 3))
+    u = jnp.asarray(random_points(float, (4, 3))[1])
+
+    def loss(x):
+        def field(t, y, args):
+            return Affine(1.0, jnp.sin(y) + t, args * spectrum, transform)
+
+        end = cfjax.integrate(
+            cfjax.LieTerm(field), cfjax.CF4(), 0.0, 0.5, x["u"], x["d"], num_steps=3
+        ).ys[-1]
+        return jnp.sum(end**2)
+
+    x = {"u": u, "d": jnp.asarray(0.3)}
+    dx = problems.random_like(x, 3)
+    found = problems.inner(jax.jit(jax.grad(loss))(x), dx)
+    wanted = problems.central_difference(jax.jit(loss), x, dx, 1e-4)
+    # Differences leave 1e-4^4 of the fifth derivative, and of rounding some units over 1e-4.
+    np.testing.assert_allclose(found, wanted, rtol=1e-8)
+
+
 # What is refused.
 
 
@@ -626,7 +768,8 @@ def test_fields_with_different_operators_are_not_added():
     np.testing.assert_array_equal(total.alpha, 3.0)
 
 
-def test_a_spectrum_that_changes_with_time_is_an_error():
-    term = cfjax.LieTerm(lambda t, y, args: Affine(1.0, y, -(1 + t) * jnp.arange(4.0)))
+@pytest.mark.parametrize("transform", [None, cfjax.SineTransform()])
+def test_a_spectrum_that_changes_with_time_is_an_error(transform):
+    term = cfjax.LieTerm(lambda t, y, args: Affine(1.0, y, -(1 + t) * jnp.arange(4.0), transform))
     with pytest.raises(eqx.EquinoxRuntimeError, match="must have one spectrum"):
         cfjax.integrate(term, cfjax.CF4(), 0.0, 1.0, jnp.ones(4), num_steps=2)

@@ -5,6 +5,7 @@ import numpy as np
 import pytest
 from jax import lax
 
+import cfjax
 from cfjax._measure.flops import count_flops
 
 X = jnp.ones(10)
@@ -238,3 +239,56 @@ def test_a_check_counts_nothing_and_a_function_of_the_host_is_refused():
     host = lambda x: jax.pure_callback(np.sin, jax.ShapeDtypeStruct((), float), x)  # noqa: E731
     with pytest.raises(NotImplementedError, match="function of the host"):
         count_flops(host, 1.0)
+
+
+class Product(cfjax.AbstractTransform):
+    matrix: jax.Array
+
+    def forward(self, point):
+        return self.matrix.T @ point
+
+    def inverse(self, coefficients):
+        return self.matrix @ coefficients
+
+
+class Reversed(cfjax.AbstractTransform):
+    """The points backwards, which takes no flops."""
+
+    def forward(self, point):
+        return point[::-1]
+
+    def inverse(self, coefficients):
+        return coefficients[::-1]
+
+
+@pytest.mark.parametrize(
+    "solver, transforms",
+    [
+        # The start, four times b, three points where the field is evaluated, and the end.
+        (cfjax.CF4(estimate=None), 9),
+        # One more b, at the end, and the point of the embedded method. Its flow would have been
+        # three.
+        (cfjax.CF4(), 11),
+        # One more b too, and two for the velocity at the end.
+        (cfjax.CF4(estimate="algebra"), 12),
+        # A bracket takes none.
+        (cfjax.RKMK4(), 9),
+        (cfjax.Luscher3(estimate=None), 7),
+    ],
+)
+def test_transforms_of_a_step_of_affine_fields(solver, transforms):
+    def flops(transform):
+        def field(t, y, args):
+            return cfjax.Affine(1.0, jnp.sin(y) + t, -jnp.arange(8.0), transform)
+
+        term, y0 = cfjax.LieTerm(field), jnp.ones(8)
+        state = eqx.filter_jit(solver.init)(term, 0.0, 0.1, y0, None)
+
+        def step(t0, t1, y0):
+            y1, error, _, after, _ = solver.step(term, t0, t1, y0, None, state, False)
+            return y1, error, after.first
+
+        return count_flops(step, 0.0, 0.1, y0)
+
+    matrix = jnp.asarray(np.linalg.qr(np.random.default_rng(0).standard_normal((8, 8)))[0])
+    assert flops(Product(matrix)) - flops(Reversed()) == transforms * 2 * 8**2

@@ -1,0 +1,330 @@
+"""`diagonalised`: solves against scipy's exponential, the kinds of points, and what is refused."""
+
+from typing import Any
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+import problems
+import pytest
+import scipy.linalg
+
+import cfjax
+
+EPS = 2.0**-52
+
+
+def heat(n=19):
+    """`(mu u_x)_x` and `mu u_xx` on n points, with `mu = 1 - x^2`: the second is not symmetric."""
+    dx = 2 / (n + 1)
+    x = np.linspace(-1, 1, n + 2)
+    mu = 1 - (x[:-1] + dx / 2) ** 2
+    flux = np.diag(-mu[:-1] - mu[1:]) + np.diag(mu[1:-1], 1) + np.diag(mu[1:-1], -1)
+    plain = np.diag(np.full(n, -2.0)) + np.eye(n, k=1) + np.eye(n, k=-1)
+    return flux / dx**2, (1 - x[1:-1, None] ** 2) * plain / dx**2
+
+
+def advection(n=12):
+    """Diffusion and upwind advection on a line with an inflow, far from normal."""
+    return 3 * (np.eye(n, k=1) - 2 * np.eye(n) + np.eye(n, k=-1)) - 8 * (
+        np.eye(n, k=1) - np.eye(n, k=-1)
+    )
+
+
+def hermitian(n=6):
+    a = np.random.default_rng(0).standard_normal((2, n, n))
+    a = a[0] + 1j * a[1]
+    return a + a.conj().T
+
+
+MATRICES: dict[str, tuple[np.ndarray, str]] = {
+    "symmetric": (heat()[0], "real"),
+    "symmetrisable": (heat()[1], "real"),
+    "real eigenvalues": (np.triu(np.ones((4, 4))) + np.diag(np.arange(4.0)), "real"),
+    "complex eigenvalues": (advection(), "real to complex"),
+    # Three pairs, and a real eigenvalue.
+    "odd": (np.random.default_rng(1).standard_normal((7, 7)), "real to complex"),
+    "Hermitian": (hermitian(), "complex"),
+    "complex": (np.random.default_rng(2).standard_normal((5, 5)) * (1 + 1j) + np.eye(5), "complex"),
+    "real as complex": (advection().astype(complex), "complex"),
+    "one": (np.array([[-3.0]]), "real"),
+}
+matrices = pytest.mark.parametrize("name", MATRICES)
+
+
+def points(shape, is_complex, seed=0):
+    x = np.random.default_rng(seed).standard_normal((2, *shape))
+    return x[0] + 1j * x[1] if is_complex else x[0]
+
+
+@matrices
+def test_the_operator_is_diagonal(name):
+    a, kind = MATRICES[name]
+    n = len(a)
+    spectrum, transform = cfjax.diagonalised(a)
+    assert np.iscomplexobj(spectrum) == (kind != "real" and name != "Hermitian")
+    for columns in ((), (3,), (2, 2)):
+        for is_complex in {"real": (False, True), "complex": (True,)}.get(kind, (False,)):
+            x = jnp.asarray(points((n, *columns), is_complex))
+            c = transform.forward(x)
+            assert c.shape == (len(spectrum), *columns)
+            assert jnp.iscomplexobj(c) == (is_complex or kind != "real")
+            factor = jnp.asarray(spectrum).reshape(-1, *[1] * len(columns)).astype(c.dtype)
+            found = transform.inverse(factor * c)
+            assert found.dtype == x.dtype
+            # Sums of n products, in vectors of a condition up to 1e3.
+            atol = n * EPS * 1e3
+            np.testing.assert_allclose(transform.inverse(c), x, rtol=0, atol=atol)
+            wanted = np.tensordot(a, x, 1)
+            atol *= np.abs(a).max()
+            np.testing.assert_allclose(found, wanted, rtol=0, atol=atol)
+
+
+def test_half_of_the_conjugate_eigenvalues():
+    a, _ = MATRICES["odd"]
+    spectrum, _ = cfjax.diagonalised(a)
+    every: Any = np.linalg.eigvals(a)
+    assert len(spectrum) == np.sum(every.imag >= 0) < 7
+    np.testing.assert_allclose(np.sort(np.real(spectrum)), np.sort(every[every.imag >= 0].real))
+
+
+@pytest.mark.parametrize("which", [0, 1])
+def test_heat_with_a_variable_coefficient_is_exact_in_one_step(which):
+    a = heat(49)[which]
+    n, b = len(a), np.linspace(1, 2, len(a))
+    spectrum, transform = cfjax.diagonalised(a)
+    assert spectrum.dtype == np.float64 and spectrum.max() < 0
+    term = cfjax.LieTerm(lambda t, u, args: cfjax.Affine(1.0, jnp.asarray(b), args, transform))
+    u0 = 1 - np.abs(np.linspace(-1, 1, n + 2)[1:-1])
+    found = cfjax.integrate(term, cfjax.CF4(), 0.0, 0.5, jnp.asarray(u0), spectrum, num_steps=1).ys[
+        -1
+    ]
+    whole = np.zeros((n + 1, n + 1))
+    whole[:n, :n], whole[:n, n] = a, b
+    wanted = (scipy.linalg.expm(0.5 * whole) @ np.append(u0, 1))[:n]
+    # Eigenvalues are known to some units of the largest, 0.5 * 2500 here. The scaling that makes
+    # `mu u_xx` symmetric has a condition of 4, and the squarings of expm lose as much again.
+    np.testing.assert_allclose(found, wanted, rtol=0, atol=8 * 1250 * EPS)
+
+
+@pytest.mark.parametrize("name", ["complex eigenvalues", "odd", "complex", "real eigenvalues"])
+def test_a_flow_of_a_matrix_that_is_not_normal(name):
+    a, kind = MATRICES[name]
+    n = len(a)
+    spectrum, transform = cfjax.diagonalised(a)
+    b, u = (points((n,), kind == "complex", seed) for seed in (1, 2))
+    field = cfjax.Affine(0.3, b, spectrum, transform)
+    whole = np.zeros((n + 1, n + 1), b.dtype)
+    whole[:n, :n], whole[:n, n] = 0.3 * a, b
+    wanted = (scipy.linalg.expm(whole) @ np.append(u, 1))[:n]
+    # The condition of the eigenvectors, up to 400, times some units of norms up to 7.
+    atol = 400 * 20 * EPS * np.abs(wanted).max()
+    np.testing.assert_allclose(field.flow(jnp.asarray(u)), wanted, rtol=0, atol=atol)
+    velocity = 0.3 * a @ u + b
+    np.testing.assert_allclose(field.tangent(jnp.asarray(u)), velocity, rtol=0, atol=10 * atol)
+
+
+GRIDS: dict[str, Any] = {
+    # The matrix, the transform of the other axis, and which axis the matrix is on.
+    "sine": (heat(6)[1], cfjax.SineTransform(), 0),
+    "after sine": (advection(4), cfjax.SineTransform(), 1),
+    "real Fourier": (heat(6)[1], cfjax.RealFourierTransform(4), 0),
+    "complex and real Fourier": (advection(5).astype(complex), cfjax.RealFourierTransform(4), 0),
+    "complex eigenvalues and Fourier": (advection(5), cfjax.FourierTransform(), 1),
+}
+
+
+@pytest.mark.parametrize("name", GRIDS)
+def test_one_axis_of_a_grid(name):
+    a, other, axis = GRIDS[name]
+    spectrum, transform = cfjax.diagonalised(a)
+    n = 4
+    eye = np.eye(n)
+    line = np.roll(eye, 1, axis=0) + np.roll(eye, -1, axis=0) - 2 * eye
+    if isinstance(other, cfjax.SineTransform):
+        line[0, -1] = line[-1, 0] = 0
+    pair = [(a.real, spectrum, transform), (line, other.second_difference(n), other)]
+    (m1, s1, t1), (m2, s2, t2) = pair if axis == 0 else pair[::-1]
+    operator = np.kron(m1, np.eye(len(m2))) + np.kron(np.eye(len(m1)), m2)
+    b, u = (points((len(m1), len(m2)), False, seed) for seed in (1, 2))
+    grid = cfjax.TensorTransform((t1, t2))
+    field = cfjax.Affine(0.1, b, np.add.outer(s1, s2), grid)
+    size = b.size
+    whole = np.zeros((size + 1, size + 1))
+    whole[:size, :size], whole[:size, size] = 0.1 * operator, b.ravel()
+    wanted = (scipy.linalg.expm(whole) @ np.append(u, 1))[:size].reshape(u.shape)
+    found = eqx.filter_jit(field.flow)(jnp.asarray(u))
+    assert found.dtype == u.dtype
+    # The condition of the eigenvectors, up to 60, times some units of norms up to 5.
+    np.testing.assert_allclose(found, wanted, rtol=0, atol=60 * 20 * EPS * np.abs(wanted).max())
+
+
+def test_derivative_of_a_solve_with_respect_to_a_factor_of_the_spectrum():
+    spectrum, transform = cfjax.diagonalised(advection() / 10)
+    u0 = jnp.asarray(points((12,), False))
+
+    def loss(factor):
+        def field(t, u, args):
+            return cfjax.Affine(1.0, u - u**3, args * spectrum, transform)
+
+        factor = factor.astype(complex)
+        end = cfjax.integrate(
+            cfjax.LieTerm(field), cfjax.CF4(), 0.0, 1.0, u0, factor, num_steps=4
+        ).ys[-1]
+        return jnp.sum(end**2)
+
+    one = jnp.asarray(1.0)
+    wanted = problems.central_difference(jax.jit(loss), one, one, 1e-3)
+    # Differences leave 1e-12 of the fifth derivative, and rounding some units over 1e-3.
+    assert float(jax.jit(jax.grad(loss))(one)) == pytest.approx(float(wanted), rel=1e-10)
+    assert float(jax.jvp(loss, (one,), (one,))[1]) == pytest.approx(float(wanted), rel=1e-10)
+
+
+@pytest.mark.parametrize("name", ["symmetrisable", "complex eigenvalues", "complex"])
+def test_float32(name):
+    a, kind = MATRICES[name]
+    wide, transform = cfjax.diagonalised(a)
+    single = np.complex64 if np.iscomplexobj(a) else np.float32
+    spectrum, own = cfjax.diagonalised(a.astype(single))
+    assert spectrum.dtype == wide.astype(np.complex64 if kind != "real" else np.float32).dtype
+    x = jnp.asarray(points((len(a),), kind == "complex"))
+    for t in (transform, own):
+        # One transform serves points of both precisions.
+        c = t.forward(x.astype(single))
+        assert c.dtype == spectrum.dtype
+        back = t.inverse(c)
+        assert back.dtype == single
+        # Sums of n products, in vectors of a condition up to 400.
+        np.testing.assert_allclose(back, x, rtol=0, atol=len(a) * 2.0**-23 * 100)
+    b = jnp.ones(len(a), single)
+    term = cfjax.LieTerm(lambda t, u, args: cfjax.Affine(1.0, b, args, transform))
+    times = (np.float32(0), np.float32(0.1))
+    end = cfjax.integrate(
+        term, cfjax.CF4(), *times, x.astype(single), jnp.asarray(spectrum), num_steps=2
+    )
+    assert end.ys.dtype == single and np.isfinite(end.ys).all()
+
+
+def test_batches_without_another_trace():
+    a = heat(6)[1]
+    traces = 0
+
+    @eqx.filter_jit
+    def flows(transform, spectrum, points):
+        nonlocal traces
+        traces += 1
+        field = cfjax.Affine(0.1, jnp.ones(6), spectrum, transform)
+        return jax.vmap(field.flow)(points)
+
+    u = jnp.asarray(points((3, 6), False))
+    spectrum, transform = cfjax.diagonalised(a)
+    found = flows(transform, spectrum, u)
+    # Made anew it is the same.
+    again, same = cfjax.diagonalised(a)
+    np.testing.assert_array_equal(flows(same, again, u), found)
+    assert traces == 1
+    field = cfjax.Affine(0.1, jnp.ones(6), spectrum, transform)
+    for x, y in zip(u, found, strict=True):
+        np.testing.assert_allclose(field.flow(x), y, rtol=0, atol=20 * EPS)
+    other = cfjax.diagonalised(a.T)[1]
+    assert other != transform and hash(other) != hash(transform)
+    with pytest.raises(ValueError, match="must have one operator"):
+        cfjax.combine((1.0, 1.0), (field, cfjax.Affine(0.1, jnp.ones(6), spectrum, other)))
+
+
+def test_a_program_has_each_matrix_once():
+    transform = cfjax.diagonalised(heat(6)[0])[1]
+    program = jax.make_jaxpr(lambda x: transform.forward(transform.forward(x)))(jnp.ones(6))
+    assert len(program.consts) == 1
+
+
+def test_no_symmetry_is_made_up():
+    """Products of opposite entries are positive, but not consistent around a triangle."""
+    a = np.array([[0.0, 4, 1], [1, 0, 1], [1, 1, 0]])
+    spectrum, transform = cfjax.diagonalised(a)
+    c = transform.forward(jnp.arange(3.0))
+    found = transform.inverse(jnp.asarray(spectrum).astype(c.dtype) * c)
+    np.testing.assert_allclose(found, a @ np.arange(3.0), rtol=0, atol=100 * EPS)
+
+
+# What is refused.
+
+
+def test_a_defective_matrix():
+    with pytest.raises(ValueError, match=r"condition number .* 1e\+06, got .*cfjax.LinearAffine"):
+        cfjax.diagonalised(np.eye(50) + np.eye(50, k=1))
+    # Symmetrisable, but only by a scaling of condition 1e12.
+    a = np.eye(13, k=1) + 100 * np.eye(13, k=-1)
+    with pytest.raises(ValueError, match="condition number"):
+        cfjax.diagonalised(a)
+
+
+@pytest.mark.parametrize(
+    "call, error, message",
+    [
+        (
+            lambda: cfjax.diagonalised(np.ones((2, 3))),
+            ValueError,
+            r"matrix must have the shape \(n, n\) with n >= 1, got \(2, 3\)",
+        ),
+        (
+            lambda: cfjax.diagonalised(np.ones((0, 0))),
+            ValueError,
+            r"matrix must have the shape .* got \(0, 0\)",
+        ),
+        (
+            lambda: cfjax.diagonalised(np.ones(3)),
+            ValueError,
+            r"matrix must have the shape .* got \(3,\)",
+        ),
+        (
+            lambda: cfjax.diagonalised(np.eye(3, dtype=int)),
+            TypeError,
+            "matrix must be one of float32, .*, got int64",
+        ),
+        (
+            lambda: cfjax.diagonalised(np.diag([1.0, np.nan, np.inf])),
+            ValueError,
+            "matrix must be finite, got 2 entries that are not",
+        ),
+        (
+            lambda: jax.jit(lambda a: cfjax.diagonalised(a)[0])(jnp.eye(3)),
+            TypeError,
+            r"matrix must be known before .* got a traced array, float64 of shape \(3, 3\)",
+        ),
+        (
+            lambda: cfjax.diagonalised(np.eye(3))[1].forward(jnp.ones(4)),
+            ValueError,
+            "cfjax.diagonalised, .* got length 4 along its axis, expected 3",
+        ),
+        (
+            lambda: cfjax.diagonalised(advection())[1].inverse(jnp.ones(7, complex)),
+            ValueError,
+            "got 7 coefficients along its axis, expected 6",
+        ),
+        (
+            lambda: cfjax.diagonalised(advection())[1].forward(jnp.ones(12, complex)),
+            TypeError,
+            "takes real points, got complex128. For complex points take",
+        ),
+        (
+            lambda: cfjax.diagonalised(hermitian())[1].forward(jnp.ones(6)),
+            TypeError,
+            "of a complex matrix takes complex points, got float64",
+        ),
+        (
+            lambda: cfjax.TensorTransform([cfjax.diagonalised(advection())[1]] * 2),
+            ValueError,
+            r"at most one RealFourierTransform, or .* diagonalised\(matrix.astype\(complex\)\)",
+        ),
+        (
+            lambda: cfjax.diagonalised(np.eye(3))[1].forward(jnp.arange(3)),
+            TypeError,
+            "takes arrays of float32, .*, got int64",
+        ),
+    ],
+)
+def test_wrong_matrices_and_points(call, error, message, no_shape_hook):
+    with pytest.raises(error, match=message):
+        call()
