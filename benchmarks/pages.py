@@ -801,7 +801,7 @@ def stiff_others() -> list[list[str]]:
 
 @table
 def stiff_steps() -> list[list[str]]:
-    return _stiff_table(lambda row: str(row.get("steps", "")), (1e-6,))
+    return _stiff_table(lambda row: two_digits(row["steps"]) if "steps" in row else "", (1e-6,))
 
 
 @table
@@ -821,6 +821,11 @@ def stiff_orders() -> list[list[str]]:
     return table
 
 
+def _short(error: float) -> str:
+    """One digit, as 2e-4 or 9e23."""
+    return f"{error:.0e}".replace("e+", "e").replace("e0", "e").replace("e-0", "e-")
+
+
 @table
 def stiff_parts() -> list[list[str]]:
     rows = _stiff("in M")
@@ -829,9 +834,15 @@ def stiff_parts() -> list[list[str]]:
     parts = ("mean", "0.8 of the largest", "largest")
     for part, program in itertools.product(parts, values(rows, "program")):
         found = [one(rows, program=program, steps=n, **{"in M": part})["error"] for n in counts]
-        cells = ["overflow" if e is None else f"{e:.0e}".replace("e-0", "e-") for e in found]
+        cells = ["overflow" if e is None else _short(e) for e in found]
         table.append([part, f"`{program}`", *cells])
     return table
+
+
+@number
+def stiff_whole_operator() -> str:
+    row, *_ = _stiff("whole operator, steps")
+    return f"an error of {power(row['error'])} in {in_units(row['seconds a solve'][2])}"
 
 
 @table
@@ -871,7 +882,7 @@ def stiff_damping() -> list[list[str]]:
                 f"`{row['curve']}`",
                 *(two_digits(dict(zip(r, growth, strict=True))[x]) for x in shown),
                 f"{r[r.index(last) + 1]:.2f}",
-                f"{longest:.1f}",
+                f"{longest:.2f}",
                 f"{longest / EVALUATIONS[row['curve']]:.2f}",
             ]
         )

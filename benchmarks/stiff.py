@@ -31,7 +31,7 @@ import results
 from cfjax._integrate import equal_steps, without_estimate
 from cfjax._measure import style as _style
 from cfjax._measure.work_precision import take_turns
-from stiff_problems import OTHERS, PROBLEMS, Problem
+from stiff_problems import OTHERS, PROBLEMS, Problem, heat_diagonalised
 
 TARGETS = (1e-3, 1e-6, 1e-9)
 TOLERANCES = (1e-4, 1e-6, 1e-8)
@@ -252,6 +252,7 @@ def measure(quick: bool) -> Iterator[results.Row]:
         }
         yield from _orders(name, problem, few)
         yield from _parts(name, few)
+    yield from _whole_operator()
 
 
 def _to_target(
@@ -347,6 +348,17 @@ def _parts(name: str, found: dict[str, Program]) -> Iterator[results.Row]:
             error = results.digits(found[program].run(n).error)
             part = name.removeprefix("heat, ").removesuffix(" in M")
             yield {"in M": part, "program": program, "steps": n, "error": error}
+
+
+def _whole_operator() -> Iterator[results.Row]:
+    """The heat problem with all of its operator in M, which its eigenvectors make diagonal."""
+    for n in (1, 10):
+        problem = heat_diagonalised()
+        solve = with_equal_steps(problem, cfjax.ETD54())
+        found = Program(solve, problem, problem.reference(), "cfjax")
+        error = results.digits(found.run(n).error)
+        seconds = results.spread(take_turns([found.timed(n)], repeats=200, budget=1.0)[0])
+        yield {"whole operator, steps": n, "error": error, "seconds a solve": seconds}
 
 
 LOOKS: dict[str, tuple[str, str]] = {

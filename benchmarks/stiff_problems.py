@@ -128,6 +128,19 @@ def of_heat(constant: Callable[[np.ndarray], float]) -> Problem:
     )
 
 
+def heat_diagonalised() -> Problem:
+    """All of it in M."""
+    problem, n = of_heat(np.mean), len(heat.y0())
+    matrix = jax.jacfwd(lambda u: problem.velocity(0.0, u, None))(jnp.zeros(n))
+    spectrum, transform = cfjax.diagonalised(np.asarray(matrix))
+    return problem._replace(
+        y0=transform.forward(problem.values(problem.y0)),
+        field=lambda t, c, _: cfjax.Affine(1.0, jnp.zeros_like(c), spectrum),
+        values=transform.inverse,
+        coefficients=transform.forward,
+    )
+
+
 def hochbruck_ostermann() -> Problem:
     x = points(199, 0, 1)
     start = x * (1 - x)
@@ -300,7 +313,7 @@ def korteweg_de_vries() -> Problem:
 
 
 def schrodinger() -> Problem:
-    """A nonlinear Schrodinger equation with a potential: the values are real and imaginary."""
+    """A nonlinear Schrödinger equation with a potential: the values are real and imaginary."""
     n = 256
     x = 2 * np.pi * np.arange(n) / n - np.pi
     k = np.fft.fftfreq(n, 1 / n)
@@ -390,7 +403,7 @@ PROBLEMS: dict[str, Callable[[], Problem]] = {
     "Kuramoto-Sivashinsky": kuramoto_sivashinsky,
     "Burgers": burgers,
     "Korteweg-de Vries": korteweg_de_vries,
-    "Schrodinger, potential": schrodinger,
+    "Schrödinger, potential": schrodinger,
     "Gray-Scott, two dimensions": gray_scott,
 }
 # Only errors of given numbers of steps are measured.
