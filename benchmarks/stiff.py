@@ -382,7 +382,7 @@ NAMES = {
 
 def draw() -> dict[str, Figure]:
     rows = [row for row in results.load("stiff")["rows"] if "seconds" in row]
-    figure = _style.new_figure((13, 10.5))
+    figure = _style.new_figure((15, 10.5))
     panels = dict(zip(PROBLEMS, figure.subplots(3, 4).flat, strict=True))
     for problem, axes in panels.items():
         for program in LOOKS:
