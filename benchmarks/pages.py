@@ -33,6 +33,7 @@ PICTURES = {
     "noise": 120,
     "peers": 120,
     "stability": 100,
+    "stiff": 100,
     "tolerances": 120,
 }
 
@@ -121,7 +122,7 @@ def code(program: str) -> str:
     for measured, name in SHORT.items():
         program = program.replace(measured, name)
     return re.sub(
-        r"cfjax\.integrate|C[FG]\d+(\([\w=]+\))?|(Magnus|RKMK)\d+|(Richardson|RKMK)\(\w+\)",
+        r"cfjax\.integrate|C[FG]\d+(\([\w=]+\))?|ETD\d+|(Magnus|RKMK)\d+|(Richardson|RKMK)\(\w+\)",
         r"`\g<0>`",
         program,
     )
@@ -738,6 +739,166 @@ def energy_ahead() -> str:
 def energy_midpoint() -> str:
     rows = pick(load("energy")["rows"], system="fluid")
     return f"{_break_even(one(rows, other='CF4'))} units of time"
+
+
+# What the pages call the programs for stiff equations.
+STIFF = {
+    "CF4": "`CF4`",
+    "CF43": "`CF43`",
+    "ETDRK4": "`ETDRK4`",
+    "ETD43": "`ETD43`",
+    "ETD54": "`ETD54`",
+    "ETD54 controlled": "`ETD54`, adaptive",
+    "exponax": "exponax, ETDRK4",
+    "Kvaerno5": "diffrax, Kvaerno5, adaptive",
+    "Tsit5": "diffrax, Tsit5, adaptive",
+}
+
+# Of a step.
+EVALUATIONS = {"CF4": 4, "ETDRK4": 4, "ETD43": 5, "ETD54": 8}
+
+
+def _stiff(key: str) -> list[Row]:
+    return [row for row in load("stiff")["rows"] if key in row]
+
+
+def _stiff_table(text: Callable[[Row], str], targets: Iterable[float]) -> list[list[str]]:
+    """A row for each problem and error, with what `text` says of each program."""
+    rows = _stiff("to")
+    programs = [name for name in STIFF if pick(rows, program=name)]
+    table = [["", "error", *(STIFF[name] for name in programs)]]
+    for problem, target in itertools.product(values(rows, "problem"), targets):
+        few = pick(rows, problem=problem, to=target)
+        cells = ["".join(map(text, pick(few, program=name))) for name in programs]
+        table.append([problem, power(target), *cells])
+    return table
+
+
+@table
+def stiff_times() -> list[list[str]]:
+    def text(row: Row) -> str:
+        if "not in seconds" in row:
+            return f"over {row['not in seconds']:.0f} s"
+        over = row["over CF4"]
+        # The medians alone: the table is wide.
+        return two_digits(over[2]) if over else in_units(row["seconds"][2])
+
+    return _stiff_table(text, values(_stiff("to"), "to"))
+
+
+@table
+def stiff_others() -> list[list[str]]:
+    rows = pick(_stiff("to"), program="ETD54")
+    others = {"exponax": "exponax, ETDRK4", "Kvaerno5": "Kvaerno5", "Tsit5": "Tsit5"}
+    table = [["", "error", *others.values()]]
+    for row in rows:
+        spreads = [row.get(f"over {other}") for other in others]
+        if any(spreads):
+            cells = [cell(over) if over else "" for over in spreads]
+            table.append([row["problem"], power(row["to"]), *cells])
+    return table
+
+
+@table
+def stiff_steps() -> list[list[str]]:
+    return _stiff_table(lambda row: two_digits(row["steps"]) if "steps" in row else "", (1e-6,))
+
+
+@table
+def stiff_orders() -> list[list[str]]:
+    rows = _stiff("slope")
+    programs = values(rows, "program")
+    table = [["", "steps", *(f"`{name}`" for name in programs)]]
+    for problem in values(rows, "problem"):
+        few = pick(rows, problem=problem)
+        cells = [
+            "overflow"
+            if row["slope"] is None
+            else f"{power(row['error with many'])}, {row['slope']:.1f}"
+            for row in few
+        ]
+        table.append([problem, f"{few[0]['few']}, {few[0]['many']}", *cells])
+    return table
+
+
+def _short(error: float) -> str:
+    """One digit, as 2e-4 or 9e23."""
+    return f"{error:.0e}".replace("e+", "e").replace("e0", "e").replace("e-0", "e-")
+
+
+@table
+def stiff_parts() -> list[list[str]]:
+    rows = _stiff("in M")
+    counts = values(rows, "steps")
+    table = [["in M", "", *(f"{n} steps" for n in counts)]]
+    parts = ("mean", "0.8 of the largest", "largest")
+    for part, program in itertools.product(parts, values(rows, "program")):
+        found = [one(rows, program=program, steps=n, **{"in M": part})["error"] for n in counts]
+        cells = ["overflow" if e is None else _short(e) for e in found]
+        table.append([part, f"`{program}`", *cells])
+    return table
+
+
+@number
+def stiff_whole_operator() -> str:
+    row, *_ = _stiff("whole operator, steps")
+    return f"an error of {power(row['error'])} in {in_units(row['seconds a solve'][2])}"
+
+
+@table
+def stiff_control() -> list[list[str]]:
+    steps, errors = _stiff("step over an equal one"), _stiff("controlled to")
+    programs = [name for name in ("ETD43", "ETD54") if pick(errors, program=name)]
+    head = [f"`{name}`, {what}" for name in programs for what in ("a step", "error")]
+    table = [["", *head]]
+    for problem in values(errors, "problem"):
+        cells = []
+        for name in programs:
+            found = pick(steps, problem=problem, program=f"{name} controlled", to=1e-6)
+            ratio = found[0]["step over an equal one"] if found else None
+            cells.append(cell(ratio) if ratio else "")
+            over = [r["error over tolerance"] for r in pick(errors, problem=problem, program=name)]
+            cells.append("not finite" if None in over else between(over))
+        table.append([problem, *cells])
+    return table
+
+
+@table
+def stiff_damping() -> list[list[str]]:
+    rows = load("stability")["rows"]
+    shown = (-1.5, -1.0, -0.75, -0.5, -0.25)
+    columns = ("stable from r =", "stable to y =", "the same over evaluations")
+    table = [["", *(f"r = {r:g}" for r in shown), *columns]]
+    for row in pick(rows, panel="damping"):
+        r, (growth,) = row["x"], row["y"]
+        waves = one(rows, panel="oscillation", curve=row["curve"])
+        y, (of_y,) = waves["x"], waves["y"]
+        # Rounding leaves one a little above one.
+        last = max(x for x, size in zip(r, growth, strict=True) if x < 0 and size > 1 + 1e-9)
+        stable = itertools.takewhile(lambda pair: pair[1] <= 1 + 1e-9, zip(y, of_y, strict=True))
+        longest, _ = max(stable)
+        table.append(
+            [
+                f"`{row['curve']}`",
+                *(two_digits(dict(zip(r, growth, strict=True))[x]) for x in shown),
+                f"{r[r.index(last) + 1]:.2f}",
+                f"{longest:.2f}",
+                f"{longest / EVALUATIONS[row['curve']]:.2f}",
+            ]
+        )
+    return table
+
+
+@table
+def stiff_dispersion() -> list[list[str]]:
+    rows = _stiff("dispersion, steps")
+    counts = values(rows, "dispersion, steps")
+    table = [["", *(f"{n} steps" for n in counts)]]
+    for program in values(rows, "program"):
+        errors = [row["error"] for row in pick(rows, program=program)]
+        cells = ["overflow" if e is None else f"{e:.1e}".replace("e-0", "e-") for e in errors]
+        table.append([STIFF[program], *(c.replace("e+00", "") for c in cells)])
+    return table
 
 
 _TOO_LARGE = "top, large steps"

@@ -317,9 +317,9 @@ def of_kuramoto() -> Scene:
         c = like.fft.rfft(u)
         return like.fft.irfft(spectrum * c + square(c, like), n)
 
-    def coefficients(u: Any, num_steps: int) -> Any:
-        solve = equal_steps(field, cfjax.CF4(), t1)
-        return jnp.fft.irfft(solve(jnp.fft.rfft(u), num_steps), n)
+    def coefficients(solver: Any) -> Callable:
+        solve = equal_steps(field, solver, t1)
+        return lambda u, num_steps: jnp.fft.irfft(solve(jnp.fft.rfft(u), num_steps), n)
 
     def in_space(t: Any, u: Any, args: Any) -> Any:
         return velocity(u, jnp)
@@ -329,7 +329,8 @@ def of_kuramoto() -> Scene:
 
     exact = on_host(on_grid, "DOP853", t1)(y0, LEAST)
     programs = {
-        "CF4": Program("cfjax", coefficients, steps(150)),
+        "CF4": Program("cfjax", coefficients(cfjax.CF4()), steps(150)),
+        "ETD54": Program("cfjax", coefficients(cfjax.ETD54()), steps(30)),
         # With 2000 it overflows.
         "diffrax, Tsit5": Program("diffrax", in_plain_space(in_space, diffrax.Tsit5(), t1), [2400]),
         "SciPy, DOP853": Program("scipy", on_host(on_grid, "DOP853", t1), TOLERANCES[::2]),

@@ -35,11 +35,9 @@ def measure(quick: bool) -> Iterator[results.Row]:
 
 
 def draw() -> dict[str, Figure]:
-    figure = Figure(figsize=(17, 8), layout="constrained")
-    grid = figure.subplots(2, 4)
-    for axes in grid.flat[len(PANELS) :]:
-        axes.set_axis_off()
-    for panel, axes in zip(PANELS, grid.flat, strict=False):
+    figure = Figure(figsize=(14, 12.5), layout="constrained")
+    grid = figure.subplots(3, 3)
+    for panel, axes in zip(PANELS, grid.flat, strict=True):
         panel(axes)
         axes.title.set_fontsize(10)
         axes.grid(color="0.9", linewidth=0.6)
@@ -236,7 +234,73 @@ def heat_contrast(axes: Axes) -> None:
     axes.legend(fontsize=8)
 
 
-MEASURED = {f.__name__: f for f in (rotations, families, precisions, stiffness, contrast)}
+SEMILINEAR = {
+    name: getattr(cfjax, name)()
+    for name in ("CF4", "ETDRK4", "ETD43", "ETD54")
+    if hasattr(cfjax, name)
+}
+
+
+def damping() -> Curves:
+    """The largest growth of a step, over |z| from 1 to 1e4, of `u' = -|z| u + r |z| u`."""
+    parts = np.linspace(-1.5, 1.0, 51)
+    z, r = (x.ravel() for x in np.meshgrid(np.geomspace(1, 1e4, 200), parts))
+    for name, solver in SEMILINEAR.items():
+        growth = _growth(solver, -z, r * z).reshape(len(parts), -1)
+        yield name, parts, growth.max(axis=1)
+
+
+def oscillation() -> Curves:
+    """The growth of a step of `u' = -0.3 y u + i y u`."""
+    y = np.linspace(0, 6, 121)
+    for name, solver in SEMILINEAR.items():
+        yield name, y, _growth(solver, -0.3 * y, 1j * y)
+
+
+def _growth(solver: Any, exact: np.ndarray, explicit: np.ndarray) -> np.ndarray:
+    """Of one step of length 1 from u = 1, by the solver itself."""
+
+    def field(t, u, explicit):
+        return cfjax.Affine(1.0, explicit * u, exact)
+
+    w = jnp.asarray(explicit)
+    u0 = jnp.ones_like(w)
+    sol = cfjax.integrate(cfjax.LieTerm(field), solver, 0.0, 1.0, u0, w, num_steps=1)
+    return np.abs(np.asarray(jax.tree.leaves(sol.ys)[0][-1]))
+
+
+def stiff_explicit_part(axes: Axes) -> None:
+    for (name, r, growth), color in zip(curves("damping"), (BLUE, GREY, PINK, RED), strict=False):
+        axes.semilogy(r, growth, color=color, label=name)
+    axes.axhline(1, color="0.5", linewidth=1, linestyle=":")
+    axes.set(
+        title="u' = (z + w) u, z < 0 exact and w = r |z| explicit:\nlargest growth of a step",
+        xlabel="r: the explicit part over |z|, damping where negative",
+        ylabel="largest |R| for |z| from 1 to 10 000",
+        ylim=(1e-2, 1e4),
+    )
+    axes.legend(fontsize=8)
+
+
+def oscillating_explicit_part(axes: Axes) -> None:
+    for (name, y, growth), color in zip(
+        curves("oscillation"), (BLUE, GREY, PINK, RED), strict=False
+    ):
+        axes.plot(y, growth, color=color, label=name)
+    axes.axhline(1, color="0.5", linewidth=1, linestyle=":")
+    axes.set(
+        title="u' = (-0.3 y + i y) u, the damping exact,\nthe oscillation explicit",
+        xlabel="y",
+        ylabel="growth |R| of a step",
+        ylim=(0, 3),
+    )
+    axes.legend(fontsize=8)
+
+
+MEASURED = {
+    f.__name__: f
+    for f in (rotations, families, precisions, stiffness, contrast, damping, oscillation)
+}
 PANELS = (
     regions_of_cf3,
     regions_of_cf4,
@@ -245,6 +309,8 @@ PANELS = (
     single_precision,
     heat_steps,
     heat_contrast,
+    stiff_explicit_part,
+    oscillating_explicit_part,
 )
 
 
