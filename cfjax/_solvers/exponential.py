@@ -90,7 +90,8 @@ class AbstractExponential(AbstractChartSolver):
         g = _rest(first, first, start)
 
         def reach(row: Columns) -> PyTree:
-            return jtu.tree_map(jnp.add, chart.start, linear.increment(row, changes))
+            point = jtu.tree_map(jnp.add, chart.start, linear.increment(row, changes))
+            return chart.branching(point)
 
         def evaluate(stage: int, c: float, point: PyTree) -> None:
             later = _rest(chart.frozen(c, point), first, chart.without_sums(point))
