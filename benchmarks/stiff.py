@@ -116,6 +116,8 @@ class Program:
         while self.run(n).error > target and n < MOST_STEPS:
             n *= 2
             yield n
+        if self.run(n).error > target:
+            return
         while True:
             high = min(r.steps for r in self.runs.values() if r.error <= target)
             misses = [r.steps for r in self.runs.values() if r.error > target and r.steps < high]

@@ -1,4 +1,4 @@
-"""Affine fields with a linear part that a fast transform makes diagonal."""
+"""Affine fields with a linear part that a transform makes diagonal."""
 
 from collections.abc import Sequence
 from typing import Any, ClassVar
@@ -28,14 +28,16 @@ class Affine(AbstractAlgebraElement, AbstractSemilinearField):
     M is diagonal in the coefficients of a transform, with the eigenvalues `spectrum`. The flow of
     the field is `exp(alpha M) x + phi_1(alpha M) b` with `phi_1(z) = (exp(z) - 1) / z`, exact
     however stiff M is. So to solve `u' = M u + g(u)` return
-    `Affine(1.0, g(u), spectrum, transform)`. On a grid the transform is a `cfjax.TensorTransform`
-    and u has the shape of the grid.
+    `Affine(1.0, g(u), spectrum, transform)`, and use `cfjax.ETD54`. On a grid the transform is a
+    `cfjax.TensorTransform` and u has the shape of the grid.
 
-    Subtract boundary values or fluxes other than zero: take a smooth w that has them and solve for
-    `v = u - w`, whose boundary values are zero, `v' = M v + g(v + w) + L w - w'`. Here `L w` is M
-    applied to w with its boundary values in place, so it is as smooth as w. If boundary values that
-    vary in time were put into b directly, divided by `dx^2`, the order of CF4 would drop to little
-    more than one.
+    M should hold at least four fifths of the stiffness, for `CF4` half. So of a coefficient that
+    varies it holds the largest value, not the mean.
+
+    Boundary values and fluxes that are constant in time may stand in b, divided by `dx^2`. Subtract
+    those that vary: take a smooth w that has them and solve for `v = u - w`, whose boundary values
+    are zero, `v' = M v + g(v + w) + L w - w'`. Here `L w` is M applied to w with its boundary
+    values in place, so it is as smooth as w. In b they would lower the order, of CF4 to two.
 
     Without a transform the state and `b` are the coefficients themselves, and a flow costs an
     exponential, a division and a polynomial for each eigenvalue. With a transform they are points.

@@ -2,6 +2,7 @@
 
 import csv
 import os
+import textwrap
 from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
@@ -98,7 +99,10 @@ class WorkPrecision(NamedTuple):
         left.set(yscale="log", ylabel="error of the final state")
         _style.logarithmic(left, "time", unit="s")
         label = "flops" if counts_flops else "evaluations of the field"
-        _style.logarithmic(right, label + (f" (not known: {', '.join(unknown)})" * bool(unknown)))
+        if unknown:
+            # On lines of their own, as there may be many.
+            label = "\n".join([label, *textwrap.wrap(f"(not known: {', '.join(unknown)})", 44)])
+        _style.logarithmic(right, label)
         figure.align_xlabels()
         _style.finish(figure, 4)
         return figure
