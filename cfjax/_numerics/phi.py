@@ -78,20 +78,22 @@ def phis(
     """`phi_0(z)` to `phi_most(z)`. XLA would compute what goes through `once` for each of them."""
     if most == 0:
         return [jnp.exp(z)]
-    is_small = jnp.abs(z) < _RADIUS
+    # Of complex numbers XLA computes moduli, quotients and exponentials slowly.
+    is_small = jnp.real(z * jnp.conj(z)) < _RADIUS**2
     half = jnp.where(is_small, z, 0) / 2
     top = polynomial([1 / factorial(j + most) for j in range(_terms(_RADIUS / 2))], half)
-    top, of_half, of_z, first = once([top, jnp.exp(half), jnp.exp(z), jnp.expm1(z)])
+    e, inverse = jnp.exp(jnp.where(is_small, half, z)), 1 / jnp.where(is_small, 1, z)
+    top, e, inverse = once([top, e, inverse])
     inner = [top]
     for k in range(most, 1, -1):
         inner.insert(0, half * inner[0] + 1 / factorial(k - 1))
-    found, outer = [of_z], first / jnp.where(is_small, 1, z)
+    found, outer = [jnp.where(is_small, e * e, e)], e
     for k in range(1, most + 1):
         # phi_k(2 w), in which all terms are positive for real w.
         terms = (inner[j - 1] * (1 / factorial(k - j)) for j in range(1, k + 1))
-        doubled = functools.reduce(jnp.add, terms, of_half * inner[k - 1]) * 0.5**k
+        doubled = functools.reduce(jnp.add, terms, e * inner[k - 1]) * 0.5**k
+        outer = (outer - 1 / factorial(k - 1)) * inverse
         found.append(jnp.where(is_small, doubled, outer))
-        outer = (outer - 1 / factorial(k)) / jnp.where(is_small, 1, z)
     return found
 
 

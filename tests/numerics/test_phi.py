@@ -180,6 +180,7 @@ def test_phi_against_sixty_digits(dtype):
             assert off <= limit, (k, x, float(off / size))
 
 
+@pytest.mark.representatives(1)
 @pytest.mark.parametrize("mode", [jax.grad, jax.jacfwd])
 def test_derivatives_of_phi(mode):
     """At zero those of the series, and elsewhere `phi_k' = phi_k - k phi_(k+1)`."""
