@@ -99,10 +99,8 @@ class WorkPrecision(NamedTuple):
         left.set(yscale="log", ylabel="error of the final state")
         _style.logarithmic(left, "time", unit="s")
         label = "flops" if counts_flops else "evaluations of the field"
-        if unknown:
-            # On lines of their own, as there may be many.
-            label = "\n".join([label, *textwrap.wrap(f"(not known: {', '.join(unknown)})", 44)])
-        _style.logarithmic(right, label)
+        label += f" (not known: {', '.join(unknown)})" * bool(unknown)
+        _style.logarithmic(right, textwrap.fill(label, 50))
         figure.align_xlabels()
         _style.finish(figure, 4)
         return figure
