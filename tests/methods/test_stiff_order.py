@@ -42,6 +42,15 @@ PUBLISHED = {
     ),
     # The exponential midpoint rule in this form, of stiff order 2.
     "two stages": (cfjax.ExponentialTableau([0, HALF], {}, {2: {2: 2}}), (2, 2)),
+    # Radau's nodes with a line through stages 1 and 2; and the same quadrature for z = 0 alone.
+    "three stages": (
+        cfjax.ExponentialTableau([0, F(1, 3), F(2, 3)], {3: {2: {2: F(4, 3)}}}, {3: {2: F(3, 2)}}),
+        (3, 3),
+    ),
+    "three stages, weakly": (
+        cfjax.ExponentialTableau([0, F(1, 3), F(2, 3)], {3: {2: {2: F(4, 3)}}}, {3: {3: F(9, 2)}}),
+        (2, 2),
+    ),
     "Euler": (cfjax.ExponentialTableau([0], {}, {}), (1, 1)),
 }
 
@@ -51,7 +60,7 @@ def orders(tableau):
 
 
 @pytest.mark.parametrize("name", PUBLISHED)
-def test_orders_in_print(name):
+def test_orders_of_known_methods(name):
     tableau, expected = PUBLISHED[name]
     assert orders(tableau) == expected
 
