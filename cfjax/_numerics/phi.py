@@ -54,7 +54,7 @@ def phi(
     error is relative to `1 / |z|`.) Derivatives of any order work, forward and reverse, at zero
     too.
 
-    **Cost:** some 30 operations more than two exponentials.
+    **Cost:** an exponential and some 80 operations; phi_0 is `jnp.exp`, phi_1 costs less.
 
     **Raises:** `ValueError` for another k, `TypeError` for another dtype.
     """
@@ -230,7 +230,7 @@ def matrix_phis(
     """
     found: dict[float, tuple[Array, ...]] = {}
     for c in sorted(set(nodes)):
-        # Twice as many doublings cost no more than to begin anew.
+        # Two doublings take fewer products than a series of its own.
         halves = [(c / 2**k, k) for k in (1, 2) if c / 2**k in found]
         if not halves:
             found[c] = _matrix_phis(c * a, most)

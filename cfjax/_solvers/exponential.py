@@ -255,8 +255,8 @@ class ETDRK4(AbstractExponential):
 class ETD43(AbstractExponential, diffrax.AbstractAdaptiveSolver):
     """Order 4 and stiff order 4, with an embedded method of order 3: 5 evaluations.
 
-    Its estimate uses the field at the end, with which the next step begins. For stiff problems at
-    loose tolerances, and in two dimensions. Dense output of order 3.
+    Its estimate uses the field at the end, with which the next step begins. For stiff problems and
+    errors of about 1e-3. Dense output of order 3.
 
     Source: derived for this package, with the conditions of Hochbruck & Ostermann, Explicit
     exponential Runge-Kutta methods for semilinear parabolic problems, SIAM J. Numer. Anal. 43
