@@ -548,7 +548,7 @@ DEFECTS = [
     ),
     Defect(
         "_xla/invariant.py",
-        "fixed = [v for v in dict.fromkeys(marked) if not computing([v])[1]]",
+        "fixed = [v for v in dict.fromkeys(marked) if v in single and not computing([v])[1]]",
         "fixed = []",
         "nothing computed before a loop of equal steps",
         "solvers/test_exponential.py -k functions",

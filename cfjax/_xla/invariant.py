@@ -39,8 +39,9 @@ def invariants_first(turn: Callable[[PyTree], PyTree], carry: PyTree) -> Callabl
     def computing(vs: list[Any]) -> tuple[ClosedJaxpr, Sequence[int]]:
         return narrowed(ClosedJaxpr(altered(jaxpr, outvars=vs), program.consts))
 
-    # Those that need nothing of the carry.
-    fixed = [v for v in dict.fromkeys(marked) if not computing([v])[1]]
+    # Those that need nothing of the carry. An operation with more results stays where it is.
+    single = {eqn.outvars[0] for eqn in jaxpr.eqns if len(eqn.outvars) == 1}
+    fixed = [v for v in dict.fromkeys(marked) if v in single and not computing([v])[1]]
     if not fixed:
         return turn
     before, _ = computing(fixed)
