@@ -262,6 +262,48 @@ def batch_compile() -> str:
     return between(row["compile seconds"] for row in rows)
 
 
+def _devices() -> tuple[str, str]:
+    """A GPU and a processor."""
+    first, second = values(load("gpu")["rows"], "device")
+    return first, second
+
+
+@table
+def gpu() -> list[list[str]]:
+    rows, (device, processor) = load("gpu")["rows"], _devices()
+
+    def text(where: dict, device: str, dtype: str) -> str:
+        return in_units(one(rows, device=device, dtype=dtype, **where)["seconds"][2])
+
+    table = [["", "method", "GPU, float64", "GPU, float32", "processor, float64"]]
+    for row in pick(rows, device=device, dtype="float64"):
+        where = {key: row[key] for key in ("problem", "members", "method")}
+        what, members = row["problem"], row["members"]
+        count = f"{two_digits(members)} rigid bodies" if members > 1 else "one rigid body"
+        what = what.replace("rigid bodies", count)
+        solver, comma, rest = row["method"].partition(",")
+        table.append(
+            [
+                what,
+                f"`{solver}`{comma}{rest}",
+                text(where, device, "float64"),
+                text(where, device, "float32"),
+                text(where, processor, "float64"),
+            ]
+        )
+    return table
+
+
+@number
+def gpu_name() -> str:
+    return _devices()[0]
+
+
+@number
+def gpu_cores() -> str:
+    return str(load("gpu")["machine"]["cores"])
+
+
 @number
 def chart_compile() -> str:
     rows = [row for row in load("charts")["rows"] if "/" in row["chart"]]

@@ -19,10 +19,7 @@ from ._numerics.checks import Fault, checked, error_if, needing
 from ._numerics.squaring import max_over_batch
 from ._solvers.base import is_finite, result_of
 from ._step_back import repeat_and_undo
-from ._xla import invariants_first, repeat
-
-# Steps whose derivative is not rewritten.
-_FEW = 10
+from ._xla import invariants_first, limits, repeat, within_equal_steps
 
 _NOT_FINITE = "y0 must be finite, got an entry that is not."
 
@@ -211,12 +208,17 @@ def equal_steps(
         solver = cast(Any, solver).for_equal_steps((t1 - t0) / intervals)
         forward = invariants_first(step, carry)
 
-    # Of a few steps the derivative takes longer to compile than it will ever save.
-    order = 0 if isinstance(num_steps, int) and num_steps < _FEW else 1
+    order = 0 if isinstance(num_steps, int) and num_steps < limits.FEW else 1
 
     def advance(carry, number):
         if step_back:
-            return repeat_and_undo(forward, lambda carry: step(carry, -1), carry, number, throw)
+            back = lambda carry: step(carry, -1)  # noqa: E731
+            # What a function closes over becomes an argument, which has a derivative.
+            with within_equal_steps():
+                there = eqx.filter_closure_convert(forward, carry)
+                back = eqx.filter_closure_convert(back, carry)
+            several = lambda step, carry, number: repeat(step, carry, number, order=0)[0]  # noqa: E731
+            return repeat_and_undo(several, there, back, carry, number, throw)
         # XLA would scalarise a loop of one turn, and compute the step anew for each of its uses.
         if isinstance(number, int) and number == 1:
             return forward(carry)

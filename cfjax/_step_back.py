@@ -12,7 +12,6 @@ from jaxtyping import Array, Bool, PyTree
 
 from ._numerics.checks import Fault
 from ._solvers.base import largest
-from ._xla import repeat, within_equal_steps
 
 Step = Callable[[PyTree], PyTree]
 
@@ -23,16 +22,19 @@ _MISSED = (
 )
 
 
-def repeat_and_undo(step: Step, back: Step, carry: PyTree, num_steps: int, throw: bool) -> PyTree:
-    """Replaces `carry` by `step(carry)`, `num_steps` times, of which `back` is the inverse.
+def repeat_and_undo(
+    repeat: Callable[[Step, PyTree, int], PyTree],
+    step: Step,
+    back: Step,
+    carry: PyTree,
+    num_steps: int,
+    throw: bool,
+) -> PyTree:
+    """`repeat(step, carry, num_steps)`, where `back` is the inverse of `step`.
 
-    The second entry of a carry is the state. Where the way back misses the start, the derivative is
-    NaN, or an error if `throw`.
+    Both are pytrees, whose arrays have derivatives too. The second entry of a carry is the state.
+    Where the way back misses the start, the derivative is NaN, or an error if `throw`.
     """
-    # What a function closes over becomes an argument, which has a derivative.
-    with within_equal_steps():
-        step = eqx.filter_closure_convert(step, carry)
-        back = eqx.filter_closure_convert(back, carry)
     moving, rest = _parts((carry, step))
     rest, static = eqx.partition((rest, back), eqx.is_array)
 
@@ -40,7 +42,7 @@ def repeat_and_undo(step: Step, back: Step, carry: PyTree, num_steps: int, throw
     def steps(moving: PyTree, rest: PyTree) -> PyTree:
         rest, _ = eqx.combine(rest, static)
         carry, step = eqx.combine(moving, rest)
-        return repeat(lambda carry: step(carry), carry, num_steps, order=0)[0]
+        return repeat(lambda carry: step(carry), carry, num_steps)
 
     def forward(moving: PyTree, rest: PyTree) -> tuple[PyTree, PyTree]:
         end = steps(moving, rest)

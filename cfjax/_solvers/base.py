@@ -19,9 +19,9 @@ from .._control_term import is_driven, no_estimate
 from .._field import is_field
 from .._numerics.checks import Fault
 from .._term import product, velocity
-from .._xla import is_rewritten, materialised_in_rows, materialised_together, scalarised
 from .chart import Chart
-from .compensation import added, at, no_compensation, with_sums, zeros
+from .compensation import added, at, no_compensation, zeros
+from .compiled import control_of, is_rewritten, materialised_in_rows, scalarised, shared_end
 from .dense import AbstractPath, Interpolation
 
 
@@ -211,39 +211,6 @@ class Step(eqx.Module):
     is_shared: bool = eqx.field(static=True, default=False)
 
 
-def control_of(terms: diffrax.AbstractTerm, t0: Any, t1: Any, **kwargs: Any) -> PyTree:
-    """The control of a step, whose random numbers are drawn once."""
-    control = terms.contr(t0, t1, **kwargs)
-    if not is_driven(terms):
-        return control
-    # Otherwise XLA makes normal numbers of the random bits again for each flow that uses them. A
-    # barrier in what is rewritten would keep arrays whole.
-    return materialised_in_rows(control) if is_rewritten() else lax.optimization_barrier(control)
-
-
-def by_turns(
-    body: Callable[[PyTree, Any], tuple[PyTree, PyTree]], carry: PyTree, turns: Sequence[Any]
-) -> tuple[PyTree, list[PyTree]]:
-    """What `jax.lax.scan` makes of some turns, with the outputs of each; most in one loop.
-
-    A step that is rewritten for XLA must not have a loop within. So two turns are unrolled there;
-    more would be too long, and then each turn is rewritten instead.
-    """
-    if len(turns) == 1 or (len(turns) == 2 and is_rewritten()):
-        outputs = []
-        for turn in turns:
-            carry, output = body(carry, turn)
-            outputs.append(output)
-        return carry, outputs
-
-    def once(carry: PyTree, turn: Any) -> Any:
-        return scalarised(lambda carry: body(carry, turn), carry)
-
-    many = jtu.tree_map(lambda *xs: jnp.asarray(xs), *turns)
-    carry, stacked = lax.scan(once, carry, many)
-    return carry, [jtu.tree_map(lambda x: x[k], stacked) for k in range(len(turns))]  # noqa: B023
-
-
 def check_choice(name: str, value: Any, *choices: Any) -> None:
     """Raises `ValueError` unless the value is one of the choices."""
     if not any(value is x or (isinstance(x, str) and value == x) for x in choices):
@@ -351,21 +318,6 @@ def _off_manifold(fault: Fault, part: Any, place: str, point: PyTree) -> Fault:
             f"must have {expected}, and is off by more than {x:.1g}.",
         )
     return fault
-
-
-def shared_end(
-    compensation: PyTree, end: PyTree, error: PyTree, is_followed: bool
-) -> tuple[PyTree, PyTree]:
-    """The end of a step and its error, which XLA would otherwise compute for each use of an entry.
-
-    A compensated sum uses each increment several times, and so does what follows from the end.
-    """
-    is_used = is_followed or error is not None
-    moving = with_sums(lambda c, z: z if is_used or c is not None else None, compensation, end)
-    moving, error = materialised_together((moving, error), alone=is_used)
-    return with_sums(
-        lambda c, z, new: new if is_used or c is not None else z, compensation, end, moving
-    ), error
 
 
 # diffrax traces a step three times, which takes longer than all else that it traces. Inline, the

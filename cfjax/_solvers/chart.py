@@ -9,8 +9,13 @@ import jax.tree_util as jtu
 from jaxtyping import Array, PyTree, Real
 
 from .._field import Rest, flow, from_chart, is_field, to_chart
-from .._xla import invariant, materialised_if_long, materialised_in_rows, materialised_together
 from .compensation import at, with_sums
+from .compiled import (
+    invariant,
+    materialised_if_long,
+    materialised_in_rows,
+    materialised_together,
+)
 
 
 class Chart:

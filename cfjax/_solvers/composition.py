@@ -9,7 +9,8 @@ from jax import lax
 
 from .._control_term import is_driven
 from .._methods.splitting import COMPOSITIONS
-from .base import AbstractLieSolver, State, by_turns, result_of, time_at
+from .base import AbstractLieSolver, State, result_of, time_at
+from .compiled import by_turns
 from .dense import Pieces, as_part
 
 

@@ -15,8 +15,8 @@ from jaxtyping import Array, Float, PyTree, Real
 
 from .._field import combine, from_chart
 from .._methods.tableau import ContinuousExtension
-from .._xla import scalarised
 from .chart import carried
+from .compiled import scalarised
 from .stages import can_roll, rolled_flows
 
 

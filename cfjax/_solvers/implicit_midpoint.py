@@ -13,9 +13,10 @@ from jaxtyping import Array, Bool, PyTree
 from .._control_term import is_driven
 from .._field import is_field, to_chart
 from .._term import product
-from .base import AbstractLieSolver, begun, ended, largest, shared_end, time_at
+from .base import AbstractLieSolver, begun, ended, largest, time_at
 from .chart import moved
 from .compensation import with_sums
+from .compiled import shared_end
 from .dense import Interpolation, Path
 
 # The flow of the step's one field, for a part of the step.

@@ -17,13 +17,9 @@ from .._methods.proved import proved
 from .._methods.tableau import Product, Row, Tableau
 from .base import Step
 from .commutator_free import AbstractCommutatorFree, trimmed
+from .compiled import limits
 from .dense import Path
 from .stages import is_uniform
-
-# Unrolled stages cost compile time quadratically. And XLA keeps the fields of several of them, to
-# add them up at once: as many as fit in a cache may be.
-_MAX_UNROLLED = 5
-_LARGE = 4096
 
 
 class AbstractLowStorage(AbstractCommutatorFree, diffrax.AbstractStratonovichSolver):
@@ -80,7 +76,9 @@ class AbstractLowStorage(AbstractCommutatorFree, diffrax.AbstractStratonovichSol
         if self.unroll is not None:
             return self.unroll
         size = sum(jnp.size(leaf) for leaf in jtu.tree_leaves(point))
-        return len(self.b) <= _MAX_UNROLLED and size <= _LARGE
+        # Unrolled stages cost compile time quadratically. And XLA keeps the fields of several of
+        # them, to add them up at once.
+        return len(self.b) <= limits.MANY and size <= limits.LARGE
 
 
 def _tableau(a: Row, b: Row, embedded: Callable[[Product], Any] | None = None) -> Tableau:

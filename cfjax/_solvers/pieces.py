@@ -18,8 +18,9 @@ from jaxtyping import PyTree
 
 from .._control_term import is_driven, paths
 from .._term import product
-from .base import AbstractChartSolver, AbstractLieSolver, by_turns, control_of, result_of, time_at
+from .base import AbstractChartSolver, AbstractLieSolver, result_of, time_at
 from .commutator_free import CF4, LieEuler
+from .compiled import by_turns, control_of
 from .dense import Pieces, as_part
 from .dependence import depending_on_state
 

@@ -18,15 +18,13 @@ from .base import (
     AbstractLieSolver,
     State,
     begun,
-    by_turns,
-    control_of,
     ended,
     fault_of_start,
-    shared_end,
     time_at,
 )
 from .chart import flow_at, moved
 from .compensation import at, no_compensation, with_sums, zeros
+from .compiled import by_turns, control_of, shared_end
 from .dense import part_of_step
 from .dependence import depending_on_time
 

@@ -15,19 +15,8 @@ from .._field import AbstractFrozenField, describe, is_field
 from .._fields.elementwise import Elementwise
 from .._methods.tableau import Product, Row
 from .._numerics.vectors import pack
-from .._xla import are_long, is_rewritten, table
 from .chart import Chart
-
-# A loop copies the fields of all stages in each of its turns. For a dense matrix of more entries
-# that moves a vector, this takes longer than the flow.
-_SMALL = 100
-
-# Of a point in the chart of a field, with its columns. Where a loop is differentiated, it keeps
-# those of all stages for each of its turns.
-_SMALL_STEP = 2048
-
-# Fewer stages are mostly short enough to be rewritten for XLA; to look costs a trace of one more.
-_MANY = 8
+from .compiled import are_long, is_rewritten, limits, table
 
 
 def can_roll(unroll: bool | None, field: PyTree, point: PyTree, is_long: bool = False) -> bool:
@@ -43,7 +32,7 @@ def can_roll(unroll: bool | None, field: PyTree, point: PyTree, is_long: bool = 
     if unroll is not None:
         return is_possible and not unroll
     pays = is_long or not is_rewritten()
-    return is_possible and pays and _size(field) <= max(_SMALL, 4 * _size(point))
+    return is_possible and pays and _size(field) <= max(limits.MAX_SIZE, 4 * _size(point))
 
 
 def _can_roll_in_room(
@@ -56,7 +45,7 @@ def _can_roll_in_room(
     first = known[-1]
     if unroll or not is_field(first) or type(first).room is AbstractFrozenField.room:
         return False
-    pays = unroll is False or (not is_rewritten() and _size(chart.start) <= _SMALL_STEP)
+    pays = unroll is False or (not is_rewritten() and _size(chart.start) <= limits.LARGE)
     if not pays or any(x.span is not first.span for x in known):
         return False
     room = first.room(chart.start, num_stages)
@@ -212,9 +201,10 @@ def rolled_elements(
     def stage(c: Any, u: PyTree) -> PyTree:
         return element(u, chart.frozen_after([u], c, chart.flow(u, chart.start)))
 
-    # Before all of them are traced, only to find that they are too long together.
+    # Before all of them are traced, only to find that they are too long together. Few are mostly
+    # short enough; to look costs a trace of one more.
     one = functools.partial(stage, times[0])
-    is_long = len(rows) > _MANY and is_rewritten() and are_long(one, first, len(rows))
+    is_long = len(rows) > limits.MANY and is_rewritten() and are_long(one, first, len(rows))
     if can_roll(unroll, first, first, is_long) and is_uniform(chart):
         made = table(
             lambda c, u: _like(first, stage(c, u)), known, _padded(rows, n), jnp.asarray(times)
@@ -227,7 +217,7 @@ def rolled_elements(
     if not _can_roll_in_room(unroll, chart, known, n):
         return None
     # A bracket takes time as the third power of the room: less for the first ones.
-    half = len(rows) // 2 if len(rows) > _MANY else 0
+    half = len(rows) // 2 if len(rows) > limits.MANY else 0
     for few in (slice(half), slice(half, None)) if half else (slice(None),):
         m = len(known) + len(rows[few])
         fields = _InRoom.of(known, chart.start, m, m)

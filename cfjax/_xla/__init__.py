@@ -10,11 +10,13 @@
 - `pack`, `unpack`: `jnp.stack` and `jnp.unstack` in a form that XLA fuses.
 - `smooth`: a mark of functions that compare numbers and yet are smooth up to rounding.
 - `materialised`, `call`: arrays and functions that XLA computes on their own.
+- `limits`: the numbers that decide.
 - `rewriting`: the switch that turns it all off; `is_rewritten`: what there is around.
 
 Nothing outside may import from the files within. `README.md` here says what each trick buys.
 """
 
+from . import limits as limits
 from .call import call as call
 from .invariant import invariant as invariant
 from .invariant import invariants_first as invariants_first

@@ -56,8 +56,6 @@ from .understood import MOVES, REDUCTIONS, is_in_place, is_readable
 # Of a longer step that stands alone, not in a loop of equal steps, derivatives are left to JAX: a
 # gradient through diffrax's loop would take two to three times as long to compile.
 _SHORT_TO_DIFFERENTIATE = FUNCTION // 2
-# About as many operations combine the stages of a long method.
-_COMBINATIONS = 1000
 
 _CALLS = frozenset(("jit", "pjit"))
 
@@ -124,9 +122,9 @@ def scalarised(fun: Callable[[PyTree], PyTree], y: PyTree) -> PyTree:
 
 
 def are_long(fun: Callable[[PyTree], PyTree], y: PyTree, times: int) -> bool:
-    """Whether so many of `fun(y)`, and what combines them, are too long to be scalarised."""
+    """Whether so many of `fun(y)` are too long to be scalarised."""
     code = without_dead_code(jax.make_jaxpr(fun)(y).jaxpr)
-    return times * _operations(code) > MAX_OPERATIONS - _COMBINATIONS
+    return times * _operations(code) > MAX_OPERATIONS
 
 
 class Program(NamedTuple):

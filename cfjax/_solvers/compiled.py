@@ -1,0 +1,74 @@
+"""How a step is compiled. Of this folder only this file knows `_xla`.
+
+A step says of its values that several results need them, and what of it may be one loop. What
+becomes of that in the program is decided in `_xla`.
+"""
+
+from collections.abc import Callable, Sequence
+from typing import Any
+
+import diffrax
+import jax.numpy as jnp
+import jax.tree_util as jtu
+from jax import lax
+from jaxtyping import PyTree
+
+from .._control_term import is_driven
+from .._xla import are_long as are_long
+from .._xla import invariant as invariant
+from .._xla import is_rewritten as is_rewritten
+from .._xla import limits as limits
+from .._xla import materialised_if_long as materialised_if_long
+from .._xla import materialised_in_rows as materialised_in_rows
+from .._xla import materialised_together as materialised_together
+from .._xla import scalarised as scalarised
+from .._xla import table as table
+from .compensation import with_sums
+
+
+def control_of(terms: diffrax.AbstractTerm, t0: Any, t1: Any, **kwargs: Any) -> PyTree:
+    """The control of a step, whose random numbers are drawn once."""
+    control = terms.contr(t0, t1, **kwargs)
+    if not is_driven(terms):
+        return control
+    # Otherwise XLA makes normal numbers of the random bits again for each flow that uses them. A
+    # barrier in what is rewritten would keep arrays whole.
+    return materialised_in_rows(control) if is_rewritten() else lax.optimization_barrier(control)
+
+
+def by_turns(
+    body: Callable[[PyTree, Any], tuple[PyTree, PyTree]], carry: PyTree, turns: Sequence[Any]
+) -> tuple[PyTree, list[PyTree]]:
+    """What `jax.lax.scan` makes of some turns, with the outputs of each; most in one loop.
+
+    A step that is rewritten for XLA must not have a loop within. So two turns are unrolled there;
+    more would be too long, and then each turn is rewritten instead.
+    """
+    if len(turns) == 1 or (len(turns) == 2 and is_rewritten()):
+        outputs = []
+        for turn in turns:
+            carry, output = body(carry, turn)
+            outputs.append(output)
+        return carry, outputs
+
+    def once(carry: PyTree, turn: Any) -> Any:
+        return scalarised(lambda carry: body(carry, turn), carry)
+
+    many = jtu.tree_map(lambda *xs: jnp.asarray(xs), *turns)
+    carry, stacked = lax.scan(once, carry, many)
+    return carry, [jtu.tree_map(lambda x: x[k], stacked) for k in range(len(turns))]  # noqa: B023
+
+
+def shared_end(
+    compensation: PyTree, end: PyTree, error: PyTree, is_followed: bool
+) -> tuple[PyTree, PyTree]:
+    """The end of a step and its error, which XLA would otherwise compute for each use of an entry.
+
+    A compensated sum uses each increment several times, and so does what follows from the end.
+    """
+    is_used = is_followed or error is not None
+    moving = with_sums(lambda c, z: z if is_used or c is not None else None, compensation, end)
+    moving, error = materialised_together((moving, error), alone=is_used)
+    return with_sums(
+        lambda c, z, new: new if is_used or c is not None else z, compensation, end, moving
+    ), error
