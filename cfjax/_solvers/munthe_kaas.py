@@ -26,6 +26,7 @@ from .._methods.order_conditions import runge_kutta_order
 from .._methods.tableau import ContinuousExtension, Row
 from .base import AbstractChartSolver, Step, check_choice
 from .chart import Chart
+from .compiled import scalarised
 from .dense import Path
 from .stages import rolled_elements
 
@@ -274,8 +275,12 @@ class RKMK(AbstractMuntheKaas, diffrax.AbstractAdaptiveSolver):
         if not rows:
             return path
         start, elements = path.parts(path.arrays)
-        chart = Chart.at_path(field, start, elements)
-        elements = self._stages(elements[:n], rows, times, chart)
+
+        def later(start: PyTree) -> list[PyTree]:
+            chart = Chart.at_path(field, start, elements)
+            return self._stages(elements[:n], rows, times, chart)[n:]
+
+        elements = [*elements[:n], *scalarised(later, start, is_derived=False)]
         return Path.of(path.continuous_extension, start, elements)
 
     @property

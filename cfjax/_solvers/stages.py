@@ -16,7 +16,7 @@ from .._fields.elementwise import Elementwise
 from .._methods.tableau import Product, Row
 from .._numerics.vectors import pack
 from .chart import Chart
-from .compiled import are_long, is_rewritten, limits, table
+from .compiled import are_long, is_rewritten, limits, scalarised, table
 
 
 def can_roll(unroll: bool | None, field: PyTree, point: PyTree, is_long: bool = False) -> bool:
@@ -102,7 +102,8 @@ def rolled_flows(
     stacked = _Stacked(jtu.tree_map(lambda *leaves: pack(leaves), *fields[: weights.shape[1]]))
 
     def body(point: PyTree, row: Array) -> Any:
-        return flow(stacked.combination(row), point), None
+        moved = lambda point: flow(stacked.combination(row), point)  # noqa: E731
+        return scalarised(moved, point, is_derived=False), None
 
     # A weak type would be lost on the way.
     start = jtu.tree_map(lambda x: jnp.asarray(x, jnp.result_type(x)), point)

@@ -91,20 +91,22 @@ def _whole(x: Any) -> Any:
     return x.whole() if _is_apart(x) else x
 
 
-def scalarised(fun: Callable[[PyTree], PyTree], y: PyTree) -> PyTree:
+def scalarised(fun: Callable[[PyTree], PyTree], y: PyTree, is_derived: bool = True) -> PyTree:
     """`fun(y)`, computed on single numbers where `y` is a small state of short vectors.
 
     The result agrees with that of `fun` to rounding. `fun` may close over traced values. Operations
     that have no rule here get the array whole. Where `y` is another state, the program is too long
-    or cannot be scalarised, and inside of `trace`, this is `fun(y)`.
+    or cannot be scalarised, and inside of `trace`, this is `fun(y)`. Unless `is_derived`, and where
+    the program is long, derivatives are JAX's own of the program as it is, which compile faster.
     """
-    program = None if where() else trace(fun, y, "step")
+    program = None if where() else trace(fun, y, "step", is_derived)
     if program is None:
         return fun(y)
     y, parameters = split((y, program.parameters), program.rows)
     # What is around may use single entries, so that XLA computes anew what these share. It does
     # little harm to a step, but much to a derivative.
-    is_derived = program.length <= _SHORT_TO_DIFFERENTIATE or in_equal_steps()
+    is_long = program.length > _SHORT_TO_DIFFERENTIATE
+    is_derived = is_derived and (not is_long or in_equal_steps())
     through = _materialised if is_derived else lambda x: x
     # The derivative of an adaptive loop computes a step at one place and uses its derivative at
     # another. What that needs of the step is many numbers: to compute them again is cheaper than to
@@ -146,7 +148,9 @@ class _Declined(Exception):
     """A program has something that is not to be scalarised."""
 
 
-def trace(fun: Callable[[PyTree], PyTree], y: PyTree, place: Place) -> Program | None:
+def trace(
+    fun: Callable[[PyTree], PyTree], y: PyTree, place: Place, is_derived: bool = True
+) -> Program | None:
     """`fun` as a program that is scalarised at `y`; None if that does not pay or cannot be done.
 
     It must have no effects and be readable (`is_readable`).
@@ -165,7 +169,7 @@ def trace(fun: Callable[[PyTree], PyTree], y: PyTree, place: Place) -> Program |
     except Exception as error:
         return unread(error)
     before = ClosedJaxpr(code, jaxpr.consts)
-    if place == "loop" or num_operations > _SHORT_TO_DIFFERENTIATE:
+    if place == "loop" or num_operations > _SHORT_TO_DIFFERENTIATE or not is_derived:
         # Where a step is not scalarised its stages may be one loop.
         with rewriting(False):
             rolled, shape = jax.make_jaxpr(fun, return_shape=True)(y)
