@@ -1,7 +1,11 @@
-"""Time and memory of many solves at once: the rigid body, 100 steps of CF4.
+"""Time and memory of many solves at once: the rigid body, 100 steps of CF4; and adaptive steps.
 
 `cfjax.map_batch` with several chunk sizes and one plain `jax.vmap` over the whole batch take turns
 in one run, from NumPy arrays to NumPy arrays. The picture shows trajectories per second.
+
+Then 1000 solves with adaptive steps of a tolerance of 1e-7: the end alone, the state at 21 times,
+and the gradient of a sum over these with respect to the start. diffrax's Tsit5 in plain space takes
+turns.
 """
 
 import time
@@ -9,6 +13,7 @@ from collections.abc import Callable, Iterator
 from typing import Any, NamedTuple
 from unittest import mock
 
+import diffrax
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -32,6 +37,8 @@ STYLES: dict[str, dict[str, Any]] = {
     "chunks of 100000": dict(color="#009E73", linestyle="-.", marker="^"),
     "one jax.vmap": dict(color="#000000", linestyle=":", marker="D"),
 }
+ADAPTIVE, TIMES, TOLERANCE = 1000, 21, 1e-7
+METHODS = {"CF54": cfjax.CF54(), "RKMK8": cfjax.RKMK8(), "Tsit5": diffrax.Tsit5()}
 Member = Any  # Angular momentum and principal moments.
 
 
@@ -55,6 +62,53 @@ def measure(quick: bool) -> Iterator[results.Row]:
                 "MiB": results.digits(programs[name].memory / 2**20),
                 "compile seconds": results.digits(programs[name].compile_seconds),
             }
+    members = _members(ADAPTIVE)
+    for what, make in PROGRAMS.items():
+        runs = [results.compiled(jax.vmap(make(solver)), *members) for solver in METHODS.values()]
+        taken = take_turns(runs, repeats=3 if quick else 15)
+        for method, seconds in zip(METHODS, taken, strict=True):
+            yield {
+                "what": what,
+                "method": method,
+                "members": ADAPTIVE,
+                "seconds": results.spread(seconds),
+                "over Tsit5": results.ratios(seconds, taken[-1]),
+            }
+
+
+def _adaptive(solver: Any, num_times: int) -> Callable[[Any, Any], Any]:
+    space = diffrax.ODETerm(lambda t, y, args: jnp.cross(y, y / args))
+    term = space if isinstance(solver, diffrax.Tsit5) else TERM
+    times = jnp.linspace(0.0, END, num_times) if num_times > 1 else None
+
+    def solve(y0: Any, inertia: Any) -> Any:
+        return diffrax.diffeqsolve(
+            term,
+            solver,
+            0.0,
+            END,
+            None,
+            y0,
+            inertia,
+            saveat=diffrax.SaveAt(ts=times, t1=times is None),
+            stepsize_controller=diffrax.PIDController(rtol=TOLERANCE, atol=TOLERANCE),
+            max_steps=256,
+            throw=False,
+        ).ys
+
+    return solve
+
+
+def _gradient(solver: Any) -> Callable[[Any, Any], Any]:
+    solve = _adaptive(solver, TIMES)
+    return jax.grad(lambda y0, inertia: jnp.sum(solve(y0, inertia) ** 3))
+
+
+PROGRAMS: dict[str, Callable[[Any], Callable[[Any, Any], Any]]] = {
+    "end alone": lambda solver: _adaptive(solver, 1),
+    f"{TIMES} times": lambda solver: _adaptive(solver, TIMES),
+    "gradient": _gradient,
+}
 
 
 def _members(size: int) -> Member:

@@ -262,6 +262,19 @@ def batch_compile() -> str:
     return between(row["compile seconds"] for row in rows)
 
 
+@table
+def batch_adaptive() -> list[list[str]]:
+    rows = [row for row in load("batch")["rows"] if "what" in row]
+
+    def text(row: Row) -> str:
+        time = in_units(row["seconds"][2])
+        return time if row["method"] == "Tsit5" else f"{time}; {cell(row['over Tsit5'])}"
+
+    return [["", *values(rows, "what")]] + [
+        [f"`{method}`", *map(text, pick(rows, method=method))] for method in values(rows, "method")
+    ]
+
+
 def _devices() -> tuple[str, str]:
     """A GPU and a processor."""
     first, second = values(load("gpu")["rows"], "device")

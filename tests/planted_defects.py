@@ -731,7 +731,7 @@ DEFECTS = [
     ),
     # Programs for XLA.
     Defect(
-        "_solvers/base.py",
+        "_solvers/compiled.py",
         "moving, error = materialised_together((moving, error), alone=is_used)",
         "moving = materialised_together(moving, alone=is_used)",
         "an error that XLA computes together with its norm",

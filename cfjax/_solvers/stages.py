@@ -103,7 +103,7 @@ def rolled_flows(
 
     def body(point: PyTree, row: Array) -> Any:
         moved = lambda point: flow(stacked.combination(row), point)  # noqa: E731
-        return scalarised(moved, point, is_derived=False), None
+        return scalarised(moved, point), None
 
     # A weak type would be lost on the way.
     start = jtu.tree_map(lambda x: jnp.asarray(x, jnp.result_type(x)), point)

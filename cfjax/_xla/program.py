@@ -6,6 +6,7 @@ every small array as its entries. In a state with leading axes, many short vecto
 are arrays of these axes.
 """
 
+import contextlib
 import math
 from collections.abc import Callable, Sequence
 from typing import Any, NamedTuple
@@ -153,7 +154,8 @@ def trace(
 ) -> Program | None:
     """`fun` as a program that is scalarised at `y`; None if that does not pay or cannot be done.
 
-    It must have no effects and be readable (`is_readable`).
+    It must have no effects and be readable (`is_readable`). Unless `is_derived`, what it was before
+    may have loops whose turns are scalarised.
     """
     rows = _has_rows(y, MAX_ENTRIES[place])
     if not is_on() or not (rows or _is_small_state(y, MAX_ENTRIES[place])):
@@ -171,7 +173,7 @@ def trace(
     before = ClosedJaxpr(code, jaxpr.consts)
     if place == "loop" or num_operations > _SHORT_TO_DIFFERENTIATE or not is_derived:
         # Where a step is not scalarised its stages may be one loop.
-        with rewriting(False):
+        with rewriting(False) if is_derived else contextlib.nullcontext():
             rolled, shape = jax.make_jaxpr(fun, return_shape=True)(y)
         before = rolled if jtu.tree_structure(shape) == structure else before
     unknown = {id(x): x for x in jaxpr.consts if _constant(x) is None}
