@@ -20,8 +20,8 @@ def rewriting(on: bool) -> contextlib.AbstractContextManager:
 
     It is on by default, which makes steps several times faster on CPU and GPU. Without it XLA gets
     every program as it was traced: switch it off to debug a program, or where rewriting does not
-    pay. The values agree to rounding. The environment variable `CFJAX_REWRITE=0` switches it off for a whole
-    process.
+    pay. The values agree to rounding. The environment variable `CFJAX_REWRITE=0` switches it off
+    for a whole process.
 
     ```python
     with cfjax.rewriting(False):
