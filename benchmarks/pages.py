@@ -280,9 +280,8 @@ def gpu() -> list[list[str]]:
     rows = [{**row, "is processor": row["device"] == "cpu"} for row in load("gpu")["rows"]]
 
     def text(where: dict, is_processor: bool, dtype: str) -> str:
-        return in_units(
-            one(rows, **{"is processor": is_processor}, dtype=dtype, **where)["seconds"][2]
-        )
+        where = {**where, "is processor": is_processor, "dtype": dtype}
+        return in_units(one(rows, **where)["seconds"][2])
 
     table = [["", "method", "GPU, float64", "GPU, float32", "processor, float64"]]
     for row in pick(rows, **{"is processor": False}, dtype="float64"):
