@@ -12,7 +12,6 @@ if _signals.is_command():
 from ._control_term import LieControlTerm as LieControlTerm
 from ._field import AbstractAlgebraElement as AbstractAlgebraElement
 from ._field import AbstractFrozenField as AbstractFrozenField
-from ._field import AbstractSemilinearField as AbstractSemilinearField
 from ._field import bracket as bracket
 from ._field import combine as combine
 from ._field import flow as flow
@@ -22,6 +21,7 @@ from ._fields.matrix import LeftMatrix as LeftMatrix
 from ._fields.matrix import RightMatrix as RightMatrix
 from ._fields.quaternion import QuaternionRotation as QuaternionRotation
 from ._fields.rotation import Rotation as Rotation
+from ._fields.semilinear import AbstractSemilinearField as AbstractSemilinearField
 from ._integrate import integrate as integrate
 from ._methods.order_conditions import error_constant as error_constant
 from ._methods.order_conditions import order as order

@@ -10,13 +10,11 @@ from math import factorial
 from typing import Any, ClassVar
 
 import equinox as eqx
-import jax
 import jax.numpy as jnp
 import jax.tree_util as jtu
-import numpy as np
-from jaxtyping import Array, Inexact, PyTree, Real
+from jaxtyping import Array, PyTree, Real
 
-Weight = float | Real[Array, ""]
+from ._arrays import Weight, check_coordinates, describe, linear_combination, struct
 
 
 class AbstractFrozenField(eqx.Module):
@@ -116,12 +114,12 @@ class AbstractFrozenField(eqx.Module):
         differ in more than these.
         """
         for path, leaf in jtu.tree_leaves_with_path(fields[0]):
-            _check_coordinates(f"{cls.__name__}{jtu.keystr(path)}", leaf)
+            check_coordinates(f"{cls.__name__}{jtu.keystr(path)}", leaf)
         structure = jtu.tree_structure(fields[0])
         if any(jtu.tree_structure(field) != structure for field in fields[1:]):
             kinds = " and ".join(dict.fromkeys(map(describe, fields)))
             raise TypeError(f"Fields that are added must agree in all but arrays, got {kinds}.")
-        return jtu.tree_map(lambda *leaves: _linear_combination(weights, leaves), *fields)
+        return jtu.tree_map(lambda *leaves: linear_combination(weights, leaves), *fields)
 
     def defect(self, point: Any) -> tuple[Real[Array, ""], str] | None:
         """How far `point` is off the manifold that such fields act on, and what it must satisfy.
@@ -192,36 +190,6 @@ class AbstractAlgebraElement(AbstractFrozenField):
                 weights.append(float(_bernoulli(k) / factorial(k)))
                 terms.append(term)
         return type(terms[-1]).combine(weights, terms)
-
-
-class AbstractSemilinearField(AbstractFrozenField):
-    """A field `x' = L x + b` with a linear part L, for exponential Runge-Kutta methods.
-
-    These methods, such as `cfjax.ETD54`, take L from the first field of a step, and of every later
-    field what is left beside it. So a class must say what L does, beyond what `AbstractFrozenField`
-    asks:
-
-    - `functions(pairs)`: for each pair (c, k) of a node and an order the function `phi_k(c L)`,
-      with `phi_k(z) = sum_j z^j / (j + k)!`, as an array or a pytree of arrays. Of these the method
-      makes linear combinations, entry by entry;
-    - `times(function, x)`: such a function, or combination of some, applied to x;
-    - `rest(first, point)`: the velocity at `point` less `L point`, where L is the linear part of
-      the field `first`.
-
-    A class that has a chart of its own has all of them in the chart, and its chart must be linear.
-    """
-
-    @abc.abstractmethod
-    def functions(self, pairs: Sequence[tuple[float, int]]) -> list[Any]:
-        """The functions `phi_k(c L)` for pairs (c, k)."""
-
-    @abc.abstractmethod
-    def times(self, function: Any, x: Any) -> Any:
-        """A function of L, or a combination of some, applied to x; shaped like x."""
-
-    @abc.abstractmethod
-    def rest(self, first: Any, point: Any) -> Any:
-        """The velocity at `point` less the linear part of `first` there; shaped like `point`."""
 
 
 class Rest(AbstractAlgebraElement):
@@ -325,8 +293,8 @@ def combine(weights: Sequence[Weight], fields: Sequence[PyTree]) -> PyTree:
             )
         if is_field(leaves[0]):
             return type(leaves[0]).combine(moving, leaves)
-        _check_coordinates("A translation", leaves[0])
-        return _linear_combination(moving, leaves)
+        check_coordinates("A translation", leaves[0])
+        return linear_combination(moving, leaves)
 
     columns = zip(parts, *others, strict=True)
     return treedef.unflatten(combine_part(path, part, *rest) for (path, part), *rest in columns)
@@ -410,39 +378,3 @@ def without_bracket(field: AbstractFrozenField) -> str:
         "AbstractFrozenField but not an AbstractAlgebraElement. Use a commutator-free method, "
         "for example cfjax.CF4()."
     )
-
-
-def struct(x: PyTree) -> PyTree:
-    """The shapes and dtypes of the arrays of `x`."""
-    return jtu.tree_map(lambda a: jax.ShapeDtypeStruct(jnp.shape(a), jnp.result_type(a)), x)
-
-
-def describe(x: PyTree) -> str:
-    """`x` in one line, with the dtypes and shapes of its arrays."""
-    return eqx.tree_pformat(x, struct_as_array=True, width=10_000)
-
-
-def _check_coordinates(name: str, x: Any) -> None:
-    # A weight in an integer dtype would be rounded to zero.
-    if not jnp.issubdtype(getattr(x, "dtype", object), jnp.inexact):
-        raise TypeError(
-            f"{name} must be a floating or complex array to be combined linearly, got "
-            f"{describe(x)}. Put what is not a coordinate into a static field, "
-            "`eqx.field(static=True)`, or override `combine`."
-        )
-
-
-def _linear_combination(
-    weights: Sequence[Weight], arrays: Sequence[Inexact[Array | np.ndarray, "..."]]
-) -> Inexact[Array, "..."]:
-    total = _scale(weights[0], arrays[0])
-    for weight, array in zip(weights[1:], arrays[1:], strict=True):
-        total = total + _scale(weight, array)
-    return total
-
-
-def _scale(weight: Weight, array: Inexact[Array | np.ndarray, "..."]) -> Inexact[Array, "..."]:
-    # Most tableaus have weights of one.
-    if isinstance(weight, float) and weight == 1:
-        return jnp.asarray(array)
-    return jnp.asarray(weight, array.dtype) * array

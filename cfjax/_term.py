@@ -11,7 +11,8 @@ import jax.tree_util as jtu
 import numpy as np
 from jaxtyping import Array, PyTree, Real
 
-from ._field import Rest, combine, describe, is_field, struct, tangent
+from ._arrays import describe, struct
+from ._field import Rest, combine, is_field, tangent
 
 _ARRAY_TYPES = jax.Array | np.ndarray | np.generic | int | float | complex
 

@@ -19,10 +19,12 @@ FACE = "cfjax"
 ROWS = [
     # Programs as XLA wants them, and the command's signals: none of ours.
     {"_xla", "_signals"},
+    # Linear combinations of arrays, and what errors say of them.
+    {"_arrays"},
     # The contract of a field.
     {"_field"},
-    # Its term for diffrax; functions of arrays.
-    {"_term", "_numerics"},
+    # Its term for diffrax; functions of arrays; arguments of solves.
+    {"_term", "_numerics", "_arguments"},
     # A term that a path drives.
     {"_control_term"},
     # Fields, and coefficients of methods.
@@ -39,10 +41,6 @@ ROWS = [
     {"__main__"},
 ]
 AGAINST_THE_DIRECTION = {
-    (
-        "_solvers.error_control",
-        "_integrate",
-    ): "a starting step takes states and times as `integrate` does, with the same checks",
     (
         "_batch.fingerprint",
         FACE,

@@ -14,7 +14,7 @@ import numpy as np
 from jax.sharding import Mesh
 from jaxtyping import Bool, Int, PyTree
 
-from .._integrate import count
+from .._arguments import count
 from .program import Program
 from .progress import progress_bar
 from .store import Store

@@ -9,17 +9,12 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Inexact
 
-from .._field import (
-    AbstractAlgebraElement,
-    AbstractSemilinearField,
-    Weight,
-    combine,
-    describe,
-    struct,
-)
+from .._arrays import Weight, describe, struct
+from .._field import AbstractAlgebraElement, combine
 from .._numerics.checks import needing
 from .._numerics.phi import phi_1, phis
 from .._numerics.transforms import DTYPES, AbstractTransform, TensorTransform
+from .semilinear import AbstractSemilinearField
 
 
 class Affine(AbstractAlgebraElement, AbstractSemilinearField):

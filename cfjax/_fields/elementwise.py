@@ -9,7 +9,8 @@ import jax.numpy as jnp
 import jax.tree_util as jtu
 from jaxtyping import Array, PyTree, Real
 
-from .._field import AbstractAlgebraElement, AbstractFrozenField, Weight, combine
+from .._arrays import Weight
+from .._field import AbstractAlgebraElement, AbstractFrozenField, combine
 
 
 def each(fun: Callable[..., PyTree], num_axes: int) -> Callable[..., PyTree]:

@@ -7,11 +7,11 @@ import equinox as eqx
 import jax.numpy as jnp
 from jaxtyping import Array, Inexact
 
-from .._field import AbstractSemilinearField
 from .._numerics.matmul import matmul, promoted
 from .._numerics.phi import matrix_phis, phi_1_times
 from .elementwise import check_other, check_point, each
 from .matrix import AbstractMatrix, check_companion
+from .semilinear import AbstractSemilinearField
 
 
 class LinearAffine(AbstractMatrix, AbstractSemilinearField):

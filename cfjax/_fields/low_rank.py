@@ -9,7 +9,8 @@ import numpy as np
 from jax import lax
 from jaxtyping import Array, Float
 
-from .._field import AbstractAlgebraElement, AbstractFrozenField, Weight, combine
+from .._arrays import Weight
+from .._field import AbstractAlgebraElement, AbstractFrozenField, combine
 from .._numerics.expm_action import phi_1_action
 from .._numerics.matmul import matmul
 from .._numerics.span import (

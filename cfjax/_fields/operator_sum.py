@@ -13,7 +13,8 @@ import numpy as np
 from jax import lax
 from jaxtyping import Array, Inexact, Real
 
-from .._field import AbstractFrozenField, Weight, combine, describe, struct
+from .._arrays import Weight, describe, struct
+from .._field import AbstractFrozenField, combine
 from .._numerics.checks import needing
 from .._numerics.expm_multiply import expm_minus_one_multiply, row_norm
 from .._numerics.matmul import by_columns, promoted

@@ -8,7 +8,8 @@ import jax.numpy as jnp
 import jax.tree_util as jtu
 from jaxtyping import Array, Float
 
-from .._field import AbstractAlgebraElement, describe
+from .._arrays import describe
+from .._field import AbstractAlgebraElement
 from .._numerics.quaternion import Frame, Order, check_choice, increment, times, turn
 from .._numerics.rotate import cross_product, dexpinv
 from .elementwise import check_point, each

@@ -14,17 +14,16 @@ import jax.tree_util as jtu
 import numpy as np
 from jaxtyping import Array, Float, Int, PyTree
 
-from .._batch.progress import progress_bar
-from .._integrate import (
+from .._arguments import (
     as_state,
     check_own_tolerances,
     check_term_and_solver,
     count,
-    equal_steps,
     time_dtype,
     time_scalar,
-    without_estimate,
 )
+from .._batch.progress import progress_bar
+from .._integrate import equal_steps, without_estimate
 from .._numerics.checks import needing
 from .cost import Problem, cost_of_steps
 from .result import WorkPrecision

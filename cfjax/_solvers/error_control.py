@@ -9,8 +9,9 @@ import jax.tree_util as jtu
 from jax import lax
 from jaxtyping import Array, PyTree, Real
 
-from .._field import describe, flow, tangent
-from .._integrate import as_state, check_term_and_solver, time_dtype, time_scalar
+from .._arguments import as_state, check_term_and_solver, time_dtype, time_scalar
+from .._arrays import describe
+from .._field import flow, tangent
 from .._term import LieTerm
 
 

@@ -13,7 +13,8 @@ import jax.tree_util as jtu
 from jaxtyping import Array, PyTree, Real
 
 from .._control_term import is_driven
-from .._field import AbstractSemilinearField, Rest, combine, from_chart, is_field
+from .._field import Rest, combine, from_chart, is_field
+from .._fields.semilinear import AbstractSemilinearField
 from .._methods import exponential as _exponential
 from .._methods.exponential import Columns, Combination, ExponentialTableau
 from .._methods.proved import order_of, proved

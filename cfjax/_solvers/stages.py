@@ -11,7 +11,8 @@ import jax.tree_util as jtu
 from jax import lax
 from jaxtyping import Array, PyTree, Real
 
-from .._field import AbstractFrozenField, describe, is_field
+from .._arrays import describe
+from .._field import AbstractFrozenField, is_field
 from .._fields.elementwise import Elementwise
 from .._methods.tableau import Product, Row
 from .._numerics.vectors import pack
