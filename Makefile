@@ -5,7 +5,7 @@ PYTEST := -m pytest --numprocesses auto --dist worksteal
 # Each solver and each field once, what the code relies on in jax, equinox and diffrax, and imports.
 QUICK := tests/test_quick.py tests/xla/test_struct_of_arrays.py tests/test_canary.py tests/test_public.py tests/test_architecture.py
 
-.PHONY: paper lint test test-all test-quick test-lowest test-newest coverage defects benchmarks pages docs clean
+.PHONY: paper lint test test-all test-quick test-lowest test-newest coverage defects benchmarks benchmark-gpu pages docs clean
 
 # Tables and figures of the paper, in figures/.
 paper: .venv/paper
@@ -45,6 +45,10 @@ benchmarks: .venv/dev
 	@$(BIN)/python benchmarks/results.py
 	for name in $(BENCHMARKS); do $(BIN)/python benchmarks/$$name.py $(ARGS) || exit 1; done
 	$(MAKE) pages
+
+# On a machine with a GPU, whose results are stored too.
+benchmark-gpu: .venv/dev
+	$(BIN)/python benchmarks/gpu.py $(ARGS)
 
 # The pages' tables, numbers and pictures, from what has been measured.
 pages: .venv/dev

@@ -117,7 +117,8 @@ def test_no_measured_table_is_typed_in():
 def test_every_benchmark_has_stored_results():
     (names,) = re.findall(r"^BENCHMARKS := (.*)$", (ROOT / "Makefile").read_text(), re.MULTILINE)
     stored = {path.stem for path in (ROOT / "benchmarks" / "results").glob("*.json")}
-    assert stored == set(names.split())
+    # One runs where there is a GPU, and not with the others.
+    assert stored == {*names.split(), "gpu"}
     assert all((ROOT / "benchmarks" / f"{name}.py").exists() for name in stored)
 
 

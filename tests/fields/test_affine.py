@@ -584,7 +584,7 @@ SOLVERS = {
 @pytest.mark.parametrize(
     "solver, points", [(cfjax.CF4(), 1), (cfjax.CF43(), 4), (cfjax.CK54(), 4), (cfjax.RKMK4(), 0)]
 )
-def test_points_that_are_computed_once(solver, points):
+def test_points_that_are_computed_once(rewritten, solver, points):
     """Where the field is evaluated and flows go on: back from there flows would be repeated."""
     term = cfjax.LieTerm(
         lambda t, y, args: Affine(1.0, jnp.sin(y), -jnp.arange(200.0), cfjax.SineTransform())
