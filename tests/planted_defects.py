@@ -227,14 +227,14 @@ DEFECTS = [
         "both = (float(self.a[i]), 1.0)",
         "both = (1.0, float(self.a[i]))",
         "swapped weights of a low-storage method",
-        "solvers/test_one_step.py -k Williamson3",
+        "solvers/test_low_storage.py -k observed_order",
     ),
     Defect(
         "_solvers/low_storage.py",
         "total = combine((a, 1.0), (total, here))",
         "total = combine((a, 1.0), (here, total))",
         "a swapped sum in the loop of a low-storage method",
-        "solvers/test_one_step.py -k YRK135",
+        "solvers/test_low_storage.py -k in_a_loop",
     ),
     Defect(
         "_solvers/low_storage.py",

@@ -54,6 +54,16 @@ def test_a_step_is_that_of_the_tableau(name):
     problems.assert_close(found, expected, 1e-13 if name == "YRK135" else 1e-15 * 5)
 
 
+def test_a_step_in_a_loop_is_that_of_the_tableau():
+    y0, inertia = jnp.asarray(problems.MOMENTUM), jnp.asarray(problems.INERTIA)
+    term, times = cfjax.LieTerm(problems.driven_body), (jnp.asarray(0.3), jnp.asarray(0.5))
+    found, expected = (
+        jax.jit(lambda s=s: problems.first_step(s, term, *times, y0, inertia)[:2])()
+        for s in (cfjax.BWRRK53(unroll=False), cfjax.CommutatorFree(cfjax.BWRRK53.tableau))
+    )
+    problems.assert_close(found, expected, 1e-15 * 5)
+
+
 @pytest.mark.representatives(1)
 @pytest.mark.parametrize("name", ["BWRRK33", "CK54", "YRK135"])
 def test_the_observed_order(body_problem, name):
