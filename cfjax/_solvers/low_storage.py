@@ -78,7 +78,7 @@ class AbstractLowStorage(AbstractCommutatorFree, diffrax.AbstractStratonovichSol
         size = sum(jnp.size(leaf) for leaf in jtu.tree_leaves(point))
         # Unrolled stages cost compile time quadratically. And XLA keeps the fields of several of
         # them, to add them up at once.
-        return len(self.b) <= limits.MANY and size <= limits.LARGE
+        return len(self.b) <= limits.MANY and size <= 2 * limits.LARGE
 
 
 def _tableau(a: Row, b: Row, embedded: Callable[[Product], Any] | None = None) -> Tableau:

@@ -47,8 +47,8 @@ WHOLE_IN_BATCHES = (math.inf, 9 * FUNCTION // 4, 3 * FUNCTION // 2)
 FEW = 10
 
 # Of the numbers of a point. If a loop over stages is differentiated, it keeps the points of all
-# stages for each of its turns; and unrolled, XLA keeps several fields to add them up at once. Both
-# are too much memory for larger ones. (scenes)
+# stages for each of its turns, which is too much memory for larger ones; and unrolled, XLA keeps
+# several fields to add them up at once, which is too much for those of twice as many. (scenes)
 LARGE = 2048
 
 # A method of more stages is long: mostly it is not scalarised as a whole, and unrolled its time to
