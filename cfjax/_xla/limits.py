@@ -8,8 +8,9 @@ import math
 
 # Of vectors that are scalarised. A pose is a quaternion and a position. (attitude, leading_axes)
 MAX_LENGTH = 7
-# Of the products of numbers that a product of two arrays is scalarised into. (fields)
-MAX_PRODUCT = MAX_LENGTH**3
+# Of the products of numbers that a product of two arrays is scalarised into: those of 6 x 6
+# matrices. (fields)
+MAX_PRODUCT = (MAX_LENGTH - 1) ** 3
 
 # Of arrays all of whose entries are scalarised, as they come up within a step: the 4 x 4 matrix of
 # a quaternion, and the 4 x 4 x 4 numbers that multiply two. A loop over stages copies the fields of
