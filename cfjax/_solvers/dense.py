@@ -56,12 +56,26 @@ class Pieces(diffrax.AbstractLocalInterpolation):
             start, end = self.evaluate(t0), self.evaluate(t1)
             return jtu.tree_map(jnp.subtract, end, start)
         theta = part_of_step(self, t0) * len(self.parts)
-        point = self.parts[0].evaluate(jnp.minimum(theta, 1))
-        for k, part in enumerate(self.parts[1:], 1):
-            is_last = k == len(self.parts) - 1
-            later = part.evaluate(theta - k if is_last else jnp.clip(theta - k, 0, 1))
-            point = jtu.tree_map(lambda a, b: jnp.where(theta > k, b, a), point, later)  # noqa: B023
+        now = jnp.clip(jnp.ceil(theta) - 1, 0, len(self.parts) - 1)
+        # Output takes longer to compile than to choose what it is made of: once for all alike.
+        kinds: dict[Any, list[int]] = {}
+        for k, part in enumerate(self.parts):
+            kinds.setdefault(jtu.tree_structure(part), []).append(k)
+        points = [self._chosen(places, theta, now) for places in kinds.values()]
+        point, _ = points[0]
+        for other, is_now in points[1:]:
+            point = jtu.tree_map(lambda a, b: jnp.where(is_now, b, a), point, other)  # noqa: B023
         return point
+
+    def _chosen(self, places: list[int], theta: Any, now: Any) -> tuple[PyTree, Any]:
+        """The output of the part at `now`, and whether it is one of these."""
+        here = jnp.asarray(places, theta.dtype)
+        nearest = jnp.argmin(jnp.abs(here - now))
+        stacked = jtu.tree_map(lambda *xs: jnp.stack(xs), *(self.parts[k] for k in places))
+        part, place = jtu.tree_map(lambda x: x[nearest], (stacked, here))
+        is_now = place == now
+        inner = theta - place
+        return part.evaluate(jnp.where(is_now, inner, jnp.clip(inner, 0, 1))), is_now
 
 
 def as_part(solver: Any, dense_info: dict[str, Any], t: Any) -> Any:

@@ -1,6 +1,5 @@
 """Splitting: flows of the terms of a sum by turns, each of which is exact."""
 
-import itertools
 from collections.abc import Sequence
 from typing import Any, ClassVar, NamedTuple
 
@@ -46,10 +45,14 @@ class _Replay(diffrax.AbstractLocalInterpolation):
             start, end = self.evaluate(t0), self.evaluate(t1)
             return jtu.tree_map(jnp.subtract, end, start)
         theta = part_of_step(self, t0)
-        y = self.start
-        for field in (self.first, *itertools.chain(*self.later)):
-            y = flow_at(combine((theta,), (field,)), y)
-        return y
+
+        def pair(y: PyTree, fields: tuple[PyTree, ...]) -> tuple[PyTree, None]:
+            for field in fields:
+                y = flow_at(combine((theta,), (field,)), y)
+            return y, None
+
+        y, _ = pair(self.start, (self.first,))
+        return by_turns(pair, y, self.later)[0]
 
 
 class AbstractSplitting(AbstractLieSolver, diffrax.AbstractStratonovichSolver):
