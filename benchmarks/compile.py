@@ -34,7 +34,7 @@ def second_derivative(what: str) -> Callable[[Any], Any]:
 
 
 def measure(quick: bool) -> Iterator[results.Row]:
-    repeats = 1 if quick else 3
+    repeats = 1 if quick else 2
     # The first program pays for what all use.
     compiled(SCENES["rigid body"](), "gradient", "Tsit5")
     for name, make in [*SCENES.items()][: 1 if quick else None]:

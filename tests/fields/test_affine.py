@@ -568,8 +568,9 @@ def solved(field, solver, transform, y0, args, **kwargs):
 
 
 SOLVERS = {
-    "CF4": cfjax.CF4(),
+    # The velocity within its steps is its first field.
     "CF43, algebra": cfjax.CF43(estimate="algebra"),
+    "CF4": cfjax.CF4(),
     "CF54": cfjax.CF54(),
     "RKMK4": cfjax.RKMK4(),
     "RKMK5": cfjax.RKMK5(),

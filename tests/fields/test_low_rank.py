@@ -133,11 +133,11 @@ def test_low_rank_fields_have_brackets_in_a_step_only():
 # A step in coordinates against the same step with n x n matrices
 
 METHODS: dict[str, Any] = {
+    "RKMK3": cfjax.RKMK3(),
     "CF4": cfjax.CF4(),
     "family B": cfjax.CommutatorFree(cfjax.third_order_b(2 / 3)),
     "Euler": cfjax.LieEuler(),
     "CG3": cfjax.CG3(),
-    "RKMK3": cfjax.RKMK3(),
     "RKMK4": cfjax.RKMK4(),
     "Bosh3": cfjax.RKMK(diffrax.Bosh3.tableau),
 }

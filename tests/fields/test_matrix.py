@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 import scipy.linalg
 
-from cfjax import LeftMatrix, RightMatrix, Rotation
+from cfjax import LeftMatrix, LieEuler, LieTerm, RightMatrix, Rotation, integrate
 
 BOTH = pytest.mark.parametrize("cls", [LeftMatrix, RightMatrix])
 
@@ -69,6 +69,17 @@ def test_flow_and_tangent(cls, vector, dtype, point_dtype):
     tangent = cls(a).tangent(jnp.asarray(point))
     assert tangent.dtype == point_dtype
     np.testing.assert_allclose(tangent, act(cls, a, point), rtol=0, atol=8 * eps * scale)
+
+
+@BOTH
+def test_steps_add_what_the_flow_adds(cls):
+    """A state is a compensated sum of what its flows add."""
+    a, y0 = random((4, 4)), random((4, 4), seed=1)
+    term = LieTerm(lambda t, y, args: cls(args))
+    sol = integrate(term, LieEuler(), 0.0, 1.0, y0, a, num_steps=2)
+    expected = act(cls, scipy.linalg.expm(a), y0)
+    # Both round by some units of the exponential.
+    np.testing.assert_allclose(sol.ys[0], expected, rtol=0, atol=1e-14 * np.abs(expected).max())
 
 
 @BOTH

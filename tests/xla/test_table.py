@@ -24,11 +24,15 @@ def _loss(scene, num_steps):
 
 def test_only_where_the_whole_step_is_too_long(rewritten):
     """A body of three numbers is scalarised as a whole, which is three times as fast."""
-    for scene, is_loop in ((spacecraft, True), (heavy_top, True), (rigid_body, False)):
+    for scene, size, is_loop in (
+        (spacecraft, 6, True),
+        (heavy_top, 9, True),
+        (rigid_body, 3, False),
+    ):
         loss, *start = _loss(scene, 3)
         program = str(jax.make_jaxpr(loss)(*start))
-        # The weights of 12 stages.
-        assert ("f64[12,13]" in program) == is_loop
+        # The weights of 12 stages, and the numbers of all elements.
+        assert ("f64[12,13]" in program) == (f"f64[13,{size}]" in program) == is_loop
         assert "cfjax_operation" in program
 
 
