@@ -215,7 +215,7 @@ def equal_steps(
         solver = cast(Any, solver).for_equal_steps((t1 - t0) / intervals)
         forward = invariants_first(step, carry)
 
-    order = 0 if isinstance(num_steps, int) and num_steps < limits.FEW else 1
+    order = 0 if isinstance(num_steps, int) and num_steps <= limits.MANY else 1
 
     def advance(carry, number):
         if step_back:

@@ -24,7 +24,8 @@ def path(solver, num_steps):
     def states(moments):
         options = dict(num_steps=num_steps, save_every=num_steps // 20, throw=False)
         inertia = jnp.append(FIRST, moments)
-        return cfjax.integrate(term, solver, 0.0, 10.0, rigid_body.y0, inertia, **options).ys
+        sol = cfjax.integrate(term, solver, 0.0, 10.0, rigid_body.y0, inertia, **options)
+        return jnp.asarray(sol.ys)
 
     return states
 

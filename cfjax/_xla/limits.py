@@ -44,14 +44,12 @@ WHOLE = {
 }
 WHOLE_IN_BATCHES = (math.inf, 9 * FUNCTION // 4, 3 * FUNCTION // 2)
 
-# The derivative of fewer equal steps takes longer to compile than it will ever save. (compile)
-FEW = 10
-
 # Of the numbers of a point. If a loop over stages is differentiated, it keeps the points of all
 # stages for each of its turns, which is too much memory for larger ones; and unrolled, XLA keeps
 # several fields to add them up at once, which is too much for those of twice as many. (scenes)
 LARGE = 2048
 
-# A method of more stages is long: mostly it is not scalarised as a whole, and unrolled its time to
-# compile grows as the square of their number. (compile)
-MANY = 8
+# Of the stages of a method, or of equal steps: more are many. A method of many stages is mostly not
+# scalarised as a whole, and unrolled its time to compile grows as the square of their number. The
+# derivative of few steps takes longer to compile than it will ever save. (compile)
+MANY = 9
