@@ -57,7 +57,7 @@ def phi_1_action(
     choice = jnp.sum(bound > intervals[:-1].astype(b.dtype))
     coefficients = jnp.asarray(table, b.dtype)[choice]
 
-    # In a loop: every product written out would be compiled by itself.
+    # In a loop: unrolled, every product would be compiled by itself.
     def step(carry: tuple[Array, Array], coefficient: Array) -> tuple[tuple[Array, Array], None]:
 
         def add(carry: tuple[Array, Array]) -> tuple[Array, Array]:

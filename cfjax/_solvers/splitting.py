@@ -1,4 +1,4 @@
-"""Splitting: flows of the terms of a sum by turns, each of which is exact."""
+"""Splitting: the exact flows of the terms of a sum, in turn."""
 
 from collections.abc import Sequence
 from typing import Any, ClassVar, NamedTuple
@@ -56,7 +56,7 @@ class _Replay(diffrax.AbstractLocalInterpolation):
 
 
 class AbstractSplitting(AbstractLieSolver, diffrax.AbstractStratonovichSolver):
-    """The flows of the terms of a sum by turns."""
+    """The flows of the terms of a sum, in turn."""
 
     stages: eqx.AbstractVar[tuple[float, ...]]
 
@@ -143,7 +143,7 @@ class AbstractSplitting(AbstractLieSolver, diffrax.AbstractStratonovichSolver):
 
 
 class Splitting(AbstractSplitting):
-    """Flows of the terms of a `diffrax.MultiTerm` by turns: symplectic where the terms are.
+    """Flows of the terms of a `diffrax.MultiTerm` in turn: symplectic where the terms are.
 
     Each term has a frozen field that does not change along its own flow, such as a force, which
     moves momenta alone. So its flow is exact, and where the term is Hamiltonian, the step is
