@@ -4,7 +4,7 @@ It measures processor time to trace, lower and compile, which other work on the 
 less than wall time, and the lines of optimised HLO, for the programs and scenes of
 `compile_programs.py`. Methods take turns. Then it measures second derivatives.
 
-`tests/xla/test_sizes.py` holds the lines to what is stored here.
+`tests/xla/test_sizes.py` holds the lines of some to what is stored here.
 """
 
 import time

@@ -467,18 +467,42 @@ def chain() -> list[list[str]]:
     return table
 
 
+# Those with the same methods.
+_DETERMINISTIC = ("rigid body", "spacecraft", "4 x 4 matrices")
+
+
+def _compiled() -> list[Row]:
+    return [row for row in load("compile")["rows"] if "scene" in row]
+
+
 @table
 def compiling() -> list[list[str]]:
-    rows = load("compile")["rows"]
-    ways, methods = values(rows, "way"), values(rows, "method")
-    seconds = {way: pick(rows, method="Tsit5", way=way) for way in ways}
-    table = [["", *(WAYS.get(way, way) for way in ways)]]
-    table.append(["diffrax, Tsit5"])
-    table[1] += [f"1 ({between(r['CPU seconds'][2] for r in seconds[way])} s)" for way in ways]
-    for method in methods[1:]:
-        found = [pick(rows, method=method, way=way) for way in ways]
-        cells = [between(r["over Tsit5"][2] for r in few) if few else "" for few in found]
-        table.append([f"`{SHORT.get(method, method)}`", *cells])
+    rows = [row for row in _compiled() if row["scene"] in _DETERMINISTIC]
+    base, *methods = values(rows, "method")
+    table = [["", f"diffrax, {base}", *(f"`{method}`" for method in methods)]]
+    for program in values(rows, "program"):
+        seconds = between(r["CPU seconds"][2] for r in pick(rows, program=program, method=base))
+        table.append([program, f"{seconds} s"])
+        for method in methods:
+            found = pick(rows, program=program, method=method)
+            lines = between(row["lines, ratio"] for row in found)
+            table[-1].append(f"{between(r['seconds, ratio'][2] for r in found)} ({lines})")
+    return table
+
+
+@table
+def compiling_families() -> list[list[str]]:
+    table = [["", "program", "diffrax", "cfjax"]]
+    rows = [row for row in _compiled() if row["scene"] not in _DETERMINISTIC]
+    for scene, program in dict.fromkeys((row["scene"], row["program"]) for row in rows):
+        base, *others = pick(rows, scene=scene, program=program)
+        cells = [
+            f"`{r['method']}` {two_digits(r['seconds, ratio'][2])} "
+            f"({two_digits(r['lines, ratio'])})"
+            for r in others
+        ]
+        seconds = two_digits(base["CPU seconds"][2])
+        table.append([scene, program, f"`{base['method']}`, {seconds} s", ", ".join(cells)])
     return table
 
 

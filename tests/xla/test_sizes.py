@@ -6,6 +6,8 @@ import jax.numpy as jnp
 import pytest
 
 import cfjax
+import compile_programs
+import results
 
 pytestmark = pytest.mark.usefixtures("rewritten")
 
@@ -138,3 +140,46 @@ def test_a_splitting_of_six_vectors_has_each_flow_once():
     rolled = size(end(cfjax.LieTerm(fields), cfjax.CF4()), y)
     # Five flows, where the other program has one in a loop.
     assert split < 4 * rolled
+
+
+# Of all that people write, as `python benchmarks/compile.py` has stored it.
+STORED = [row for row in results.load("compile")["rows"] if "scene" in row]
+HELD = [
+    ("rigid body", "adaptive steps"),
+    ("rigid body", "output at times"),
+    ("rigid body", "`integrate`, gradient"),
+]
+
+
+@pytest.fixture
+def optimised():
+    """Programs are compiled as for users: what other tests leave out changes the lines too."""
+    jax.config.update("jax_disable_most_optimizations", False)
+    yield
+    jax.config.update("jax_disable_most_optimizations", True)
+
+
+def test_all_programs_are_stored():
+    expected = [
+        (name, program, method)
+        for name, make in compile_programs.SCENES.items()
+        for scene in [make()]
+        for program in scene.programs
+        for method in (scene.base, *scene.methods)
+    ]
+    assert [(row["scene"], row["program"], row["method"]) for row in STORED] == expected
+
+
+@pytest.mark.usefixtures("optimised")
+@pytest.mark.parametrize("scene, program", HELD)
+def test_what_people_write_stays_as_small_over_what_they_would_take_instead(scene, program):
+    """Versions of XLA differ by less than a tenth, and what bloats a program mostly doubles it."""
+    made = compile_programs.SCENES[scene]()
+
+    def lines(method):
+        return compile_programs.size(compile_programs.lowered(made, program, method).compile())
+
+    base = lines(made.base)
+    for row in results.pick(STORED, scene=scene, program=program):
+        if row["method"] != made.base:
+            assert lines(row["method"]) <= 1.1 * row["lines, ratio"] * base, row["method"]
