@@ -153,7 +153,7 @@ HELD = [
 
 @pytest.fixture
 def optimised():
-    """Programs are compiled as for users: what other tests leave out changes the lines too."""
+    """Programs are compiled as those that are stored, with what other tests leave out."""
     jax.config.update("jax_disable_most_optimizations", False)
     yield
     jax.config.update("jax_disable_most_optimizations", True)
@@ -173,7 +173,7 @@ def test_all_programs_are_stored():
 @pytest.mark.usefixtures("optimised")
 @pytest.mark.parametrize("scene, program", HELD)
 def test_what_people_write_stays_as_small_over_what_they_would_take_instead(scene, program):
-    """Versions of XLA differ by less than a tenth, and what bloats a program mostly doubles it."""
+    """A tenth is room for small changes; what bloats a program mostly doubles it."""
     made = compile_programs.SCENES[scene]()
 
     def lines(method):
