@@ -752,6 +752,13 @@ DEFECTS = [
         "xla/test_materialise.py -k long_step_in_a_batch",
     ),
     Defect(
+        "_xla/derivatives.py",
+        'is_long and kind.place == "step" and not',
+        "is_long and not",
+        "parameters of our own loop that are materialised in each turn of a batch",
+        "xla/test_materialise.py -k long_step_in_our_own_loop",
+    ),
+    Defect(
         "_xla/table.py",
         "if where() or not is_on()",
         "if True or not is_on()",

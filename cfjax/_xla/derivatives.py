@@ -208,9 +208,11 @@ def _batch(operands, dims, *, program, kind, plain):
         outs = lax.map(one, [jnp.moveaxis(operands[k], dims[k], 0) for k in moving])
         out_dims = [0] * len(outs)
     else:
-        if not kind.linear and sum(map(num_operations, program.jaxpr.eqns)) > FUNCTION:
+        is_long = sum(map(num_operations, program.jaxpr.eqns)) > FUNCTION
+        if is_long and kind.place == "step" and not kind.linear:
             # Single numbers, as the time of a step, that XLA would compute anew in each of its
-            # functions: 100 ms for a step of a thousand bodies with `RKMK8`.
+            # functions: 100 ms for a step of a thousand bodies with `RKMK8`. In our own loop they
+            # come with the carry or are the same in every turn.
             single = [k for k, x in enumerate(operands) if dims[k] is None and is_inexact(x)]
             new = materialised([operands[k] for k in single]) if single else []
             operands = replaced(operands, single, new)
