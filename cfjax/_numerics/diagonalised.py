@@ -249,6 +249,9 @@ def _symmetrising(a: np.ndarray) -> Float[np.ndarray, " n"]:
 
 def _by_eig(a: np.ndarray) -> _Found:
     eigenvalues, vectors = np.linalg.eig(a)
+    if not (np.iscomplexobj(a) or np.imag(eigenvalues).any()):
+        # Some versions of NumPy return complex arrays of them too.
+        eigenvalues, vectors = np.real(eigenvalues), np.real(vectors)
     with np.errstate(divide="ignore"):
         condition = float(np.linalg.cond(vectors))
     if not condition < _MAX_CONDITION:
