@@ -1,10 +1,10 @@
 """Time to compile what people write, over the same with a method of diffrax in plain space.
 
 It measures processor time to trace, lower and compile, which other work on the machine disturbs
-less than wall time, and the lines of optimised HLO, for the programs and scenes of
+less than wall time, and the instructions of optimised HLO, for the programs and scenes of
 `compile_programs.py`. Methods take turns. Then it measures second derivatives.
 
-`tests/xla/test_sizes.py` holds the lines of some to what is stored here.
+`tests/xla/test_sizes.py` holds the instructions to what is stored here.
 """
 
 import time
@@ -43,8 +43,8 @@ def measure(quick: bool) -> Iterator[results.Row]:
         for program in scene.programs:
             made = [[compiled(scene, program, m) for m in methods] for _ in range(repeats)]
             times = np.array([[seconds for seconds, _ in turn] for turn in made]).T
-            lines = [lines for _, lines in made[0]]
-            for method, taken, num_lines in zip(methods, times, lines, strict=True):
+            sizes = [size for _, size in made[0]]
+            for method, taken, number in zip(methods, times, sizes, strict=True):
                 yield {
                     "scene": name,
                     "program": program,
@@ -52,8 +52,8 @@ def measure(quick: bool) -> Iterator[results.Row]:
                     "CPU seconds": results.spread(taken),
                     "over": scene.base,
                     "seconds, ratio": results.ratios(taken, times[0]),
-                    "lines": num_lines,
-                    "lines, ratio": num_lines / lines[0],
+                    "instructions": number,
+                    "instructions, ratio": number / sizes[0],
                 }
     for what in ("gradient", "product", "Hessian"):
         taken = [seconds_of(second_derivative(what)) for _ in range(repeats)]
@@ -61,7 +61,7 @@ def measure(quick: bool) -> Iterator[results.Row]:
 
 
 def compiled(scene: Scene, program: str, method: str) -> tuple[float, int]:
-    """Seconds of the processor, and lines."""
+    """Seconds of the processor, and instructions."""
     begin = time.process_time()
     executable = lowered(scene, program, method).compile()
     return time.process_time() - begin, size(executable)

@@ -485,8 +485,8 @@ def compiling() -> list[list[str]]:
         table.append([program, f"{seconds} s"])
         for method in methods:
             found = pick(rows, program=program, method=method)
-            lines = between(row["lines, ratio"] for row in found)
-            table[-1].append(f"{between(r['seconds, ratio'][2] for r in found)} ({lines})")
+            sizes = between(row["instructions, ratio"] for row in found)
+            table[-1].append(f"{between(r['seconds, ratio'][2] for r in found)} ({sizes})")
     return table
 
 
@@ -498,7 +498,7 @@ def compiling_families() -> list[list[str]]:
         base, *others = pick(rows, scene=scene, program=program)
         cells = [
             f"`{r['method']}` {two_digits(r['seconds, ratio'][2])} "
-            f"({two_digits(r['lines, ratio'])})"
+            f"({two_digits(r['instructions, ratio'])})"
             for r in others
         ]
         seconds = two_digits(base["CPU seconds"][2])

@@ -21,14 +21,15 @@ from .jaxprs import (
     replaced,
     structs,
 )
-from .limits import FUNCTION, MAX_ENTRIES
+from .limits import FUNCTION, MAX_ENTRIES, WHOLE
 from .materialise import materialised
 from .scope import Place
 
 
 class Kind(NamedTuple):
     """Where it runs, how many of the last operands it is linear in, which derivative it is, whether
-    it is of a batch, and up to which derivative there are operations.
+    it is of a batch, up to which derivative there are operations, and whether it is transposed, as
+    in reverse mode, or of several directions at once.
     """
 
     place: Place
@@ -36,6 +37,8 @@ class Kind(NamedTuple):
     order: int = 0
     is_batch: bool = False
     last: int = 1
+    is_transposed: bool = False
+    is_mapped: bool = False
 
 
 class Plain:
@@ -68,6 +71,18 @@ class Plain:
             return [outs[k] for k in gives]
 
         return Plain(fun, [operands[k] for k in takes])
+
+
+def is_as_it_was(program: ClosedJaxpr, kind: Kind, plain: Plain | None) -> bool:
+    """Whether, outside of batches, this is of the program before it was scalarised.
+
+    That is a derivative in forward mode that is too long for one function. It would take seconds
+    more to compile, and save less than one in 10 000 steps.
+    """
+    if plain is None or not kind.linear or kind.is_batch or kind.is_transposed:
+        return False
+    length = sum(map(num_operations, program.jaxpr.eqns))
+    return kind.is_mapped or length > WHOLE[kind.place][min(kind.order, 2)]
 
 
 def _jvp(primals, tangents, *, program, kind, plain):
@@ -123,7 +138,9 @@ def _transpose(cotangents, *operands, program, kind, plain):
         )
     transposed = _transposed(program, plain, unknown, coming)
     fixed = (x for k, x in enumerate(operands) if k not in unknown)
-    new = transposed.bind([*fixed, *(cotangents[k] for k in coming)], kind)
+    new = transposed.bind(
+        [*fixed, *(cotangents[k] for k in coming)], kind._replace(is_transposed=True)
+    )
     return replaced(results, transposed.gives, new)
 
 
@@ -199,13 +216,26 @@ def _batch(operands, dims, *, program, kind, plain):
     if size <= MAX_ENTRIES["step"] and all(d is None for d in dims[:fixed]):
         # As for a Jacobian. Each on its own: in a program for all of them single numbers meet
         # arrays, and XLA would compute the former anew for every use.
-        moving = [k for k, d in enumerate(dims) if d is not None]
+        moves = [d is not None for d in dims]
+        moving = [k for k, is_one in enumerate(moves) if is_one]
 
-        def one(some):
-            values = replaced(operands, moving, some)
-            return operation_p.bind(*values, program=program, kind=kind, plain=plain)
+        def one_by_one(*operands):
+            def one(some):
+                values = replaced(operands, moving, some)
+                return operation_p.bind(*values, program=program, kind=kind, plain=plain)
 
-        outs = lax.map(one, [jnp.moveaxis(operands[k], dims[k], 0) for k in moving])
+            return lax.map(one, [jnp.moveaxis(operands[k], dims[k], 0) for k in moving])
+
+        if is_as_it_was(program, kind, plain) and all(reached(program.jaxpr, moves)):
+            # All at once, as it was. In a batch it is still scalarised, and then one by one.
+            outs = operation_p.bind(
+                *operands,
+                program=program_of(one_by_one, *operands),
+                kind=kind._replace(is_mapped=True),
+                plain=_batched(program, plain, tuple(dims), size)[1],
+            )
+        else:
+            outs = one_by_one(*operands)
         out_dims = [0] * len(outs)
     else:
         is_long = sum(map(num_operations, program.jaxpr.eqns)) > FUNCTION

@@ -8,6 +8,7 @@ import numpy as np
 import problems
 import pytest
 
+from cfjax._xla import derivatives
 from cfjax._xla import operation as module
 from cfjax._xla.operation import operation
 from cfjax._xla.pack import pack, unpack
@@ -86,6 +87,37 @@ def test_derivatives(inner, outer, argument):
     check(quick(first(whole))(X, SCALE), first(plain)(X, SCALE))
     second = lambda f: outer(first(f), argument)  # noqa: E731
     check(quick(second(whole))(X, SCALE), second(plain)(X, SCALE))
+
+
+def test_what_is_long_is_in_forward_mode_of_the_program_as_it_was(monkeypatch):
+    """Not in reverse mode, nor in batches."""
+    monkeypatch.setattr(derivatives, "WHOLE", {"step": (0, 0, 0)})
+
+    def marked(x, scale):
+        first, *rest = turn(x, scale, 6)
+        return [first + 0 * jnp.tan(x), *rest]
+
+    def both(x, scale):
+        run = lambda x, scale: turn(x, scale, 6)  # noqa: E731
+        return operation(run, x, scale, place="step", plain=marked, order=2)
+
+    xs = jnp.outer(jnp.linspace(0.1, 1, 40), X)
+    for is_marked, transform, point in (
+        (True, jax.jacfwd, X),
+        (True, lambda f: lambda *args: jax.jvp(f, args, args)[1], X),
+        (False, jax.jacrev, X),
+        # Either mode has a part in these.
+        (None, lambda f: jax.jacfwd(jax.jacrev(f)), X),
+        (None, lambda f: jax.jacrev(jax.jacfwd(f)), X),
+        (False, lambda f: jax.vmap(jax.jacfwd(f), (0, None)), xs),
+        (False, lambda f: jax.vmap(jax.jacrev(jax.jacfwd(f)), (0, None)), xs),
+    ):
+        program = transform(size(both))
+        check(quick(program)(point, SCALE), transform(size(plain))(point, SCALE))
+        if is_marked is not None:
+            # The derivative of a tangent has it too.
+            text = jax.jit(program).lower(point, SCALE).as_text()
+            assert ("stablehlo.tan" in text or "chlo.tan" in text) == is_marked
 
 
 @pytest.mark.slow
