@@ -506,6 +506,12 @@ def compiling_families() -> list[list[str]]:
     return table
 
 
+@number
+def first_line() -> str:
+    (row,) = load("getting_started")["rows"]
+    return two_digits(row["seconds"][2])
+
+
 @table
 def first_call() -> list[list[str]]:
     rows = load("first_call")["rows"]
