@@ -170,10 +170,12 @@ def trace(
             return None
     except Exception as error:
         return unread(error)
-    # Where a step is not scalarised its stages may be one loop.
-    with rewriting(False) if is_derived else contextlib.nullcontext():
-        rolled, shape = jax.make_jaxpr(fun, return_shape=True)(y)
-    before = rolled if jtu.tree_structure(shape) == structure else ClosedJaxpr(code, jaxpr.consts)
+    before = ClosedJaxpr(code, jaxpr.consts)
+    if place == "loop" or num_operations > _SHORT_TO_DIFFERENTIATE or not is_derived:
+        # Where a step is not scalarised its stages may be one loop.
+        with rewriting(False) if is_derived else contextlib.nullcontext():
+            rolled, shape = jax.make_jaxpr(fun, return_shape=True)(y)
+        before = rolled if jtu.tree_structure(shape) == structure else before
     unknown = {id(x): x for x in jaxpr.consts if _constant(x) is None}
     unknown |= {id(x): x for x in before.consts if isinstance(x, Tracer)}
     number = {key: k for k, key in enumerate(unknown)}
