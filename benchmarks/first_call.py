@@ -5,13 +5,10 @@ the machine disturbs less, and wall time. diffrax's Tsit5 solves the same proble
 a process that does not import cfjax. Processes take turns.
 """
 
-import json
-import resource
-import subprocess
-import sys
-import time
 from collections.abc import Callable, Iterator
 from typing import TYPE_CHECKING, Any
+
+import fresh_process
 
 if TYPE_CHECKING:
     import results
@@ -107,24 +104,18 @@ def solve(problem: str, method: str, way: str) -> None:
     jax.block_until_ready(sol.ys)
 
 
-def seconds(problem: str, method: str, way: str) -> tuple[float, float]:
-    """Of the processor, and of the clock, in a process of their own."""
-    begin = time.monotonic()
-    command = [sys.executable, __file__, "--one", problem, method, way]
-    done = subprocess.run(command, check=True, capture_output=True, text=True)
-    processor, end = json.loads(done.stdout)
-    return processor, end - begin
-
-
 def measure(quick: bool) -> "Iterator[results.Row]":
     import results
 
     repeats = 2 if quick else 7
     # Files come from the disk the first time.
-    seconds(PROBLEMS[0], "CF4", WAYS[0])
+    fresh_process.seconds(__file__, PROBLEMS[0], "CF4", WAYS[0])
     for problem in PROBLEMS:
         for way in WAYS:
-            taken = [[seconds(problem, m, way) for m in METHODS] for _ in range(repeats)]
+            taken = [
+                [fresh_process.seconds(__file__, problem, m, way) for m in METHODS]
+                for _ in range(repeats)
+            ]
             processor, clock = ([[pair[k] for pair in turn] for turn in taken] for k in range(2))
             base = [turn[0] for turn in processor]
             for k, method in enumerate(METHODS):
@@ -139,17 +130,5 @@ def measure(quick: bool) -> "Iterator[results.Row]":
                 }
 
 
-def main() -> None:
-    if sys.argv[1:2] == ["--one"]:
-        solve(*sys.argv[2:])
-        usage = resource.getrusage(resource.RUSAGE_SELF)
-        # This clock is the same for all processes.
-        print(json.dumps([usage.ru_utime + usage.ru_stime, time.monotonic()]))
-        return
-    import results
-
-    results.run(__file__, __doc__, measure)
-
-
 if __name__ == "__main__":
-    main()
+    fresh_process.run(__file__, __doc__, measure, solve)

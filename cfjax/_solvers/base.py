@@ -321,8 +321,8 @@ def _off_manifold(fault: Fault, part: Any, place: str, point: PyTree) -> Fault:
 
 
 # diffrax traces a step three times, which takes longer than all else that it traces. Inline, the
-# program is as if traced anew. From 0.12 on JAX has two ways for that, and with True it leaves a
-# call in the program. (equinox hands on what it does not know to `jax.jit`.)
+# program is as if traced anew. Newer JAX has two ways for that, and with True it leaves a call in
+# the program. (equinox hands on what it does not know to `jax.jit`.)
 _kinds = getattr(jax, "Inline", None)
 _inline: Any = True if _kinds is None else _kinds.JAX_EARLY
 _step_once = eqx.filter_jit(AbstractChartSolver._step, inline=_inline)  # pyright: ignore[reportCallIssue]

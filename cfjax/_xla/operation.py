@@ -7,7 +7,7 @@ pieces. What is too long for one of XLA's functions is compiled as several, whic
 these values.
 
 A derivative that would take too long to compile is JAX's own of the program as it was before it was
-scalarised (`Plain`), and so is a long one in forward mode, outside of batches.
+scalarised (`Plain`), and so is a long one in forward mode (`is_as_it_was`).
 """
 
 import functools

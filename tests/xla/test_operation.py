@@ -90,8 +90,9 @@ def test_derivatives(inner, outer, argument):
 
 
 def test_what_is_long_is_in_forward_mode_of_the_program_as_it_was(monkeypatch):
-    """Not in reverse mode, nor in batches."""
-    monkeypatch.setattr(derivatives, "WHOLE", {"step": (0, 0, 0)})
+    """In our own loop. Not in reverse mode, nor in batches."""
+    monkeypatch.setitem(module.WHOLE, "loop", module.WHOLE["step"])
+    monkeypatch.setattr(derivatives, "WHOLE", {"loop": (0, 0, 0)})
 
     def marked(x, scale):
         first, *rest = turn(x, scale, 6)
@@ -99,7 +100,7 @@ def test_what_is_long_is_in_forward_mode_of_the_program_as_it_was(monkeypatch):
 
     def both(x, scale):
         run = lambda x, scale: turn(x, scale, 6)  # noqa: E731
-        return operation(run, x, scale, place="step", plain=marked, order=2)
+        return operation(run, x, scale, place="loop", plain=marked, order=2)
 
     xs = jnp.outer(jnp.linspace(0.1, 1, 40), X)
     for is_marked, transform, point in (
