@@ -333,6 +333,8 @@ def _check(eqn: JaxprEqn) -> int:
 
 # Calls by the parameter that holds the program.
 _CALLS = {
+    "cfjax_alone": "program",
+    "cfjax_call": "program",
     "cfjax_operation": "program",
     "checkpoint": "jaxpr",
     "closed_call": "call_jaxpr",

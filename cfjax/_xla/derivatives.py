@@ -87,13 +87,20 @@ def is_as_it_was(program: ClosedJaxpr, kind: Kind, plain: Plain | None) -> bool:
     return kind.is_mapped or length > WHOLE[kind.place][min(kind.order, 2)]
 
 
+def jvp_of(
+    program: ClosedJaxpr, primals: Sequence[Any], tangents: Sequence[Any], moving: Sequence[int]
+) -> tuple[list[Any], list[Any]]:
+    """The results of a program, and their derivatives, if only some operands move."""
+    fun = jaxpr_as_fun(program)
+    points, ways = ([xs[k] for k in moving] for xs in (primals, tangents))
+    return jax.jvp(lambda *some: fun(*replaced(primals, moving, some)), points, ways)
+
+
 def _jvp(primals, tangents, *, program, kind, plain):
     given = enumerate(zip(primals, tangents, strict=True))
     moving = [k for k, (x, way) in given if type(way) is not ad.Zero and is_inexact(x)]
     if moving and plain is not None and kind.order >= kind.last:
-        fun = jaxpr_as_fun(plain.program)
-        points, ways = ([xs[k] for k in moving] for xs in (primals, tangents))
-        return jax.jvp(lambda *some: fun(*replaced(primals, moving, some)), points, ways)
+        return jvp_of(plain.program, primals, tangents, moving)
     outs = operation_p.bind(*primals, program=program, kind=kind, plain=plain)
     smooth = [k for k, x in enumerate(outs) if is_inexact(x)]
     out_tangents: list[Any] = [ad.Zero(v.aval.to_tangent_aval()) for v in program.jaxpr.outvars]

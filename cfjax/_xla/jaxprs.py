@@ -1,7 +1,7 @@
 """Programs of JAX as values: what they need, what reaches what, parts of them, their evaluation."""
 
 import itertools
-from collections.abc import Callable, Hashable, Iterable, Sequence
+from collections.abc import Callable, Container, Hashable, Iterable, Sequence
 from typing import Any
 
 import jax
@@ -14,18 +14,25 @@ from jax.extend.core import (
     JaxprEqn,
     Literal,
     Primitive,
+    Var,
     jaxpr_as_fun,
     jaxprs_in_params,
 )
+from jax.interpreters import mlir
 from jaxtyping import Array
 
 # A program within a program (`operation.py`).
 operation_p = Primitive("cfjax_operation")
 operation_p.multiple_results = True
 
+# A program as it stands, for one that is being traced.
+call_p = Primitive("cfjax_call")
+call_p.multiple_results = True
+
 # Operations that call a program, and under which parameter. Where nothing is differentiated any
 # more, rules for that are not needed either.
-_CALLS = {
+CALLS = {
+    "cfjax_call": "program",
     "cfjax_operation": "program",
     "closed_call": "call_jaxpr",
     "custom_jvp_call": "call_jaxpr",
@@ -70,8 +77,8 @@ def is_inexact(x: Any) -> bool:
 
 def num_operations(eqn: JaxprEqn) -> int:
     """How many operations on numbers or whole arrays."""
-    if eqn.primitive.name in _CALLS:
-        return sum(map(num_operations, eqn.params[_CALLS[eqn.primitive.name]].eqns))
+    if eqn.primitive.name in CALLS:
+        return sum(map(num_operations, eqn.params[CALLS[eqn.primitive.name]].eqns))
     return int(eqn.primitive.name not in _FREE)
 
 
@@ -183,35 +190,65 @@ def evaluate(jaxpr: Jaxpr, eqn: JaxprEqn, values: Sequence[Any]) -> Sequence[Any
     return [None if isinstance(v, DropVar) else next(outs) for v in eqn.outvars]
 
 
-def flattened(program: ClosedJaxpr, *operands: Array) -> list[Array]:
-    """The program without calls, and with everything once that is computed alike."""
-    # With the operands, so that none of them is forgotten and its identity used again.
-    known: dict[Any, tuple[list[Any], Sequence[Any]]] = {}
+def called(program: ClosedJaxpr, operands: Sequence[Any]) -> list[Array]:
+    """The results of a program, which is traced and lowered as one operation.
 
-    def run(program: ClosedJaxpr, operands: Sequence[Any]) -> list[Any]:
-        jaxpr, env = program.jaxpr, _environment(program, operands)
+    `jaxpr_as_fun` would trace it again, operation by operation.
+    """
+    return call_p.bind(*program.consts, *operands, program=_without_constants(program))
+
+
+def _without_constants(program: ClosedJaxpr) -> ClosedJaxpr:
+    jaxpr = program.jaxpr
+    invars = [*jaxpr.constvars, *jaxpr.invars]
+    return ClosedJaxpr(altered(jaxpr, constvars=[], invars=invars), [])
+
+
+def flattened(program: ClosedJaxpr, calls: Container[str], is_once: bool = False) -> ClosedJaxpr:
+    """The program without calls of some kinds, and `is_once` with everything once that is computed
+    alike.
+    """
+    consts: dict[int, tuple[Var, Any]] = {}
+    eqns: list[JaxprEqn] = []
+    known: dict[Any, list[Any]] = {}
+
+    def run(program: ClosedJaxpr, atoms: Sequence[Any]) -> list[Any]:
+        jaxpr, env = program.jaxpr, dict(zip(program.jaxpr.invars, atoms, strict=True))
+        for v, value in zip(jaxpr.constvars, program.consts, strict=True):
+            env[v], _ = consts.setdefault(id(value), (Var(v.aval), value))
+
+        def read(v: Any) -> Any:
+            return v if isinstance(v, Literal) else env[v]
+
         for eqn in jaxpr.eqns:
-            name = eqn.primitive.name
-            if name in _CALLS:
-                outs = run(eqn.params[_CALLS[name]], [_read(v, env) for v in eqn.invars])
+            invars, name = list(map(read, eqn.invars)), eqn.primitive.name
+            if name in calls:
+                outvars = run(eqn.params[CALLS[name]], invars)
             else:
-                keys = (
-                    # Every bit: as text, numbers that agree in eight digits would be one.
-                    (str(v.aval), np.asarray(v.val).tobytes())
-                    if isinstance(v, Literal)
-                    else id(env[v])
-                    for v in eqn.invars
-                )
-                dropped = [isinstance(v, DropVar) for v in eqn.outvars]
-                key = eqn.primitive, *keys, *dropped, parameters(eqn)
-                if key not in known:
-                    values = [_read(v, env) for v in eqn.invars]
-                    known[key] = values, evaluate(jaxpr, eqn, values)
-                _, outs = known[key]
-            env.update(zip(eqn.outvars, outs, strict=True))
-        return [_read(v, env) for v in jaxpr.outvars]
+                key = _key(eqn, invars) if is_once else object()
+                outvars = known.get(key)
+                if outvars is None:
+                    outvars = [v if isinstance(v, DropVar) else Var(v.aval) for v in eqn.outvars]
+                    known[key] = outvars
+                    eqns.append(eqn.replace(invars=invars, outvars=outvars))
+            env.update(zip(eqn.outvars, outvars, strict=True))
+        return list(map(read, jaxpr.outvars))
 
-    return run(program, operands)
+    outvars = run(program, program.jaxpr.invars)
+    constvars, values = zip(*consts.values(), strict=True) if consts else ((), ())
+    jaxpr = altered(program.jaxpr, constvars=list(constvars), eqns=eqns, outvars=outvars)
+    return ClosedJaxpr(without_dead_code(jaxpr), list(values))
+
+
+def _key(eqn: JaxprEqn, invars: Sequence[Any]) -> Hashable:
+    """What tells an operation from others."""
+    atoms = (
+        # Every bit: as text, numbers that agree in eight digits would be one.
+        (str(v.aval), np.asarray(v.val).tobytes()) if isinstance(v, Literal) else v
+        for v in invars
+    )
+    dropped = [isinstance(v, DropVar) for v in eqn.outvars]
+    return eqn.primitive, *atoms, *dropped, parameters(eqn)
 
 
 def parameters(eqn: JaxprEqn) -> Hashable:
@@ -222,3 +259,23 @@ def parameters(eqn: JaxprEqn) -> Hashable:
     except TypeError:
         return object()  # Equal to no other, so such operations are never merged.
     return values
+
+
+@call_p.def_impl
+def _run(*operands, program):
+    # A literal comes out as NumPy's.
+    return list(map(jnp.asarray, jaxpr_as_fun(program)(*operands)))
+
+
+@call_p.def_abstract_eval
+def _(*operands, program):
+    return program.out_avals
+
+
+mlir.register_lowering(
+    call_p,
+    lambda ctx, *args, program: mlir.core_call_lowering(
+        ctx, *args, name="cfjax", call_jaxpr=program.jaxpr
+    ),
+)
+call_p.to_lojax = _run

@@ -26,8 +26,10 @@ from jaxtyping import PyTree
 
 from .derivatives import Kind, Plain, is_as_it_was
 from .jaxprs import (
+    CALLS,
     altered,
     by_parts,
+    called,
     flattened,
     is_inexact,
     narrowed,
@@ -72,7 +74,7 @@ def operation(
         out, out_structure = jtu.tree_flatten(jtu.tree_map(jnp.asarray, out))
         return out
 
-    made = jax.make_jaxpr(of_leaves)(*leaves)
+    made = flattened(jax.make_jaxpr(of_leaves)(*leaves), ["cfjax_call"])
     operands = [*map(jnp.asarray, made.consts), *leaves]
     invars = [*made.jaxpr.constvars, *made.jaxpr.invars]
     code = altered(made.jaxpr, constvars=[], invars=invars)
@@ -145,14 +147,18 @@ def _run(*operands, program, kind, plain):
     ends = _groups(program.jaxpr, most)
     # Of a second derivative there are several in one loop.
     if len(ends) == 2 and kind.order < 2:
-        return flattened(program, *operands)
+        return _once(program, operands)
 
     def run(group: ClosedJaxpr, values: Sequence[Any], is_last: bool) -> Sequence[Any]:
-        outs = flattened(group, *values)
+        outs = _once(group, values)
         return outs if is_last else _together(outs)
 
     # With the operands materialised, so that no other operation shares what is computed from them.
     return by_parts(program, ends, run, *_together(operands))
+
+
+def _once(program: ClosedJaxpr, operands: Sequence[Any]) -> list[Any]:
+    return called(flattened(program, CALLS, is_once=True), operands)
 
 
 def _together(values: Sequence[Any]) -> list[Any]:

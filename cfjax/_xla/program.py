@@ -26,21 +26,18 @@ from jax.extend.core import (
 )
 from jaxtyping import Array, PyTree
 
-from .jaxprs import evaluate, without_dead_code
+from .jaxprs import called, evaluate, without_dead_code
 from .limits import FUNCTION, MAX_ENTRIES, MAX_LENGTH, MAX_OPERATIONS, MAX_SIZE
 from .materialise import materialised, materialised_p
-from .operation import operation
 from .rules import on_entries
 from .scope import (
     Place,
-    in_equal_steps,
     is_numeric,
     is_on,
     is_rows,
     is_short,
     rewriting,
     unread,
-    where,
     within,
 )
 from .smooth import by_fixed, has_reciprocals, scaled_reciprocal
@@ -56,7 +53,7 @@ from .understood import MOVES, REDUCTIONS, is_in_place, is_readable
 
 # Of a longer step that stands alone, not in a loop of equal steps, derivatives are left to JAX: a
 # gradient through diffrax's loop would take two to three times as long to compile.
-_SHORT_TO_DIFFERENTIATE = FUNCTION // 2
+SHORT_TO_DIFFERENTIATE = FUNCTION // 2
 
 _CALLS = frozenset(("jit", "pjit"))
 
@@ -92,38 +89,6 @@ def _whole(x: Any) -> Any:
     return x.whole() if _is_apart(x) else x
 
 
-def scalarised(fun: Callable[[PyTree], PyTree], y: PyTree, is_derived: bool = True) -> PyTree:
-    """`fun(y)`, computed on single numbers where `y` is a small state of short vectors.
-
-    The result agrees with that of `fun` to rounding. `fun` may close over traced values. Operations
-    that have no rule here get the array whole. Where `y` is another state, the program is too long
-    or cannot be scalarised, and inside of `trace`, this is `fun(y)`. Unless `is_derived`, and where
-    the program is long, derivatives are JAX's own of the program as it is, which compile faster.
-    """
-    program = None if where() else trace(fun, y, "step", is_derived)
-    if program is None:
-        return fun(y)
-    y, parameters = split((y, program.parameters), program.rows)
-    # What is around may use single entries, so that XLA computes anew what these share. It does
-    # little harm to a step, but much to a derivative.
-    is_long = program.length > _SHORT_TO_DIFFERENTIATE
-    is_derived = is_derived and (not is_long or in_equal_steps())
-    through = _materialised if is_derived else lambda x: x
-    # The derivative of an adaptive loop computes a step at one place and uses its derivative at
-    # another. What that needs of the step is many numbers: to compute them again is cheaper than to
-    # materialise them.
-    out = operation(
-        program.run,
-        *through((y, parameters)),
-        place="step",
-        is_batch=program.rows,
-        plain=program.plain,
-        order=1 if is_derived else 0,
-    )
-    # One by one: what is not used is not computed.
-    return jtu.tree_map(lambda x: _whole(through(x)), out, is_leaf=_is_apart)
-
-
 def are_long(fun: Callable[[PyTree], PyTree], y: PyTree, times: int) -> bool:
     """Whether so many of `fun(y)` are too long to be scalarised."""
     code = without_dead_code(jax.make_jaxpr(fun)(y).jaxpr)
@@ -135,84 +100,148 @@ class Program(NamedTuple):
 
     `run(y, parameters)` takes both split, returns what is split and closes over nothing traced.
     `plain` is the same, but for how it computes: as the function does. With `rows` the state has
-    short vectors along leading axes, and is to be split so. `length` counts operations.
+    short vectors along leading axes, and is to be split so.
     """
 
     run: Callable[[PyTree, PyTree], PyTree]
     plain: Callable[[PyTree, PyTree], PyTree]
     parameters: list[Array]
     rows: bool
-    length: int
 
 
 class _Declined(Exception):
     """A program has something that is not to be scalarised."""
 
 
-def trace(
-    fun: Callable[[PyTree], PyTree], y: PyTree, place: Place, is_derived: bool = True
-) -> Program | None:
-    """`fun` as a program that is scalarised at `y`; None if that does not pay or cannot be done.
+class Reading(NamedTuple):
+    """The program of a function that can be scalarised.
 
-    It must have no effects and be readable (`is_readable`). Unless `is_derived`, what it was before
-    may have loops whose turns are scalarised.
+    What it closes over is in `consts`, `shape` is that of its results, `length` counts operations.
+    """
+
+    code: Jaxpr
+    consts: Sequence[Any]
+    shape: PyTree
+    rows: bool
+    length: int
+
+    def scalarised(self, consts: Sequence[Any], *shapes: PyTree) -> tuple[ClosedJaxpr, Any] | None:
+        """The program on what is split, of the given shapes; and the tree of its results.
+
+        `consts` are the values or parameters in the place of those that it closes over.
+        """
+        structure = jtu.tree_structure(self.shape)
+
+        def apart(y: PyTree, parameters: PyTree) -> PyTree:
+            first, moving = filled(consts, parameters), jtu.tree_leaves(y, is_leaf=_is_apart)
+            fixed = [True] * len(first) + [False] * len(moving)
+            form = _Form(self.rows, self.length > FUNCTION, has_reciprocals(self.code, fixed))
+            outs, _ = _evaluate(self.code, (*first, *moving), fixed, form)
+            # What is known before the program runs may come out as NumPy's.
+            outs = [x if _is_apart(x) else jnp.asarray(x) for x in outs]
+            return split(jtu.tree_unflatten(structure, outs), self.rows)
+
+        try:
+            made, out = jax.make_jaxpr(apart, return_shape=True)(*shapes)
+        except _Declined:
+            return None
+        except Exception as error:
+            return unread(error)
+        return made, out
+
+
+def read(fun: Callable[[PyTree], PyTree], y: PyTree, place: Place) -> Reading | None:
+    """The program of `fun` at `y`; None if it does not pay or cannot be scalarised.
+
+    It must have no effects and be readable (`is_readable`).
     """
     rows = _has_rows(y, MAX_ENTRIES[place])
     if not is_on() or not (rows or _is_small_state(y, MAX_ENTRIES[place])):
         return None
     with within(place, rows):
-        jaxpr, out = jax.make_jaxpr(fun, return_shape=True)(y)
-    structure = jtu.tree_structure(out)
+        jaxpr, shape = jax.make_jaxpr(fun, return_shape=True)(y)
     try:
         code = without_dead_code(jaxpr.jaxpr)
-        num_operations = _operations(code)
-        if jaxpr.effects or not is_readable(code) or num_operations > MAX_OPERATIONS:
+        length = _operations(code)
+        if jaxpr.effects or not is_readable(code) or length > MAX_OPERATIONS:
             return None
     except Exception as error:
         return unread(error)
-    before = ClosedJaxpr(code, jaxpr.consts)
-    if place == "loop" or num_operations > _SHORT_TO_DIFFERENTIATE or not is_derived:
+    return Reading(code, jaxpr.consts, shape, rows, length)
+
+
+def trace(fun: Callable[[PyTree], PyTree], y: PyTree, place: Place) -> Program | None:
+    """`fun` as a program that is scalarised at `y`; None if that does not pay or cannot be done."""
+    reading = read(fun, y, place)
+    return None if reading is None else traced(fun, y, reading, place)
+
+
+def traced(
+    fun: Callable[[PyTree], PyTree],
+    y: PyTree,
+    reading: Reading,
+    place: Place,
+    is_derived: bool = True,
+) -> Program | None:
+    """`fun`, which has been read, as a program that is scalarised; None if that cannot be done.
+
+    Unless `is_derived`, what it was before may have loops whose turns are scalarised.
+    """
+    structure, rows = jtu.tree_structure(reading.shape), reading.rows
+    before = ClosedJaxpr(reading.code, reading.consts)
+    if place == "loop" or reading.length > SHORT_TO_DIFFERENTIATE or not is_derived:
         # Where a step is not scalarised its stages may be one loop.
         with rewriting(False) if is_derived else contextlib.nullcontext():
             rolled, shape = jax.make_jaxpr(fun, return_shape=True)(y)
         before = rolled if jtu.tree_structure(shape) == structure else before
-    unknown = {id(x): x for x in jaxpr.consts if _constant(x) is None}
-    unknown |= {id(x): x for x in before.consts if isinstance(x, Tracer)}
-    number = {key: k for k, key in enumerate(unknown)}
-
-    def values(consts: Sequence[Any], parameters: PyTree) -> list[Any]:
-        return [parameters[number[id(x)]] if id(x) in number else x for x in consts]
-
-    def apart(y: PyTree, parameters: PyTree) -> PyTree:
-        first = [x if _constant(x) is None else _constant(x) for x in jaxpr.consts]
-        first, moving = values(first, parameters), jtu.tree_leaves(y, is_leaf=_is_apart)
-        fixed = [True] * len(first) + [False] * len(moving)
-        form = _Form(rows, num_operations > FUNCTION, has_reciprocals(code, fixed))
-        outs, _ = _evaluate(code, (*first, *moving), fixed, form)
-        # What is known before the program runs may come out as NumPy's.
-        outs = [x if _is_apart(x) else jnp.asarray(x) for x in outs]
-        return split(jtu.tree_unflatten(structure, outs), rows)
-
-    parameters = list(map(jnp.asarray, unknown.values()))
-    try:
-        shapes = jax.eval_shape(lambda *args: split(args, rows), y, parameters)
-        made, out = jax.make_jaxpr(apart, return_shape=True)(*shapes)
-    except _Declined:
+    parameters, consts, first = closed_over(reading.consts, before.consts)
+    shapes = jax.eval_shape(lambda *args: split(args, rows), y, parameters)
+    found = reading.scalarised(consts, *shapes)
+    if found is None:
         return None
-    except Exception as error:
-        return unread(error)
+    (made, out), code = found, before.jaxpr
 
     def run(y: PyTree, parameters: PyTree) -> PyTree:
-        outs = jaxpr_as_fun(made)(*jtu.tree_leaves((y, parameters)))
-        # A literal comes out as NumPy's.
-        return jtu.tree_unflatten(jtu.tree_structure(out), list(map(jnp.asarray, outs)))
+        return run_split(made, out, y, parameters)
 
     def plain(y: PyTree, parameters: PyTree) -> PyTree:
-        closed = ClosedJaxpr(before.jaxpr, list(map(_whole, values(before.consts, parameters))))
+        closed = ClosedJaxpr(code, list(map(_whole, filled(first, parameters))))
         outs = jaxpr_as_fun(closed)(*jtu.tree_leaves(join(y)))
         return split_like(out, jtu.tree_unflatten(structure, outs))
 
-    return Program(run, plain, parameters, rows, num_operations)
+    return Program(run, plain, parameters, rows)
+
+
+def run_split(made: ClosedJaxpr, out: PyTree, y: PyTree, parameters: PyTree) -> PyTree:
+    """What a scalarised program with such results makes of what is split."""
+    outs = called(made, jtu.tree_leaves((y, parameters)))
+    return jtu.tree_unflatten(jtu.tree_structure(out), outs)
+
+
+class _Parameter(NamedTuple):
+    """In the place of an array that a program closes over."""
+
+    number: int
+
+
+def closed_over(
+    consts: Sequence[Any], *others: Sequence[Any]
+) -> tuple[list[Array], list[Any], *tuple[list[Any], ...]]:
+    """The arrays that programs close over; and for each what it has, with these as parameters.
+
+    The first program is to be scalarised. It has indices as NumPy's arrays.
+    """
+    unknown = {id(x): x for x in consts if _constant(x) is None}
+    unknown |= {id(x): x for more in others for x in more if isinstance(x, Tracer)}
+    number = {key: _Parameter(k) for k, key in enumerate(unknown)}
+    first = [number[id(x)] if id(x) in number else _constant(x) for x in consts]
+    rest = [[number.get(id(x), x) for x in more] for more in others]
+    return list(map(jnp.asarray, unknown.values())), first, *rest
+
+
+def filled(consts: Sequence[Any], parameters: Sequence[Any]) -> list[Any]:
+    """What a program closes over, with the values of parameters."""
+    return [parameters[x.number] if isinstance(x, _Parameter) else x for x in consts]
 
 
 def _constant(x: Any) -> np.ndarray | None:
@@ -360,18 +389,3 @@ def _apart(
         new = iter(materialised([x for group, _ in groups for x in group], **eqn.params))
         return [shape.unflatten(next(new) for _ in group) for group, shape in groups]
     return on_entries(jaxpr, eqn, values, fixed, form.rows)
-
-
-def _materialised(tree: Any) -> Any:
-    """The same, with all single numbers materialised where this is differentiated."""
-    leaves, structure = jtu.tree_flatten(tree)
-    places = [k for k, x in enumerate(leaves) if _is_number(x)]
-    if places:
-        new = materialised([leaves[k] for k in places], in_batches=True, now=False)
-        for k, x in zip(places, new, strict=True):
-            leaves[k] = x
-    return jtu.tree_unflatten(structure, leaves)
-
-
-def _is_number(x: Any) -> bool:
-    return isinstance(x, Tracer) and x.ndim == 0 and jnp.issubdtype(x.dtype, jnp.inexact)

@@ -12,31 +12,44 @@ import numpy as np
 from .limits import MAX_LENGTH, MAX_SIZE
 
 # JAX compiles anew where it changes.
-_is_on = jax.make_user_context(os.environ.get("CFJAX_REWRITE", "1") != "0")
+_on = jax.make_user_context({"0": False, "1": True}.get(os.environ.get("CFJAX_REWRITE", "")))
 
 
-def rewriting(on: bool) -> contextlib.AbstractContextManager:
+def rewriting(on: bool | None) -> contextlib.AbstractContextManager:
     """Switches the rewriting of small systems for XLA on or off within a `with` block.
 
-    It is on by default, which makes steps several times faster on CPU and GPU. Without it XLA gets
-    every program as it was traced: switch it off to debug a program, or where rewriting does not
-    pay. The values agree to rounding. The environment variable `CFJAX_REWRITE=0` switches it off
-    for a whole process.
+    Rewriting makes steps several times faster on CPU and GPU, and takes time to compile. The values
+    agree to rounding.
+
+    - None, the default: rewrites where that saves time if programs run for 10 000 steps, over all
+      members of a batch. Long steps, such as those of `CF54` and `RKMK8`, are rewritten in batches
+      and in `cfjax.integrate`; short ones everywhere.
+    - True: rewrites long steps everywhere, for a single solve of many steps with
+      `diffrax.diffeqsolve`.
+    - False: XLA gets every program as it was traced, for debugging and for programs that run a few
+      times.
+
+    The environment variable `CFJAX_REWRITE`, 0 or 1, sets the default of a process.
 
     ```python
     with cfjax.rewriting(False):
         sol = cfjax.integrate(term, solver, 0.0, 1.0, y0, num_steps=100)
     ```
 
-    **Raises** `TypeError` if `on` is not a bool.
+    **Raises** `TypeError` if `on` is neither a bool nor None.
     """
-    if not isinstance(on, bool):
-        raise TypeError(f"on must be True or False, got {on!r}.")
-    return _is_on(on)
+    if not (on is None or isinstance(on, bool)):
+        raise TypeError(f"on must be True, False or None, got {on!r}.")
+    return _on(on)
 
 
 def is_on() -> bool:
-    return _is_on.value and not _is_spread()
+    return _on.value is not False and not _is_spread()
+
+
+def is_everywhere() -> bool:
+    """Whether also what does not pay within 10 000 steps is scalarised."""
+    return _on.value is True
 
 
 def _is_spread() -> bool:

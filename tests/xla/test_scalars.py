@@ -11,9 +11,8 @@ from jax import lax
 from jax.experimental import io_callback
 
 import cfjax
-from cfjax._xla import program
+from cfjax._xla import program, scalarised
 from cfjax._xla.materialise import materialised
-from cfjax._xla.program import scalarised
 
 pytestmark = pytest.mark.usefixtures("rewritten")
 

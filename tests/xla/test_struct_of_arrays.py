@@ -7,8 +7,8 @@ import pytest
 from jax import lax
 
 import cfjax
-from cfjax._xla import program
-from cfjax._xla.program import join, scalarised, split
+from cfjax._xla import program, scalarised
+from cfjax._xla.program import join, split
 from cfjax._xla.scope import is_rows
 from cfjax._xla.struct_of_arrays import StructOfArrays, struct_of_arrays
 

@@ -10,7 +10,8 @@ from jax import lax
 from jax.experimental.xla_metadata import set_xla_metadata
 
 import cfjax
-from cfjax._xla.program import scalarised, trace
+from cfjax._xla import scalarised
+from cfjax._xla.program import trace
 from cfjax._xla.understood import is_readable, is_understood
 
 pytestmark = pytest.mark.usefixtures("rewritten")
