@@ -188,6 +188,6 @@ def test_a_solve_agrees_however_its_steps_are_compiled(solver):
             np.testing.assert_allclose(quick(solve)(few[0]), expected[0], **tight)
 
 
-def test_the_switch_is_a_bool_or_none():
+def test_the_switch_is_a_bool_or_none(no_shape_hook):
     with pytest.raises(TypeError, match=r"on must be True, False or None, got 'yes'"):
         cfjax.rewriting("yes")  # pyright: ignore[reportArgumentType]
