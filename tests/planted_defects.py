@@ -788,7 +788,7 @@ DEFECTS = [
     ),
     Defect(
         "_xla/step.py",
-        "reading = reading._replace(consts=())",
+        "reading = reading._replace(code=code, consts=())",
         "pass",
         "values of a trace that has ended are kept for a batch",
         "xla/test_step.py",

@@ -195,10 +195,11 @@ def called(program: ClosedJaxpr, operands: Sequence[Any]) -> list[Array]:
 
     `jaxpr_as_fun` would trace it again, operation by operation.
     """
-    return call_p.bind(*program.consts, *operands, program=_without_constants(program))
+    return call_p.bind(*program.consts, *operands, program=without_constants(program))
 
 
-def _without_constants(program: ClosedJaxpr) -> ClosedJaxpr:
+def without_constants(program: ClosedJaxpr) -> ClosedJaxpr:
+    """The program that takes what it closes over before its operands, and keeps none of it."""
     jaxpr = program.jaxpr
     invars = [*jaxpr.constvars, *jaxpr.invars]
     return ClosedJaxpr(altered(jaxpr, constvars=[], invars=invars), [])

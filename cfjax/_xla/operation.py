@@ -39,6 +39,7 @@ from .jaxprs import (
     replaced,
     structs,
     variables,
+    without_constants,
     without_dead_code,
 )
 from .limits import FUNCTION, WHOLE, WHOLE_IN_BATCHES
@@ -76,8 +77,7 @@ def operation(
 
     made = flattened(jax.make_jaxpr(of_leaves)(*leaves), ["cfjax_call"])
     operands = [*map(jnp.asarray, made.consts), *leaves]
-    invars = [*made.jaxpr.constvars, *made.jaxpr.invars]
-    code = altered(made.jaxpr, constvars=[], invars=invars)
+    code = without_constants(made).jaxpr
     # Integers, as the number of a step, are on their own: no derivative is of them, and a transpose
     # of what is linear has their values.
     outs: list[Any] = [None] * len(code.outvars)
@@ -94,7 +94,7 @@ def operation(
         pieces = functools.partial(
             by_parts, program, ends, lambda piece, xs, is_last: bind(*xs, program=piece)
         )
-        program = program_of(pieces, *structs(invars))
+        program = program_of(pieces, *structs(code.invars))
     before = None
     if plain is not None and not any(isinstance(x, Tracer) for x in made.consts):
         skipped = len(made.consts)
@@ -104,7 +104,7 @@ def operation(
             outs = jtu.tree_leaves(plain(*jtu.tree_unflatten(structure, operands[skipped:])))
             return [outs[k] for k in smooth]
 
-        before = Plain(of_plain_leaves, structs(invars))
+        before = Plain(of_plain_leaves, structs(code.invars))
     new = operation_p.bind(*operands, program=program, kind=kind, plain=before)
     return jtu.tree_unflatten(out_structure, replaced(outs, smooth, new))
 

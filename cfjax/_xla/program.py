@@ -26,7 +26,7 @@ from jax.extend.core import (
 )
 from jaxtyping import Array, PyTree
 
-from .jaxprs import called, evaluate, without_dead_code
+from .jaxprs import called, evaluate, without_constants, without_dead_code
 from .limits import FUNCTION, MAX_ENTRIES, MAX_LENGTH, MAX_OPERATIONS, MAX_SIZE
 from .materialise import materialised, materialised_p
 from .rules import on_entries
@@ -199,14 +199,14 @@ def traced(
     found = reading.scalarised(consts, *shapes)
     if found is None:
         return None
-    (made, out), code = found, before.jaxpr
+    (made, out), code = found, without_constants(before)
 
     def run(y: PyTree, parameters: PyTree) -> PyTree:
         return run_split(made, out, y, parameters)
 
     def plain(y: PyTree, parameters: PyTree) -> PyTree:
-        closed = ClosedJaxpr(code, list(map(_whole, filled(first, parameters))))
-        outs = jaxpr_as_fun(closed)(*jtu.tree_leaves(join(y)))
+        constants = map(_whole, filled(first, parameters))
+        outs = jaxpr_as_fun(code)(*constants, *jtu.tree_leaves(join(y)))
         return split_like(out, jtu.tree_unflatten(structure, outs))
 
     return Program(run, plain, parameters, rows)

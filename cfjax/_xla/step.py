@@ -11,7 +11,7 @@ from jax.extend.core import ClosedJaxpr, Jaxpr, jaxpr_as_fun, jaxprs_in_params
 from jaxtyping import Array, PyTree
 
 from .alone import Choice, alone_p
-from .jaxprs import operation_p, program_of
+from .jaxprs import operation_p, program_of, without_constants
 from .materialise import materialised
 from .operation import operation
 from .program import (
@@ -102,7 +102,8 @@ def _in_batches(fun: Callable[[PyTree], PyTree], y: PyTree, reading: Reading) ->
     alone = of_operands(alone, rest[0])
     derived = alone if is_one else of_operands(derived, rest[1])
     # Nothing that is traced now may be kept for later.
-    reading = reading._replace(consts=())
+    code = without_constants(ClosedJaxpr(reading.code, reading.consts)).jaxpr
+    reading = reading._replace(code=code, consts=())
 
     def make() -> Callable[..., Sequence[Any]] | None:
         found = reading.scalarised(consts, *shapes)
