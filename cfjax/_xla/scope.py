@@ -21,11 +21,10 @@ def rewriting(on: bool | None) -> contextlib.AbstractContextManager:
     Rewriting makes steps several times faster on CPU and GPU, and takes time to compile. The values
     agree to rounding.
 
-    - None, the default: rewrites where that saves time if programs run for 10 000 steps, over all
-      members of a batch. Long steps, such as those of `CF54` and `RKMK8`, are rewritten in batches
-      and in `cfjax.integrate`; short ones everywhere.
-    - True: rewrites long steps everywhere, for a single solve of many steps with
-      `diffrax.diffeqsolve`.
+    - None, the default: rewrites short steps, such as those of `CF4`, everywhere, and long ones,
+      such as those of `CF54` and `RKMK8`, in batches and in `cfjax.integrate`. For one system in
+      `diffrax.diffeqsolve` these would take longer to compile than 10 000 steps save.
+    - True: rewrites long steps everywhere, for a single solve of very many steps.
     - False: XLA gets every program as it was traced, for debugging and for programs that run a few
       times.
 
