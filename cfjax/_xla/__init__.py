@@ -28,9 +28,9 @@ from .materialise import materialised_together as materialised_together
 from .pack import pack as pack
 from .pack import unpack as unpack
 from .program import are_long as are_long
+from .scalarise import scalarised as scalarised
 from .scope import is_rewritten as is_rewritten
 from .scope import rewriting as rewriting
 from .scope import within_equal_steps as within_equal_steps
 from .smooth import smooth as smooth
-from .step import scalarised as scalarised
 from .table import table as table

@@ -51,9 +51,10 @@ from .struct_of_arrays import (
 )
 from .understood import MOVES, REDUCTIONS, is_in_place, is_readable
 
-# Of a longer step that stands alone, not in a loop of equal steps, derivatives are left to JAX: a
-# gradient through diffrax's loop would take two to three times as long to compile.
-SHORT_TO_DIFFERENTIATE = FUNCTION // 2
+# What is longer and stands alone, not in a loop of equal steps, is scalarised in batches only, and
+# its derivatives are left to JAX: a gradient through diffrax's loop would take two to three times
+# as long to compile.
+SHORT = FUNCTION // 2
 
 _CALLS = frozenset(("jit", "pjit"))
 
@@ -189,7 +190,7 @@ def traced(
     """
     structure, rows = jtu.tree_structure(reading.shape), reading.rows
     before = ClosedJaxpr(reading.code, reading.consts)
-    if place == "loop" or reading.length > SHORT_TO_DIFFERENTIATE or not is_derived:
+    if place == "loop" or reading.length > SHORT or not is_derived:
         # Where a step is not scalarised its stages may be one loop.
         with rewriting(False) if is_derived else contextlib.nullcontext():
             rolled, shape = jax.make_jaxpr(fun, return_shape=True)(y)

@@ -1,4 +1,4 @@
-"""A step on single numbers: where it is scalarised, and where it is left as it is."""
+"""A function on single numbers: where it is scalarised, and where it is left as it is."""
 
 from collections.abc import Callable, Sequence
 from typing import Any
@@ -15,7 +15,7 @@ from .jaxprs import operation_p, program_of, without_constants
 from .materialise import materialised
 from .operation import operation
 from .program import (
-    SHORT_TO_DIFFERENTIATE,
+    SHORT,
     Reading,
     closed_over,
     filled,
@@ -43,7 +43,7 @@ def scalarised(fun: Callable[[PyTree], PyTree], y: PyTree, is_derived: bool = Tr
     reading = None if where() else read(fun, y, "step")
     if reading is None:
         return fun(y)
-    is_long = reading.length > SHORT_TO_DIFFERENTIATE
+    is_long = reading.length > SHORT
     is_usual = is_derived and not is_long
     if not (is_usual or reading.rows or in_equal_steps() or is_everywhere()):
         outs = _in_batches(fun, y, reading)
