@@ -276,6 +276,15 @@ def batch_adaptive() -> list[list[str]]:
 
 
 @table
+def batch_compile_adaptive() -> list[list[str]]:
+    rows = [row for row in load("batch")["rows"] if "what" in row]
+    return [["", *values(rows, "what")]] + [
+        [f"`{m}`", *(f"{two_digits(r['compile CPU seconds'])} s" for r in pick(rows, method=m))]
+        for m in values(rows, "method")
+    ]
+
+
+@table
 def gpu() -> list[list[str]]:
     rows = [{**row, "is processor": row["device"] == "cpu"} for row in load("gpu")["rows"]]
 

@@ -192,9 +192,9 @@ class AbstractChartSolver(AbstractLieSolver):
                 last = evaluate(1.0, at(y0, end, compensation))
             else:
                 last = values[-1]
-            return (end, last), (error, step.path)
+            return (end, last, error), step.path
 
-        y1, (error, path), state, result = ended(solver_state, stepped, y0)
+        y1, error, path, state, result = ended(solver_state, stepped, y0)
         path = self.extended(path, lambda c, y: product(terms, evaluate(c, y), terms.contr(t0, t1)))
         return y1, error, dict(path=path), state, result
 
@@ -263,15 +263,17 @@ def begun(
 
 def ended(
     solver_state: "State", stepped: Callable[[PyTree], Any], y0: PyTree
-) -> tuple[PyTree, Any, "State", diffrax.RESULTS]:
-    """The state after a step, what else the step makes, the solver's state, and the result.
+) -> tuple[PyTree, PyTree, Any, "State", diffrax.RESULTS]:
+    """The state after a step, the estimate of its error, what output within it takes, the solver's
+    state, and the result.
 
-    `stepped(y0)` is a pair of pairs: of the end, an increment where the state is a compensated sum,
-    with the field that the next step begins with or None; and of what else there is.
+    `stepped(y0)` is a pair. First is the end, an increment where the state is a compensated sum,
+    with the field that the next step begins with and the estimate, or None for these. Second is
+    what output takes.
     """
-    (end, first), rest = scalarised(stepped, y0)
+    (end, first, error), within = scalarised(stepped, y0, is_pair=True)
     y1, compensation = added(y0, end, solver_state.compensation)
-    return y1, rest, State(compensation, first, solver_state.zero), result_of(y1)
+    return y1, error, within, State(compensation, first, solver_state.zero), result_of(y1)
 
 
 class State(eqx.Module):

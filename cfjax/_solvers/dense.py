@@ -1,8 +1,8 @@
 """Output within a step, on the manifold."""
 
 import abc
+import functools
 from collections.abc import Callable, Sequence
-from functools import lru_cache
 from typing import Any
 
 import diffrax
@@ -136,18 +136,22 @@ class Path(AbstractPath):
 
     def point(self, theta: Any) -> PyTree:
         """The solution at a part `theta` of the step."""
-        powers = _by_power(self.continuous_extension)
-        weights = _polynomials(powers, jnp.asarray(theta))
+        powers, theta = _by_power(self.continuous_extension), jnp.asarray(theta)
+        num_flows = powers.shape[1]
         point, fields = self.parts(self.arrays)
         # Of small states too: an event's root finder differentiates it, and a loop of flows on
         # short vectors is as fast in batches.
-        if self.apply_flow is carried and len(weights) > 1 and can_roll(None, fields[0], point):
+        if self.apply_flow is carried and num_flows > 1 and can_roll(None, fields[0], point):
             # There may be no field at the end of the step, where it has no weight.
-            return rolled_flows(weights[:, : len(fields)], fields, point, carried)
+            rows = powers.swapaxes(0, 1)[..., : len(fields)].astype(theta.dtype)
+            weights = functools.partial(_polynomials, theta=theta)
+            return rolled_flows(jnp.asarray(rows), fields, point, carried, weights)
+
+        weights = _polynomials(powers, theta)
 
         def end(arrays: tuple[Array | np.ndarray, ...]) -> PyTree:
             point, fields = self.parts(arrays)
-            for j in range(len(weights)):
+            for j in range(num_flows):
                 used = np.flatnonzero(powers[:, j].any(axis=0))
                 row = [(weights[j, k], fields[k]) for k in used]
                 point = self.apply_flow(combine(*zip(*row, strict=True)), point)
@@ -156,7 +160,7 @@ class Path(AbstractPath):
         return scalarised(end, self.arrays)
 
 
-@lru_cache
+@functools.lru_cache
 def _by_power(extension: ContinuousExtension) -> Float[np.ndarray, "powers flows stages"]:
     """Its coefficients; flows may have different numbers of powers."""
     size = max(map(len, extension)), len(extension), len(extension[0][0])
@@ -167,9 +171,9 @@ def _by_power(extension: ContinuousExtension) -> Float[np.ndarray, "powers flows
 
 
 def _polynomials(
-    powers: Float[np.ndarray, "powers flows stages"], theta: Real[Array, ""]
-) -> Real[Array, "flows stages"]:
-    """The weight of each stage in each flow, `sum_i powers[i] theta^(i+1)`.
+    powers: Real[np.ndarray | Array, "powers *rest"], theta: Real[Array, ""]
+) -> Real[Array, "*rest"]:
+    """The weights of fields, `sum_i powers[i] theta^(i+1)`.
 
     One array: number by number they would be most of the program of output within a step.
     """

@@ -91,12 +91,12 @@ class ImplicitMidpoint(AbstractLieSolver):
             start = with_sums(lambda c, y: y if c is None else jnp.zeros_like(y), compensation, y0)
             end, _ = shared_end(compensation, moved(frozen, start, y0, compensation), None, True)
             charted, point = to_chart(frozen, y0, ())
-            return (end, None), Path.of(_EXTENSION, point, [charted])
+            return (end, None, None), Path.of(_EXTENSION, point, [charted])
 
-        y1, path, state, result = ended(solver_state, stepped, y0)
+        y1, error, path, state, result = ended(solver_state, stepped, y0)
         failed: Any = diffrax.RESULTS.nonlinear_divergence
         result = diffrax.RESULTS.where(has_converged, result, failed)
-        return y1, None, dict(path=path), state, result
+        return y1, error, dict(path=path), state, result
 
 
 def _mean(field: PyTree, y0: PyTree) -> PyTree:

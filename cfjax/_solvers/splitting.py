@@ -136,10 +136,10 @@ class AbstractSplitting(AbstractLieSolver, diffrax.AbstractStratonovichSolver):
             field, z = apply_flow(0, known, self.stages[0], start)
             (z, first), later = by_turns(pair, (z, known), _pairs(self.stages))
             end, _ = shared_end(compensation, z, None, is_followed=True)
-            return (end, first), (field, later)
+            return (end, first, None), (field, later)
 
-        y1, (field, later), state, result = ended(solver_state, stepped, y0)
-        return y1, None, dict(start=y0, first=field, later=later), state, result
+        y1, error, (field, later), state, result = ended(solver_state, stepped, y0)
+        return y1, error, dict(start=y0, first=field, later=later), state, result
 
 
 class Splitting(AbstractSplitting):

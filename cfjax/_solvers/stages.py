@@ -12,9 +12,10 @@ from jax import lax
 from jaxtyping import Array, PyTree, Real
 
 from .._arrays import describe
-from .._field import AbstractFrozenField, is_field
+from .._field import AbstractFrozenField, combine, is_field
 from .._fields.elementwise import Elementwise
 from .._methods.tableau import Product, Row
+from .._numerics.matmul import matmul
 from .._numerics.vectors import pack
 from .chart import Chart
 from .compiled import are_long, is_rewritten, limits, scalarised, table
@@ -93,22 +94,33 @@ def _is_plain_part(field: AbstractFrozenField) -> bool:
 
 
 def rolled_flows(
-    weights: Real[Array, "flows stages"],
+    rows: Real[Array, "flows ..."],
     fields: Sequence[PyTree],
     point: PyTree,
     flow: Callable[[PyTree, PyTree], PyTree],
+    weights: Callable[[Array], Real[Array, " stages"]] = lambda row: row,
 ) -> PyTree:
-    """Where flows of combinations of the first fields lead, that of the first row first."""
+    """Where flows of combinations of the fields lead, that of the first row first.
+
+    A combination has the `weights` of its row, which are of the first fields.
+    """
     # XLA computes what leads to each of the arrays that `jnp.stack` gets for itself.
-    stacked = _Stacked(jtu.tree_map(lambda *leaves: pack(leaves), *fields[: weights.shape[1]]))
+    stacked = _Stacked(jtu.tree_map(lambda *leaves: pack(leaves), *fields))
 
     def body(point: PyTree, row: Array) -> Any:
-        moved = lambda point: flow(stacked.combination(row), point)  # noqa: E731
+        def moved(point: PyTree) -> PyTree:
+            if is_rewritten():
+                # As numbers: in a batch XLA would take each of them out of its place in one array.
+                combination = combine(list(weights(row)), fields)
+            else:
+                combination = stacked.combination(weights(row))
+            return flow(combination, point)
+
         return scalarised(moved, point), None
 
     # A weak type would be lost on the way.
     start = jtu.tree_map(lambda x: jnp.asarray(x, jnp.result_type(x)), point)
-    return lax.scan(body, start, weights)[0]
+    return lax.scan(body, start, rows)[0]
 
 
 class _Flow(NamedTuple):
@@ -376,6 +388,11 @@ def _stack(tree: PyTree, n: int) -> PyTree:
 
 def _combination(row: Array, fields: Array) -> Array:
     fields = fields[: len(row)]
+    if jnp.size(fields[0]) > limits.LARGE:
+        if jnp.iscomplexobj(fields):
+            return lax.complex(_combination(row, fields.real), _combination(row, fields.imag))
+        product = matmul(row.astype(fields.dtype), fields.reshape(len(row), -1))
+        return product.reshape(fields.shape[1:])
     weights = row.astype(fields.dtype).reshape(-1, *[1] * (fields.ndim - 1))
     return jnp.sum(weights * fields, axis=0)
 

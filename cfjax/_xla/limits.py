@@ -26,6 +26,10 @@ MAX_ENTRIES = {"step": 16, "loop": 2 * 16 + 2}
 # XLA takes what more entries are made of apart, and computes all that leads there for each of them.
 # (scenes, adaptive steps)
 MAX_RESULTS = 15
+# Of the entries that are materialised together in a batch. If there are more, XLA does not compute
+# several members at once in a vector, which takes three times as long, and from 18 entries on five
+# times or more. (batch)
+MAX_RESULTS_IN_BATCHES = 13
 
 # About as many operations XLA puts into one function. What is longer is cut, and materialised in
 # between: a step takes 20 ms where it is not. (attitude)
@@ -46,7 +50,8 @@ WHOLE_IN_BATCHES = (math.inf, 9 * FUNCTION // 4, 3 * FUNCTION // 2)
 
 # Of the numbers of a point. If a loop over stages is differentiated, it keeps the points of all
 # stages for each of its turns, which is too much memory for larger ones; and unrolled, XLA keeps
-# several fields to add them up at once, which is too much for those of twice as many. (scenes)
+# several fields to add them up at once, which is too much for those of twice as many. Of larger
+# fields, combinations are matrix products, up to ten times as fast as sums. (scenes)
 LARGE = 2048
 
 # Of the stages of a method, or of equal steps: more are many. A method of many stages is mostly not

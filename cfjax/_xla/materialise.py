@@ -13,7 +13,7 @@ from jax.extend.core import Primitive
 from jax.interpreters import ad, batching, mlir
 from jaxtyping import Array, PyTree
 
-from .limits import MAX_RESULTS, MAX_SIZE
+from .limits import MAX_RESULTS, MAX_RESULTS_IN_BATCHES, MAX_SIZE
 from .pack import pack, sharding, unpack
 from .scope import has_rows, is_on, is_short, where
 
@@ -111,9 +111,8 @@ def _materialised_impl(*entries, in_batches, alone, now, is_cut, has_calls=False
         is_batch = in_batches and shape != ()
         if has_calls if is_batch else alone:
             through = _by_call if is_batch else _by_reduction
-            most = len(places) if is_batch else MAX_RESULTS
-            for start in range(0, len(places), most):
-                some = places[start : start + most]
+            most = MAX_RESULTS_IN_BATCHES if is_batch else MAX_RESULTS
+            for some in np.array_split(places, -(-len(places) // most)):
                 for k, x in zip(some, through([entries[k] for k in some]), strict=True):
                     outs[k] = x
     return outs

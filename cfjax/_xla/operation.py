@@ -20,7 +20,7 @@ import jax.numpy as jnp
 import jax.tree_util as jtu
 import numpy as np
 from jax.core import Tracer
-from jax.extend.core import ClosedJaxpr, Jaxpr, jaxpr_as_fun
+from jax.extend.core import ClosedJaxpr, Jaxpr, Literal, jaxpr_as_fun
 from jax.interpreters import mlir
 from jaxtyping import PyTree
 
@@ -42,8 +42,8 @@ from .jaxprs import (
     without_constants,
     without_dead_code,
 )
-from .limits import FUNCTION, WHOLE, WHOLE_IN_BATCHES
-from .materialise import materialised
+from .limits import FUNCTION, MAX_RESULTS_IN_BATCHES, WHOLE, WHOLE_IN_BATCHES
+from .materialise import materialised, materialised_p
 from .scope import Place
 
 _GROUP = FUNCTION // 2
@@ -58,20 +58,24 @@ def operation(
     is_batch: bool = False,
     plain: Callable[..., PyTree] | None = None,
     order: int = 1,
+    is_pair: bool = False,
 ) -> PyTree:
     """`fun(*args)`, as one operation, of a batch if it is one already.
 
     `fun` may close over traced values, and has no effects. Reverse mode keeps the arguments and
     computes everything again, as with `jax.checkpoint`. `plain` is the same function before it was
-    scalarised, and closes over nothing that is traced: derivatives beyond `order` are of that.
+    scalarised, and closes over nothing that is traced: derivatives beyond `order` are of that. With
+    `is_pair` it returns a pair, of which mostly the first part alone is used.
     """
     leaves, structure = jtu.tree_flatten(args)
     leaves = list(map(jnp.asarray, leaves))
     out_structure: Any = None
+    first: list[Any] = []
 
     def of_leaves(*leaves):
-        nonlocal out_structure
+        nonlocal out_structure, first
         out = fun(*jtu.tree_unflatten(structure, leaves))
+        first = jtu.tree_leaves(out[0] if is_pair else out)
         out, out_structure = jtu.tree_flatten(jtu.tree_map(jnp.asarray, out))
         return out
 
@@ -105,17 +109,16 @@ def operation(
             return [outs[k] for k in smooth]
 
         before = Plain(of_plain_leaves, structs(code.invars))
+    if is_pair and not is_batch:
+        # Along leading axes a copy of the program (`_in_two`) would take much memory.
+        kind = kind._replace(first=sum(is_smooth[: len(first)]))
     new = operation_p.bind(*operands, program=program, kind=kind, plain=before)
     return jtu.tree_unflatten(out_structure, replaced(outs, smooth, new))
 
 
 def _places(jaxpr: Jaxpr) -> list[int]:
     """The ends of pieces of a program, where few values are on their way."""
-    n = len(jaxpr.eqns)
-    last = dict.fromkeys(variables(jaxpr.outvars), n)
-    for k, eqn in reversed(list(enumerate(jaxpr.eqns))):
-        for v in variables(eqn.invars):
-            last.setdefault(v, k)
+    n, last = len(jaxpr.eqns), _last_uses(jaxpr)
     change = np.zeros(n + 2, int)
     for k, eqn in enumerate(jaxpr.eqns):
         for v in eqn.outvars:
@@ -140,6 +143,8 @@ def _places(jaxpr: Jaxpr) -> list[int]:
 def _run(*operands, program, kind, plain):
     if is_as_it_was(program, kind, plain):
         return jaxpr_as_fun(plain.program)(*operands)
+    if kind.is_batch and not kind.order and kind.first < len(program.jaxpr.outvars):
+        return _in_two(program, int(kind.first), operands)
     order = min(kind.order, 2)
     most = WHOLE[kind.place][order]
     if kind.is_batch:
@@ -155,6 +160,71 @@ def _run(*operands, program, kind, plain):
 
     # With the operands materialised, so that no other operation shares what is computed from them.
     return by_parts(program, ends, run, *_together(operands))
+
+
+def _in_two(program: ClosedJaxpr, first: int, operands: Sequence[Any]) -> list[Any]:
+    """The first results, and all others from a copy of the program.
+
+    XLA would compute what leads to each of the others anew. The copy is in parts, each with few
+    results, which are materialised together. What is not used is not computed.
+    """
+    given = range(len(program.jaxpr.outvars))
+    main, main_takes = narrowed(program, given[:first])
+    rest, rest_takes = narrowed(flattened(program, CALLS, is_once=True), given[first:])
+    rest = _not_materialised(rest)
+    # So that the copy is not seen to be one.
+    inputs = _together([operands[k] for k in rest_takes])
+    run = lambda part, values, is_last: _together(jaxpr_as_fun(part)(*values))  # noqa: E731
+    outs = by_parts(rest, _ends_of_few(rest.jaxpr), run, *inputs)
+    return [*_once(main, [operands[k] for k in main_takes]), *outs]
+
+
+def _not_materialised(program: ClosedJaxpr) -> ClosedJaxpr:
+    """The program in which everything that is materialised is as it was."""
+    same: dict[Any, Any] = {}
+
+    def read(v: Any) -> Any:
+        return v if isinstance(v, Literal) else same.get(v, v)
+
+    eqns = []
+    for eqn in program.jaxpr.eqns:
+        invars = list(map(read, eqn.invars))
+        if eqn.primitive is materialised_p:
+            same.update(zip(eqn.outvars, invars, strict=True))
+        else:
+            eqns.append(eqn.replace(invars=invars))
+    outvars = list(map(read, program.jaxpr.outvars))
+    return ClosedJaxpr(altered(program.jaxpr, eqns=eqns, outvars=outvars), program.consts)
+
+
+def _ends_of_few(jaxpr: Jaxpr) -> list[int]:
+    """The ends of parts of a program, as long as they give few values to the rest and the results.
+
+    A part is also not too long for one function.
+    """
+    n = len(jaxpr.eqns)
+    last = _last_uses(jaxpr)
+    ends = [0]
+    while ends[-1] < n:
+        live, length, found = set(), 0, []
+        for k in range(ends[-1], n):
+            eqn = jaxpr.eqns[k]
+            length += num_operations(eqn)
+            live = {v for v in (*live, *eqn.outvars) if last.get(v, -1) > k}
+            found.append((len(live) > MAX_RESULTS_IN_BATCHES and len(live), -k))
+            if length > FUNCTION:
+                break
+        ends.append(1 - min(found)[1])
+    return ends
+
+
+def _last_uses(jaxpr: Jaxpr) -> dict[Any, int]:
+    """The number of the operation that uses a value last; that after the last one for results."""
+    last = dict.fromkeys(variables(jaxpr.outvars), len(jaxpr.eqns))
+    for k, eqn in reversed(list(enumerate(jaxpr.eqns))):
+        for v in variables(eqn.invars):
+            last.setdefault(v, k)
+    return last
 
 
 def _once(program: ClosedJaxpr, operands: Sequence[Any]) -> list[Any]:

@@ -30,7 +30,9 @@ from .scope import in_equal_steps, is_everywhere, rewriting, where
 from .struct_of_arrays import StructOfArrays
 
 
-def scalarised(fun: Callable[[PyTree], PyTree], y: PyTree, is_derived: bool = True) -> PyTree:
+def scalarised(
+    fun: Callable[[PyTree], PyTree], y: PyTree, is_derived: bool = True, is_pair: bool = False
+) -> PyTree:
     """`fun(y)`, computed on single numbers where `y` is a small state of short vectors.
 
     The result agrees with that of `fun` to rounding. `fun` may close over traced values. Operations
@@ -38,7 +40,7 @@ def scalarised(fun: Callable[[PyTree], PyTree], y: PyTree, is_derived: bool = Tr
     cannot be scalarised, and within another one that is scalarised, this is `fun(y)`. Unless
     `is_derived`, and where the program is long, derivatives are JAX's own of the program as it is,
     which compile faster. Outside of a loop of equal steps, what is long is scalarised in batches
-    only.
+    only. With `is_pair` the function returns a pair, of which mostly the first part alone is used.
     """
     reading = None if where() else read(fun, y, "step")
     if reading is None:
@@ -46,7 +48,7 @@ def scalarised(fun: Callable[[PyTree], PyTree], y: PyTree, is_derived: bool = Tr
     is_long = reading.length > SHORT
     is_usual = is_derived and not is_long
     if not (is_usual or reading.rows or in_equal_steps() or is_everywhere()):
-        outs = _in_batches(fun, y, reading)
+        outs = _in_batches(fun, y, reading, is_pair)
         if outs is not None:
             return outs
     program = traced(fun, y, reading, "step", is_derived)
@@ -55,7 +57,7 @@ def scalarised(fun: Callable[[PyTree], PyTree], y: PyTree, is_derived: bool = Tr
     y, parameters = split((y, program.parameters), program.rows)
     # What is around may use single entries, so that XLA computes anew what these share. It does
     # little harm to a step, but much to a derivative.
-    is_derived = is_derived and (not is_long or in_equal_steps())
+    is_derived = is_derived and (not is_long or in_equal_steps() or is_everywhere())
     through = _materialised if is_derived else lambda x: x
     # The derivative of an adaptive loop computes a step at one place and uses its derivative at
     # another. What that needs of the step is many numbers: to compute them again is cheaper than to
@@ -67,13 +69,16 @@ def scalarised(fun: Callable[[PyTree], PyTree], y: PyTree, is_derived: bool = Tr
         is_batch=program.rows,
         plain=program.plain,
         order=1 if is_derived else 0,
+        is_pair=is_pair,
     )
     # One by one: what is not used is not computed.
     is_apart = lambda x: isinstance(x, StructOfArrays)  # noqa: E731
     return jtu.tree_map(lambda x: join(through(x)), out, is_leaf=is_apart)
 
 
-def _in_batches(fun: Callable[[PyTree], PyTree], y: PyTree, reading: Reading) -> PyTree | None:
+def _in_batches(
+    fun: Callable[[PyTree], PyTree], y: PyTree, reading: Reading, is_pair: bool
+) -> PyTree | None:
     """`fun(y)`, scalarised in batches only; None if what it returns depends on that."""
     alone, shape = jax.make_jaxpr(fun, return_shape=True)(y)
     derived, other = alone, shape
@@ -123,6 +128,7 @@ def _in_batches(fun: Callable[[PyTree], PyTree], y: PyTree, reading: Reading) ->
                 place="step",
                 plain=plain,
                 order=0,
+                is_pair=is_pair,
             )
             return list(map(jnp.asarray, jtu.tree_leaves(join(outs))))
 

@@ -24,7 +24,8 @@ def rewriting(on: bool | None) -> contextlib.AbstractContextManager:
     - None, the default: rewrites short steps, such as those of `CF4`, everywhere, and long ones,
       such as those of `CF54` and `RKMK8`, in batches and in `cfjax.integrate`. For one system in
       `diffrax.diffeqsolve` these would take longer to compile than 10 000 steps save.
-    - True: rewrites long steps everywhere, for a single solve of very many steps.
+    - True: rewrites long steps everywhere, and their first derivatives too. This is for solves of
+      very many steps, and for gradients of batches that are computed many times.
     - False: XLA gets every program as it was traced, for debugging and for programs that run a few
       times.
 

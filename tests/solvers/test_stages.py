@@ -1,5 +1,7 @@
 """Stages rolled into a loop: the numbers and derivatives of stages that are not."""
 
+import re
+
 import diffrax
 import equinox as eqx
 import jax
@@ -200,6 +202,35 @@ def test_a_small_step_is_rolled_if_asked_for(solver):
     assert "scan[" not in str(jax.make_jaxpr(lambda y0: end(solver.unrolled(), y0))(y0))
     # Entries of size 1, some ten flows with a few roundings each.
     assert_same(end(solver, y0), end(solver.unrolled(), y0), 100)
+
+
+@pytest.mark.parametrize("dtype", [jnp.float64, jnp.complex128])
+def test_large_fields_are_combined_by_a_product(dtype):
+    """Of 2500 numbers; smaller ones are added up."""
+    n = 50
+    a = jnp.asarray(np.random.default_rng(0).normal(size=(n, n)) / n, dtype)
+    a = a + 1j * a.T if dtype == jnp.complex128 else a
+
+    def field(t, y, args):
+        m = a @ y + jnp.cos(t).astype(dtype) * a
+        return cfjax.LeftMatrix(m - m.conj().T)
+
+    def end(solver):
+        times = jnp.asarray(0.1), jnp.asarray(0.4)
+        step = lambda y0: problems.first_step(solver, cfjax.LieTerm(field), *times, y0, None)[0]  # noqa: E731
+        y0 = jnp.eye(n, dtype=dtype)
+        assert ("dot_general" in _combinations(step, y0)) == (solver.unroll is False)
+        return step(y0)
+
+    # Entries of at most 1; products of 50 terms, a few for each flow.
+    assert_same(end(cfjax.CF4(unroll=False)), end(cfjax.CF4(unroll=True)), 1000)
+
+
+def _combinations(step, y0):
+    """The operations of a program that make a vector of 2500 numbers."""
+    text = str(jax.make_jaxpr(step)(y0))
+    lines = [line for line in text.splitlines() if re.search(r":(f64|c128)\[2500\] = ", line)]
+    return " ".join(lines)
 
 
 @pytest.mark.parametrize("make", [cfjax.CF4, cfjax.RKMK5, cfjax.RKMK4, cfjax.Magnus4])

@@ -122,6 +122,14 @@ def test_derivatives(transform, argument):
     check(quick(of_batch(rewritten))(few, SCALE), of_batch(as_it_is)(few, SCALE))
 
 
+def test_derivatives_are_scalarised_if_asked_for():
+    gradient = jax.vmap(jax.grad(size(rewritten)), (0, None))
+    assert not is_scalarised(gradient, BATCH, SCALE)
+    with cfjax.rewriting(True):
+        assert is_scalarised(gradient, BATCH, SCALE)
+        check(quick(jax.grad(size(rewritten)))(X, SCALE), jax.grad(size(as_it_is))(X, SCALE))
+
+
 def test_what_is_linear_is_transposed():
     def turn(x, scale):
         table = jnp.outer(jnp.concatenate([x, x, x[:1]]), jnp.arange(1.0, 8.0))
