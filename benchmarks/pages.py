@@ -534,6 +534,24 @@ def first_call() -> list[list[str]]:
     return table
 
 
+@table
+def second_process() -> list[list[str]]:
+    rows = load("second_process")["rows"]
+    methods = values(rows, "method")
+    table = [["", "diffrax, Tsit5", *(f"`{method}`" for method in methods[1:])]]
+    for program in values(rows, "program"):
+        base, *others = pick(rows, program=program)
+        cells = [f"1 ({cell(base['CPU seconds'])} s)"]
+        cells += [f"{cell(r['over Tsit5'])}; {two_digits(r['CPU seconds'][2])} s" for r in others]
+        table.append([_SECOND[program], *cells])
+    return table
+
+
+_SECOND = {
+    "integrate": "50 steps of `cfjax.integrate`",
+    "its gradient": "their gradient",
+    "diffeqsolve": "50 steps in `diffrax.diffeqsolve`",
+}
 _OVER = "over the fastest of others"
 
 
