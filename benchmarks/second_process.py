@@ -1,4 +1,4 @@
-"""Time of a second process, whose programs JAX has kept on disk: from its start to the first result.
+"""Time of a second process, whose programs JAX has kept on disk, from its start to the result.
 
 A process that is not measured fills JAX's compilation cache, in a folder for each program. What is
 left is to import, to trace, to lower and to read the program. `EQX_ON_ERROR=nan` is set, as JAX
