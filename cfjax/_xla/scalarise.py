@@ -38,9 +38,10 @@ def scalarised(
     The result agrees with that of `fun` to rounding. `fun` may close over traced values. Operations
     that have no rule get the array whole. Where `y` is another state, the program is too long or
     cannot be scalarised, and within another one that is scalarised, this is `fun(y)`. Unless
-    `is_derived`, and where the program is long, derivatives are JAX's own of the program as it is,
-    which compile faster. Outside of a loop of equal steps, what is long is scalarised in batches
-    only. With `is_pair` the function returns a pair, of which mostly the first part alone is used.
+    `is_derived`, derivatives are JAX's own of the program as it is, which compile faster. Outside
+    of a loop of equal steps, what is long is scalarised in batches only, and its derivatives are
+    not, unless rewriting is switched on. With `is_pair` the function returns a pair, of which
+    mostly the first part alone is used.
     """
     reading = None if where() else read(fun, y, "step")
     if reading is None:
