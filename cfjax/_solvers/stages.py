@@ -116,7 +116,7 @@ def rolled_flows(
                 combination = stacked.combination(weights(row))
             return flow(combination, point)
 
-        return scalarised(moved, point), None
+        return scalarised(moved, point, is_alone=True), None
 
     # A weak type would be lost on the way.
     start = jtu.tree_map(lambda x: jnp.asarray(x, jnp.result_type(x)), point)

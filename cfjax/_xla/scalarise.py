@@ -31,7 +31,11 @@ from .struct_of_arrays import StructOfArrays
 
 
 def scalarised(
-    fun: Callable[[PyTree], PyTree], y: PyTree, is_derived: bool = True, is_pair: bool = False
+    fun: Callable[[PyTree], PyTree],
+    y: PyTree,
+    is_derived: bool = True,
+    is_pair: bool = False,
+    is_alone: bool = False,
 ) -> PyTree:
     """`fun(y)`, computed on single numbers where `y` is a small state of short vectors.
 
@@ -40,13 +44,13 @@ def scalarised(
     cannot be scalarised, and within another one that is scalarised, this is `fun(y)`. Unless
     `is_derived`, derivatives are JAX's own of the program as it is, which compile faster. Outside
     of a loop of equal steps, what is long is scalarised in batches only, and its derivatives are
-    not, unless rewriting is switched on. With `is_pair` the function returns a pair, of which
+    not, unless rewriting is switched on. With `is_alone` so is what is short. With `is_pair` the function returns a pair, of which
     mostly the first part alone is used.
     """
     reading = None if where() else read(fun, y, "step")
     if reading is None:
         return fun(y)
-    is_long = reading.length > SHORT
+    is_long = reading.length > SHORT or is_alone
     is_usual = is_derived and not is_long
     if not (is_usual or reading.rows or in_equal_steps() or is_everywhere()):
         outs = _in_batches(fun, y, reading, is_pair)

@@ -130,6 +130,25 @@ def test_derivatives_are_scalarised_if_asked_for():
         check(quick(jax.grad(size(rewritten)))(X, SCALE), jax.grad(size(as_it_is))(X, SCALE))
 
 
+def test_output_within_a_step_is_scalarised_in_batches():
+    """Its flows are short, and a loop."""
+    sol = diffrax.diffeqsolve(
+        cfjax.LieTerm(lambda t, y, args: cfjax.Rotation(y * jnp.cos(t) / jnp.arange(1.0, 4.0))),
+        cfjax.CF54(),
+        0.0,
+        1.0,
+        0.25,
+        X,
+        saveat=diffrax.SaveAt(dense=True),
+    )
+    times = jnp.linspace(0.05, 0.95, 20)
+    one, batch = jax.make_jaxpr(sol.evaluate)(0.3), jax.make_jaxpr(jax.vmap(sol.evaluate))(times)
+    for program, is_batch in ((one, False), (batch, True)):
+        assert ("cfjax_operation" in str(program)) == is_batch
+        assert ("cfjax_alone" in str(program)) != is_batch
+    check(jax.vmap(sol.evaluate)(times), jnp.stack([sol.evaluate(t) for t in times]))
+
+
 def test_what_is_linear_is_transposed():
     def turn(x, scale):
         table = jnp.outer(jnp.concatenate([x, x, x[:1]]), jnp.arange(1.0, 8.0))
