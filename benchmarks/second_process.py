@@ -34,21 +34,22 @@ def solve(program: str, method: str, folder: str) -> None:
     jax.config.update("jax_persistent_cache_min_compile_time_secs", 0)
     jax.config.update("jax_persistent_cache_min_entry_size_bytes", -1)
     inertia, y0 = jnp.array([7 / 8, 5 / 8, 1 / 4]), jnp.array([8 / 9, 4 / 9, 1 / 9])
+    options: dict[str, Any] = dict(throw=False)
     if method == "Tsit5":
         term: Any = diffrax.ODETerm(lambda t, y, args: jnp.cross(-y / inertia, y))
-        solver = diffrax.Tsit5()
+        solver, make = diffrax.Tsit5(), diffrax.diffeqsolve
     else:
         import cfjax
 
         term = cfjax.LieTerm(lambda t, y, args: cfjax.Rotation(-y / inertia))
-        solver = getattr(cfjax, method)()
+        solver, make = getattr(cfjax, method)(), cfjax.integrate
+    if make is diffrax.diffeqsolve or program == "diffeqsolve":
+        make, options = diffrax.diffeqsolve, dict(options, dt0=1 / STEPS)
+    else:
+        options["num_steps"] = STEPS
 
     def end(y0: Any) -> Any:
-        if method == "Tsit5" or program == "diffeqsolve":
-            sol = diffrax.diffeqsolve(term, solver, 0.0, 1.0, 1 / STEPS, y0, throw=False)
-            assert sol.ys is not None
-            return sol.ys[-1]
-        return cfjax.integrate(term, solver, 0.0, 1.0, y0, num_steps=STEPS, throw=False).ys
+        return make(term, solver, t0=0.0, t1=1.0, y0=y0, **options).ys
 
     fun = jax.grad(lambda y0: jnp.sum(end(y0) ** 3)) if program == "its gradient" else end
     jax.block_until_ready(jax.jit(fun)(y0))

@@ -44,8 +44,8 @@ def scalarised(
     cannot be scalarised, and within another one that is scalarised, this is `fun(y)`. Unless
     `is_derived`, derivatives are JAX's own of the program as it is, which compile faster. Outside
     of a loop of equal steps, what is long is scalarised in batches only, and its derivatives are
-    not, unless rewriting is switched on. With `is_alone` so is what is short. With `is_pair` the function returns a pair, of which
-    mostly the first part alone is used.
+    not, unless rewriting is switched on. With `is_alone` so is what is short. With `is_pair` the
+    function returns a pair, of which mostly the first part alone is used.
     """
     reading = None if where() else read(fun, y, "step")
     if reading is None:
