@@ -788,7 +788,7 @@ DEFECTS = [
     ),
     Defect(
         "_xla/scalarise.py",
-        "outs = _in_batches(fun, y, reading)",
+        "outs = _in_batches(fun, y, reading, is_pair)",
         "outs = None",
         "a long step of one system that is scalarised",
         "xla/test_alone.py",
