@@ -70,12 +70,12 @@ def operation(
     leaves, structure = jtu.tree_flatten(args)
     leaves = list(map(jnp.asarray, leaves))
     out_structure: Any = None
-    first: list[Any] = []
+    num_first = 0
 
     def of_leaves(*leaves):
-        nonlocal out_structure, first
+        nonlocal out_structure, num_first
         out = fun(*jtu.tree_unflatten(structure, leaves))
-        first = jtu.tree_leaves(out[0] if is_pair else out)
+        num_first = len(jtu.tree_leaves(out[0] if is_pair else out))
         out, out_structure = jtu.tree_flatten(jtu.tree_map(jnp.asarray, out))
         return out
 
@@ -111,7 +111,7 @@ def operation(
         before = Plain(of_plain_leaves, structs(code.invars))
     if is_pair and not is_batch:
         # Along leading axes a copy of the program (`_in_two`) would take much memory.
-        kind = kind._replace(first=sum(is_smooth[: len(first)]))
+        kind = kind._replace(first=sum(is_smooth[:num_first]))
     new = operation_p.bind(*operands, program=program, kind=kind, plain=before)
     return jtu.tree_unflatten(out_structure, replaced(outs, smooth, new))
 
