@@ -104,6 +104,7 @@ def rolled_flows(
 
     A combination has the `weights` of its row, which are of the first fields.
     """
+    fields = fields[: rows.shape[-1]]
     # XLA computes what leads to each of the arrays that `jnp.stack` gets for itself.
     stacked = _Stacked(jtu.tree_map(lambda *leaves: pack(leaves), *fields))
 
