@@ -1,4 +1,6 @@
+import gc
 from collections import defaultdict
+from pathlib import Path
 
 import jax
 import jaxtyping
@@ -9,6 +11,22 @@ jax.config.update("jax_numpy_dtype_promotion", "strict")
 jax.config.update("jax_numpy_rank_promotion", "raise")
 # Programs are compiled to run once. This leaves out what LLVM does, and not what XLA does before.
 jax.config.update("jax_disable_most_optimizations", True)
+# Tests raise on purpose, and do not show what they raise.
+jax.config.update("jax_traceback_filtering", "off")
+# Tracing makes many objects that stay, and little that only the garbage collector can free.
+gc.set_threshold(50_000, 20, 100)
+
+# Calls are checked against the annotations of what they call, shapes of arrays among them. What
+# rewrites programs handles variables of programs, few arrays, and calls its functions so often that
+# checks took a fifth of the time of all tests: of its modules only those are checked that give shapes.
+PACKAGE = Path(__file__).parents[1] / "cfjax"
+CHECKED = [path for path in PACKAGE.iterdir() if path.stem not in ("_xla", "__init__")] + [
+    path for path in (PACKAGE / "_xla").glob("*.py") if '[Array, "' in path.read_text()
+]
+jaxtyping.install_import_hook(
+    [".".join(path.relative_to(PACKAGE.parent).with_suffix("").parts) for path in CHECKED],
+    "signatures.checked",
+)
 
 
 @pytest.fixture(autouse=True, scope="module")
