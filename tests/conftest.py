@@ -1,4 +1,5 @@
 import gc
+import os
 from collections import defaultdict
 from pathlib import Path
 
@@ -9,16 +10,21 @@ import pytest
 jax.config.update("jax_enable_x64", True)
 jax.config.update("jax_numpy_dtype_promotion", "strict")
 jax.config.update("jax_numpy_rank_promotion", "raise")
-# Programs are compiled to run once. This leaves out what LLVM does, and not what XLA does before.
+# Programs are compiled to run once. This leaves out what LLVM does, and not what XLA does before,
+# and lets XLA's older emitters write what LLVM compiles, which takes two thirds of the time.
+# `XLA_FLAGS= make test` compiles with those that users' programs are compiled with.
 jax.config.update("jax_disable_most_optimizations", True)
+os.environ.setdefault(
+    "XLA_FLAGS", "--xla_backend_extra_options=xla_cpu_disable_new_fusion_emitters"
+)
 # Tests raise on purpose, and do not show what they raise.
 jax.config.update("jax_traceback_filtering", "off")
 # Tracing makes many objects that stay, and little that only the garbage collector can free.
 gc.set_threshold(50_000, 20, 100)
 
 # Calls are checked against the annotations of what they call, shapes of arrays among them. What
-# rewrites programs handles variables of programs, few arrays, and calls its functions so often that
-# checks took a fifth of the time of all tests: of its modules only those are checked that give shapes.
+# rewrites programs handles variables of programs, few arrays, and calls its functions so often
+# that checks took a fifth of the time of tests: only its modules that give shapes are checked.
 PACKAGE = Path(__file__).parents[1] / "cfjax"
 CHECKED = [path for path in PACKAGE.iterdir() if path.stem not in ("_xla", "__init__")] + [
     path for path in (PACKAGE / "_xla").glob("*.py") if '[Array, "' in path.read_text()

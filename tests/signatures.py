@@ -6,7 +6,7 @@ _CHECKED = {}
 def checked(fn):
     """`beartype(fn)`, made once for all functions of one signature.
 
-    jaxtyping's import hook hands over a function of the signature alone, without what it closes over.
+    jaxtyping's import hook hands over a function of the signature alone, which closes over nothing.
     A function within a function is defined, and handed over, in every call of the outer one.
     """
     key = (fn.__module__, fn.__qualname__, fn.__code__, *fn.__annotations__.items())
