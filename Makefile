@@ -20,13 +20,13 @@ lint: .venv/dev
 test: lint
 	$(BIN)/python $(PYTEST)
 
-# The slow ones too.
+# The slow ones too, with the emitters of XLA that users' programs are compiled with.
 test-all: .venv/dev
-	$(BIN)/python $(PYTEST) -m "slow or not slow"
+	XLA_FLAGS= $(BIN)/python $(PYTEST) -m "slow or not slow"
 
-# Whether a version works at all.
+# Whether a version works at all, with these emitters too.
 test-quick: .venv/dev
-	$(BIN)/python $(PYTEST) -m "slow or not slow" $(QUICK)
+	XLA_FLAGS= $(BIN)/python $(PYTEST) -m "slow or not slow" $(QUICK)
 
 # The tests on exactly the lowest versions in pyproject.toml.
 test-lowest: .venv-lowest/dev
