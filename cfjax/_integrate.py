@@ -208,7 +208,7 @@ def equal_steps(
     is_static = isinstance(num_steps, int)
     length = num_steps if is_static else jnp.where(fault.number == 0, num_steps, 0)
     zero = (fault.error if throw else fault.nan)(jnp.zeros((), t0.dtype))
-    # Not the times: the loop is up to twice as fast if these are constants.
+    # Not the times: if these are constants, CF54 on a heavy top takes less than half the time.
     start = needing(zero, y0)
     carry = (n, start, solver_state, diffrax.RESULTS.successful)
     forward: Callable[[Any], Any] = step

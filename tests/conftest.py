@@ -11,8 +11,8 @@ jax.config.update("jax_enable_x64", True)
 jax.config.update("jax_numpy_dtype_promotion", "strict")
 jax.config.update("jax_numpy_rank_promotion", "raise")
 # Programs are compiled to run once. This leaves out what LLVM does, and not what XLA does before,
-# and lets XLA's older emitters write what LLVM compiles, which takes two thirds of the time.
-# `XLA_FLAGS= make test` compiles with those that users' programs are compiled with.
+# and has XLA's older emitters write what LLVM compiles: all tests take two thirds of the time.
+# `XLA_FLAGS= make test` compiles with the emitters that users' programs are compiled with.
 jax.config.update("jax_disable_most_optimizations", True)
 os.environ.setdefault(
     "XLA_FLAGS", "--xla_backend_extra_options=xla_cpu_disable_new_fusion_emitters"

@@ -1,3 +1,5 @@
+"""What checks calls against signatures, for jaxtyping's import hook."""
+
 from beartype import beartype
 
 _CHECKED = {}
