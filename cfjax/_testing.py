@@ -42,7 +42,8 @@ def check_field(fields: Sequence[AbstractFrozenField], point: PyTree) -> None:
     - `combine` is linear: the tangent of a sum is the sum of the tangents;
     - `increment`, if defined, is `flow(point) - point`; `to_chart` and `from_chart` lead back to
       the point and to the same flow; and if `defect` says how far a point is off the manifold, the
-      flow stays on the manifold;
+      flow stays on the manifold, also over a hundred flows one after the other, along the field and
+      along 2, 4, 8 and 16 times the field: rounding must not grow from flow to flow;
     - for algebra elements, `[a, b]` has the sign and the size that `cfjax.AbstractAlgebraElement`
       says: its tangent is `DX_a X_b - DX_b X_a`, with the tangents of a and b as functions of the
       point. This is compared for `[a, b]`, for `[b, a]` and for the bracket of `[a, b]` with the
@@ -77,6 +78,7 @@ def check_field(fields: Sequence[AbstractFrozenField], point: PyTree) -> None:
     unit = float(np.sqrt(max(jnp.finfo(leaf.dtype).eps for leaf in jtu.tree_leaves(point))))
 
     _compare(name, _of_start(fields[0], entered[0], start, point), unit)
+    _compare(name, _of_many_flows(fields[0], point), unit)
     for given, field in zip(fields, entered, strict=True):
         _compare(name, _of_flow(given, field, entered[0], start, point), unit)
     _compare(name, _of_sum(fields, entered, start), unit)
@@ -162,6 +164,33 @@ def _of_start(given: Any, field: Any, start: Any, point: PyTree) -> _Facts:
     if defect is not None:
         facts.append((f"flow must keep {defect[1]}", defect[0], jnp.zeros_like(defect[0]), 1))
     return facts
+
+
+@eqx.filter_jit
+def _of_many_flows(field: Any, point: PyTree) -> _Facts:
+    defect = field.defect(point)
+    if defect is None:
+        return []
+
+    def off(factor: Any) -> Any:
+        """The most that a point is off, of those that flows have not carried far away."""
+        along = type(field).combine((factor,), (field,))
+
+        def body(carry: Any, _: None) -> Any:
+            point, most = carry
+            way = along.increment(point)
+            new = along.flow(point) if way is None else jtu.tree_map(jnp.add, point, way)
+            is_near = _size(new) <= 1e3 * _size(start[0])
+            return (new, jnp.where(is_near, jnp.maximum(most, field.defect(new)[0]), most)), None
+
+        start = point, jnp.zeros_like(defect[0])
+        return lax.scan(body, start, length=100)[0][1]
+
+    name = "flow" if field.increment(point) is None else "increment"
+    factors = jnp.asarray([1.0, 2.0, 4.0, 8.0, 16.0], defect[0].dtype)
+    most = lax.map(off, factors)
+    promise = f"{name} must keep {defect[1]} over 100 flows, also of large fields"
+    return [(promise, most, jnp.zeros_like(most), 1)]
 
 
 @eqx.filter_jit

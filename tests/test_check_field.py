@@ -52,6 +52,10 @@ BUILT_IN: dict[str, tuple[Any, Any]] = {
     "Scaling": (lambda: cfjax.Scaling(random(C64, 3, 1)), random(C64, 3, 4)),
     "LowRankSkew": (lambda: cfjax.LowRankSkew(random(F64, 5, 2)), frame(F64, 5, 2)),
     "SphereRotation": (lambda: cfjax.SphereRotation(random(F64, 5)), frame(F64, 5, 1)[:, 0]),
+    "QuaternionRotation": (
+        lambda: cfjax.QuaternionRotation(random(F64, 3), frame="body", order="wxyz"),
+        jnp.asarray([0.5, -0.1, 0.7, 0.5]),
+    ),
     "BorderedSkew": (lambda: cfjax.BorderedSkew(random(F32, 5, 2)), frame(F32, 5, 2)),
 }
 
@@ -126,6 +130,13 @@ def ab(fields):
     return [f.a for f in fields], [f.b for f in fields]
 
 
+def along_the_old_one(self, point):
+    """A rotation by ten times the first entry of a, and what leads the length back."""
+    (x, y), angle, off = point, 10 * self.a[0], (point @ point / (POINT @ POINT) - 1) / 2
+    c, s = jnp.cos(angle) - 1, jnp.sin(angle)
+    return jnp.stack([c * x - s * y, c * y + s * x]) + off * c * point
+
+
 MISTAKES = {
     "opposite bracket": (dict(bracket=opposite_bracket), r"bracket must .*, here \[a, b\], but it"),
     "opposite sign": (dict(bracket=opposite_bracket), r"but it has the opposite sign\."),
@@ -172,6 +183,16 @@ MISTAKES = {
     "defect": (
         dict(defect=classmethod(lambda cls, p: (abs(p @ p - POINT @ POINT), "the start's length"))),
         "flow must keep the start's length",
+    ),
+    "increment that multiplies what the length is off": (
+        dict(
+            # As a spin of half a turn does where it is led back along the old point.
+            flow=lambda self, point: point + along_the_old_one(self, point),
+            increment=along_the_old_one,
+            tangent=lambda self, point: 10 * self.a[0] * jnp.stack([-point[1], point[0]]),
+            defect=lambda self, point: (jnp.abs(point @ point - POINT @ POINT), "the length"),
+        ),
+        r"increment must keep the length over 100 flows, also of large fields, but it is off by",
     ),
     "shape": (
         dict(flow=lambda self, point: point[:1]),

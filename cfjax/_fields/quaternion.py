@@ -6,12 +6,13 @@ from typing import Any
 import equinox as eqx
 import jax.numpy as jnp
 import jax.tree_util as jtu
-from jaxtyping import Array, Float
+from jaxtyping import Array, Bool, Float
 
 from .._arrays import describe
 from .._field import AbstractAlgebraElement
-from .._numerics.quaternion import Frame, Order, check_choice, increment, times, turn
+from .._numerics.quaternion import Frame, Order, check_choice, increment, times
 from .._numerics.rotate import cross_product, dexpinv
+from .._numerics.stumpff import is_below_full_turn
 from .elementwise import check_point, each
 
 
@@ -59,10 +60,10 @@ class QuaternionRotation(AbstractAlgebraElement):
             raise TypeError(f"omega must be float32 or float64, got {self.omega.dtype}.")
 
     def flow(self, point: Float[Array, "*batch 4"]) -> Float[Array, "*batch 4"]:
-        return self._each(turn, point)
+        return point + self._each(partial(increment, leads_back=False), point)
 
     def increment(self, point: Float[Array, "*batch 4"]) -> Float[Array, "*batch 4"]:
-        return self._each(increment, point)
+        return self._each(partial(increment, leads_back=True), point)
 
     def tangent(self, point: Float[Array, "*batch 4"]) -> Float[Array, "*batch 4"]:
         return self._each(times, point)
@@ -71,8 +72,11 @@ class QuaternionRotation(AbstractAlgebraElement):
         return self._with(cross_product, other)
 
     def dexpinv(self, other: Any, degree: int) -> "QuaternionRotation":
-        """Exact, whatever the degree. Poles where `omega` makes full turns."""
+        """Exact, whatever the degree, for angles below a full turn, 2 pi."""
         return self._with(dexpinv, other)
+
+    def has_dexpinv(self) -> Bool[Array, ""]:
+        return jnp.all(is_below_full_turn(jnp.sum(self.omega * self.omega, axis=-1)))
 
     def _with(self, fun: Any, other: Any) -> "QuaternionRotation":
         kinds = jtu.tree_structure(self), jtu.tree_structure(other)

@@ -22,16 +22,23 @@ def tangent(
     w: Float[Array, ""], v: Float[Array, "2"], x: Float[Array, "..."], frame: str
 ) -> Float[Array, "..."]:
     """The velocity of `x`: a point, shape `(2,)`, or a pose, shape `(3, 3)` or `(4,)`."""
-    return _moved(lambda w, u: u, w, v, x, frame)
+    return _moved(lambda w, u: u, _times_i, w, v, x, frame)
 
 
-@functools.partial(jax.jit, static_argnames="frame")
+@functools.partial(jax.jit, static_argnames=("frame", "leads_back"))
 def increment(
-    w: Float[Array, ""], v: Float[Array, "2"], x: Float[Array, "..."], frame: str
+    w: Float[Array, ""], v: Float[Array, "2"], x: Float[Array, "..."], frame: str, leads_back: bool
 ) -> Float[Array, "..."]:
-    """What `x` moves by in unit time, with a rounding as small as it is."""
+    """What `x` moves by in unit time, with a rounding as small as it is.
+
+    It may lead the length of a direction back to 1.
+    """
     exponential = stumpff_1_to_3_apart(w * w)
-    return _moved(lambda w, u: exponential.increment(u, _times_i(w, u)), w, v, x, frame)
+
+    def turned(w: Array, z: Vector) -> Vector:
+        return exponential.turned(w * w, z, _times_i(w, z), leads_back)
+
+    return _moved(lambda w, u: exponential.increment(u, _times_i(w, u)), turned, w, v, x, frame)
 
 
 @jax.jit
@@ -53,9 +60,17 @@ def dexpinv(
 
 
 def _moved(
-    way: Callable[[Array, Vector], Vector], w: Array, v: Array, x: Array, frame: str
+    way: Callable[[Array, Vector], Vector],
+    turned: Callable[[Array, Vector], Vector],
+    w: Array,
+    v: Array,
+    x: Array,
+    frame: str,
 ) -> Array:
-    """What `x` moves by, where `way` makes it of a velocity that turns with w."""
+    """What `x` moves by, where `way` makes it of a velocity that turns with w.
+
+    `turned` makes it of the direction of a pose in one vector.
+    """
     vs = entries(v)
     if x.ndim == 2 and frame == "body":
         # A row of the matrix turns with -w.
@@ -72,8 +87,7 @@ def _moved(
         u = plus(_times_i(w, place), vs)
     else:
         u = plus([z[0] * a for a in vs], _times_i(z[1], vs))
-    turned = way(w, _times_i(w, z)) if z else []
-    return pack([*turned, *way(w, u)], sums=True)
+    return pack([*(turned(w, z) if z else []), *way(w, u)], sums=True)
 
 
 def _times_i(w: Any, x: Vector) -> Vector:

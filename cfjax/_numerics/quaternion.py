@@ -4,7 +4,6 @@ from functools import partial
 from typing import Any, Literal
 
 import jax
-from jax import lax
 from jaxtyping import Array, Float
 
 from .stumpff import stumpff_1_to_3_apart
@@ -41,45 +40,19 @@ def times(
     return from_parts(product(half(omega), parts(q, order), frame), order)
 
 
-@partial(jax.jit, static_argnames=("frame", "order"))  # One trace for the many flows of a step.
-def turn(
-    omega: Float[Array, "3"], q: Float[Array, "4"], frame: Frame, order: Order
-) -> Float[Array, "4"]:
-    """The product of `exp(omega / 2)` with q, from the side that `times` says."""
-    p = parts(q, order)
-    return q + from_parts(_change(half(omega), p, frame), order)
-
-
-@partial(jax.jit, static_argnames=("frame", "order"))
+# One trace for the many flows of a step.
+@partial(jax.jit, static_argnames=("frame", "order", "leads_back"))
 def increment(
-    omega: Float[Array, "3"], q: Float[Array, "4"], frame: Frame, order: Order
+    omega: Float[Array, "3"], q: Float[Array, "4"], frame: Frame, order: Order, leads_back: bool
 ) -> Float[Array, "4"]:
-    """`turn(omega, q) - q`, with a rounding as small as it is, for a q of length 1 to rounding.
+    """The product of `exp(omega / 2)` with q, from the side that `times` says, less q.
 
-    Roundings that are the same in every step would make the length drift with the number of steps.
-    So it leads back: it takes the part `1 - cos(|omega| / 2)` off what the length is off 1.
+    Its rounding is as small as it is. It may lead the length of q back to 1.
     """
-    p = parts(q, order)
-    w, x, y, z = p
-    off = lax.stop_gradient((w * w + x * x) + (y * y + z * z) - 1)
-    return from_parts(_change(half(omega), p, frame, off / 2), order)
-
-
-def _change(
-    a: Vector, p: Vector, frame: Frame, correction: float | Float[Array, ""] = 0.0
-) -> Vector:
-    """`exp(a) - 1` times a quaternion, less `correction * (1 - cos|a|)` times it.
-
-    For the linear map u, multiplication by a, is `u^2 = -s` with `s = |a|^2`, and so
-    `exp(u) = 1 + c_1 u - s c_2` with Stumpff functions of s.
-    """
+    a, p = half(omega), parts(q, order)
     s = dot(a, a)
-    near, d1, d2, _ = stumpff_1_to_3_apart(s)
-    d2 = d2 + correction * (near / 2 + d2)
-    return [
-        near * (u - s / 2 * x) + (d1 * u - (s * d2) * x)
-        for u, x in zip(product(a, p, frame), p, strict=True)
-    ]
+    exponential = stumpff_1_to_3_apart(s)
+    return from_parts(exponential.turned(s, p, product(a, p, frame), leads_back), order)
 
 
 def half(omega: Any) -> Vector:

@@ -27,19 +27,26 @@ def tangent(
     return _moved(entries(w), entries(v), x, frame)
 
 
-@functools.partial(jax.jit, static_argnames="frame")
+@functools.partial(jax.jit, static_argnames=("frame", "leads_back"))
 def increment(
-    w: Float[Array, "3"], v: Float[Array, "3"], x: Float[Array, "..."], frame: str
+    w: Float[Array, "3"], v: Float[Array, "3"], x: Float[Array, "..."], frame: str, leads_back: bool
 ) -> Float[Array, "..."]:
-    """What `x` moves by in unit time, with a rounding as small as it is."""
+    """What `x` moves by in unit time, with a rounding as small as it is.
+
+    It may lead the length of a quaternion back to 1.
+    """
     ws = entries(w)
     if x.shape != (7,):
         exponential = stumpff_1_to_3_apart(dot(ws, ws))
-        return _moved(ws, entries(v), x, frame, exponential, exponential)
+        return _moved(ws, entries(v), x, frame, exponential)
     # A quaternion turns by half of the angle.
     s = dot(half(ws), half(ws))
     of_half = stumpff_1_to_3_apart(s)
-    return _moved(ws, entries(v), x, frame, _doubled(s, of_half), of_half)
+
+    def turned(q: Vector, once: Vector) -> Vector:
+        return of_half.turned(s, q, once, leads_back)
+
+    return _moved(ws, entries(v), x, frame, _doubled(s, of_half), turned)
 
 
 @jax.jit
@@ -70,26 +77,30 @@ def _moved(
     x: Array,
     frame: str,
     exponential: Exponential | None = None,
-    of_half: Exponential | None = None,
+    turned: Callable[[Vector, Vector], Vector] = lambda q, once: once,
 ) -> Array:
-    """What `x` moves by in unit time, or its velocity if there is no exponential."""
+    """What `x` moves by in unit time, or its velocity if there is no exponential.
+
+    `turned` is what a quaternion turns by, from itself and its velocity.
+    """
     if x.shape == (3,):
         return pack(_along_screw(exponential, w, v, entries(x), 1), sums=True)
     if x.ndim == 1:
         q, place = entries(x)[:4], entries(x)[4:]
-        turned = _turned(of_half, q, lambda q: product(half(w), q, frame))
         if frame == "fixed":
             moved = _along_screw(exponential, w, v, place, 1)
         else:
             moved = _rotated(q, _way(exponential, w, v))
-        return pack([*turned, *moved], sums=True)
+        return pack([*turned(q, product(half(w), q, frame)), *moved], sums=True)
     if frame == "fixed":
         *rows, last = entries(x)
         moved = _along_screw(exponential, w, v, rows, last)
         return pack([*moved, jnp.zeros_like(last)], sums=True)
     *columns, _ = entries(x.T)
-    turned = _turned(exponential, columns, lambda x: cross(x, w))
-    return pack([*turned, dot(columns, _way(exponential, w, v))], axis=1, sums=True)
+    once = cross(columns, w)
+    if exponential is not None:
+        once = exponential.increment(once, cross(once, w))
+    return pack([*once, dot(columns, _way(exponential, w, v))], axis=1, sums=True)
 
 
 def _doubled(s: Array, exponential: Exponential) -> Exponential:
@@ -103,13 +114,6 @@ def _doubled(s: Array, exponential: Exponential) -> Exponential:
     return Exponential(
         near, d1 - versine * c1, d1 * (near + d1 / 2), (c2 + (c3 - versine * c3)) / 4
     )
-
-
-def _turned(
-    exponential: Exponential | None, x: Vector, times: Callable[[Vector], Vector]
-) -> Vector:
-    once = times(x)
-    return exponential.increment(once, times(once)) if exponential is not None else once
 
 
 def _along_screw(

@@ -9,7 +9,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 from jax import lax
-from jaxtyping import Array, Float
+from jaxtyping import Array, Bool, Float
 
 from .polynomial import polynomial
 from .vectors import Vector, smooth
@@ -48,6 +48,10 @@ def stumpff(n: int, s: Float[Array | np.ndarray, "*batch"]) -> Float[Array, "*ba
     return _stumpff_to(max(n, 3), jnp.where(s >= 0, s, jnp.nan))[n]
 
 
+# The square of a full turn.
+_FULL_TURN = 4 * pi**2
+
+
 class Exponential(NamedTuple):
     """`exp(A) = I + c_1 A + c_2 A^2` for an A with `A^3 = -s A`, and `c_3`.
 
@@ -66,6 +70,32 @@ class Exponential(NamedTuple):
         """`exp(A) x - x` from `A x` and `A^2 x`."""
         near, d1, d2, _ = self
         return [near * (a + b / 2) + (d1 * a + d2 * b) for a, b in zip(once, twice, strict=True)]
+
+    def turned(self, s: Array, x: Vector, once: Vector, leads_back: bool) -> Vector:
+        """`exp(A) x - x` from `A x`, for a unit quaternion or complex number x: `A^2 = -s`.
+
+        To lead the length of x back to 1, this is `(1 - lead off / 2) exp(A) x - x`, where `off` is
+        what the squared length is off 1.
+        """
+        near, d1, d2, _ = self
+        d2 = s * d2
+        if leads_back:
+            off = lax.stop_gradient(sum(a * a for a in x[1:]) + (x[0] * x[0] - 1))
+            c0 = 1 - (near * s / 2 + d2)
+            part = self.lead(s) * (off / 2)
+            d1, d2 = (d + lax.stop_gradient(part * c) for d, c in ((d1, -(near + d1)), (d2, c0)))
+        return [near * (u - s / 2 * a) + (d1 * u - d2 * a) for a, u in zip(x, once, strict=True)]
+
+    def lead(self, s: Array) -> Array:
+        """Which part of what a length is off 1 a turn takes off.
+
+        It is `1 - ((1 + c_0) / 2)^2` up to half a turn, and 1 beyond. So the next length is off by
+        no more than this one, whatever the angle, and the correction is as small as the square of
+        a small angle, as the rounding of an increment is.
+        """
+        near, _, d2, _ = self
+        versine = near * s / 2 + s * d2
+        return lax.stop_gradient(near * (versine - versine * versine / 4) + (1 - near))
 
 
 @jax.custom_jvp
@@ -113,11 +143,18 @@ def cotangent_excess(s: Float[Array, "*batch"]) -> Float[Array, "*batch"]:
     """`(1 - x/2 cot(x/2)) / x^2` with `s = x^2`, which is 1/12 at zero, and smooth there.
 
     It is `sum_k 2 / (4 pi^2 k^2 - s)`: a pole at a full turn, and a polynomial to rounding. From
-    the full turn on, where the exponential is not invertible, it is 1/12.
+    the full turn on it is 1/12, which is no value: see `is_below_full_turn`.
     """
-    pole = 4 * pi**2
-    s = jnp.where(s < pole, s, 0)
-    return 2 * _reciprocal(pole - s) + polynomial(_constants(s).excess, s)
+    s = jnp.where(is_below_full_turn(s), s, 0)
+    return 2 * _reciprocal(_FULL_TURN - s) + polynomial(_constants(s).excess, s)
+
+
+def is_below_full_turn(s: Float[Array, "*batch"]) -> Bool[Array, "*batch"]:
+    """Whether an angle, whose square is s, is so small that the exponential can be inverted.
+
+    That is so up to the first pole, on the way from zero. False for NaN.
+    """
+    return s < _FULL_TURN
 
 
 @jax.custom_jvp

@@ -1,0 +1,163 @@
+"""Rounding over many steps of constant fields, at small and large angles: it does not grow."""
+
+from typing import Any, NamedTuple
+
+import diffrax
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+import cfjax
+
+NUM_STEPS = 2000
+# From a tenth of a radian a step to several turns, with half and full turns.
+ANGLES = np.sort(np.concatenate([np.geomspace(0.1, 20, 12), np.pi * np.arange(1, 7), [12.5]]))
+AXIS = np.array([2.0, -3.0, 6.0]) / 7
+V = np.array([0.3, -0.2, 0.5])
+Q = np.array([1.0, -3.0, 5.0, 1.0]) / 6
+PLACE = np.array([1.0, 2.0, 3.0])
+EDGE = np.array([0.0, 0.6, 0.8])
+TURN = np.array([[0.6, -0.8], [0.8, 0.6]])
+RNG = np.random.default_rng(0)
+COLUMNS = np.linalg.qr(RNG.normal(size=(5, 2)))[0]
+G = RNG.normal(size=(5, 2))
+G /= np.linalg.norm(G, 2)
+
+
+def pose(rotation: Any, place: Any) -> Any:
+    n = len(place)
+    matrix = np.eye(n + 1)
+    matrix[:n, :n], matrix[:n, n] = rotation, place
+    return matrix
+
+
+def motion(frame: Any) -> Any:
+    return lambda angle, y: cfjax.RigidMotion(omega=angle * AXIS, v=V, frame=frame)
+
+
+def planar(frame: Any) -> Any:
+    return lambda angle, y: cfjax.PlanarMotion(omega=angle, v=V[:2], frame=frame)
+
+
+def quaternion(frame: Any, order: Any) -> Any:
+    return lambda angle, y: cfjax.QuaternionRotation(angle * AXIS, frame=frame, order=order)
+
+
+def sphere(angle: Any, y: Any) -> Any:
+    # Along a great circle through the start.
+    g = jnp.asarray(COLUMNS[:, 1])
+    g = g - (g @ y) * y
+    return cfjax.SphereRotation(angle * g / jnp.sqrt(g @ g))
+
+
+def orthonormal(x: Any) -> Any:
+    return jnp.max(jnp.abs(x.T @ x - jnp.eye(x.shape[1])))
+
+
+def length(x: Any) -> Any:
+    return jnp.abs(x @ x - 1)
+
+
+class Case(NamedTuple):
+    field: Any
+    start: np.ndarray
+    off: Any
+    # By what the columns of a step's span, which are not orthonormal, multiply a rounding.
+    condition: float = 1
+    # Units of rounding that are added in each step, the same in every step, where nothing leads
+    # back: a vector may have any length, and a matrix would need products of matrices.
+    per_step: float = 0
+
+
+CASES = {
+    "quaternion, fixed": Case(quaternion("fixed", "wxyz"), Q, length),
+    "quaternion, body": Case(quaternion("body", "xyzw"), Q, length),
+    "pose, fixed": Case(motion("fixed"), np.r_[Q, PLACE], lambda x: length(x[:4])),
+    "pose, body": Case(motion("body"), np.r_[Q, PLACE], lambda x: length(x[:4])),
+    "planar pose, fixed": Case(
+        planar("fixed"), np.r_[0.6, 0.8, PLACE[:2]], lambda x: length(x[:2])
+    ),
+    "planar pose, body": Case(planar("body"), np.r_[0.6, 0.8, PLACE[:2]], lambda x: length(x[:2])),
+    "planar matrix, fixed": Case(
+        planar("fixed"), pose(TURN, PLACE[:2]), lambda x: orthonormal(x[:2, :2]), per_step=8
+    ),
+    "planar matrix, body": Case(
+        planar("body"), pose(TURN, PLACE[:2]), lambda x: orthonormal(x[:2, :2]), per_step=8
+    ),
+    "sphere": Case(sphere, COLUMNS[:, 0], length),
+    "Stiefel": Case(
+        lambda angle, y: cfjax.LowRankSkew(angle * G), COLUMNS, orthonormal, condition=10
+    ),
+    "bordered": Case(lambda angle, y: cfjax.BorderedSkew(angle * G), COLUMNS, orthonormal),
+    # The two coefficients of Rodrigues' formula are rounded to one unit each.
+    "vector": Case(lambda angle, y: cfjax.Rotation(angle * AXIS), EDGE, length, per_step=8),
+    "matrix": Case(
+        motion("body"), pose(np.eye(3), PLACE), lambda x: orthonormal(x[:3, :3]), per_step=8
+    ),
+}
+
+
+@pytest.mark.representatives(7)
+@pytest.mark.parametrize("name", CASES)
+def test_rounding_does_not_grow_whatever_the_angle(name):
+    case = CASES[name]
+    term = cfjax.LieTerm(lambda t, y, angle: case.field(angle, y))
+
+    @jax.jit
+    @jax.vmap
+    def off(angle):
+        sol = cfjax.integrate(
+            term,
+            cfjax.LieEuler(),
+            0.0,
+            float(NUM_STEPS),
+            jnp.asarray(case.start),
+            angle,
+            num_steps=NUM_STEPS,
+            save_every=NUM_STEPS // 20,
+            throw=False,
+        )
+        return jax.vmap(case.off)(sol.ys)
+
+    found = off(jnp.asarray(ANGLES))
+    # Some roundings of a flow of norm 20.
+    steps = np.arange(1, 21) * (NUM_STEPS // 20)
+    bound = case.condition * 1e-13 + case.per_step * np.finfo(np.float64).eps * steps
+    np.testing.assert_array_less(found, np.broadcast_to(bound, found.shape))
+
+
+@pytest.mark.parametrize("angle", [4.0, 7.0])
+def test_lengths_in_other_methods(angle):
+    """Of a fast spin, for which one flow turns a quaternion by more than half a turn."""
+    field = lambda t, q, args: quaternion("body", "wxyz")(angle, q)  # noqa: E731
+    y0 = jnp.asarray(Q)
+    for solver in (cfjax.CF4(), cfjax.Magnus2(), cfjax.ImplicitMidpoint()):
+        sol = cfjax.integrate(cfjax.LieTerm(field), solver, 0.0, 500.0, y0, num_steps=500)
+        # Some roundings.
+        assert abs(sol.ys[-1] @ sol.ys[-1] - 1) < 1e-14
+
+
+def test_a_fast_spin_at_a_loose_tolerance():
+    """6 radians a second with a wobble of 2 %: the controller does not look at the length."""
+
+    def field(t, q, args):
+        wobble = 0.12 * jnp.stack([jnp.cos(t), jnp.sin(t), jnp.zeros_like(t)])
+        return quaternion("body", "wxyz")(1.0, q).combine(
+            (6.0, 1.0),
+            (
+                cfjax.QuaternionRotation(AXIS, frame="body", order="wxyz"),
+                cfjax.QuaternionRotation(wobble, frame="body", order="wxyz"),
+            ),
+        )
+
+    sol = diffrax.diffeqsolve(
+        cfjax.LieTerm(field),
+        cfjax.RKMK8(),
+        t0=0.0,
+        t1=100.0,
+        dt0=0.1,
+        y0=jnp.asarray(Q),
+        stepsize_controller=diffrax.PIDController(rtol=1e-2, atol=1e-2),
+    )
+    assert abs(sol.ys[-1] @ sol.ys[-1] - 1) < 1e-14
