@@ -12,7 +12,7 @@ from typing import Any, ClassVar
 import equinox as eqx
 import jax.numpy as jnp
 import jax.tree_util as jtu
-from jaxtyping import Array, PyTree, Real
+from jaxtyping import Array, Bool, PyTree, Real
 
 from ._arrays import Weight, check_coordinates, describe, linear_combination, struct
 
@@ -180,7 +180,8 @@ class AbstractAlgebraElement(AbstractFrozenField):
         equal to `degree`, which takes as many brackets. A class whose algebra has a closed form
         overrides it, and the result is exact whatever the degree. The map has poles where an
         eigenvalue of `ad_u` is a multiple of 2 pi i, for rotations at full turns. The series
-        converges up to the first pole.
+        converges up to the first pole. From there on the result must be finite, and means nothing:
+        `has_dexpinv` says so.
         """
         weights, terms, term = [1.0], [other], other
         # The series has no odd terms but the first.
@@ -190,6 +191,14 @@ class AbstractAlgebraElement(AbstractFrozenField):
                 weights.append(float(_bernoulli(k) / factorial(k)))
                 terms.append(term)
         return type(terms[-1]).combine(weights, terms)
+
+    def has_dexpinv(self) -> Bool[Array, ""] | None:
+        """Whether `dexpinv` at this element, for all its leading axes, has a value.
+
+        A Munthe-Kaas step that needs a value where there is none fails. None, the default, if
+        nothing is known, as of a series.
+        """
+        return None
 
 
 class Rest(AbstractAlgebraElement):
@@ -342,6 +351,13 @@ def dexpinv(a: PyTree, b: PyTree, degree: int) -> PyTree:
     return jtu.tree_map(
         lambda x, y: x.dexpinv(y, degree) if is_field(x) else y, a, b, is_leaf=is_field
     )
+
+
+def has_dexpinv(a: PyTree) -> Bool[Array, ""] | None:
+    """Whether `dexpinv` at a has a value in all parts; None if nothing is known of any part."""
+    parts = [x.has_dexpinv() for x in jtu.tree_leaves(a, is_leaf=is_field) if is_field(x)]
+    known = [x for x in parts if x is not None]
+    return functools.reduce(jnp.logical_and, known) if known else None
 
 
 @functools.cache

@@ -22,13 +22,18 @@ from ._arguments import (
     time_scalar,
 )
 from ._control_term import is_driven
-from ._numerics.checks import Fault, checked, error_if, needing
+from ._numerics.checks import Fault, error_if, needing
 from ._numerics.squaring import max_over_batch
 from ._solvers.base import is_finite, result_of
 from ._step_back import repeat_and_undo
 from ._xla import invariants_first, limits, repeat, within_equal_steps
 
 _NOT_FINITE = "y0 must be finite, got an entry that is not."
+_BLOW_UP = (
+    f"{diffrax.RESULTS[diffrax.RESULTS.nonfinite].rstrip('.')}: the solution grows without bound, "
+    "or the steps are too long, which more num_steps cure. (A step of a Munthe-Kaas method, such "
+    "as cfjax.RKMK8, must turn by less than 2 pi.)"
+)
 
 
 def integrate(
@@ -259,7 +264,7 @@ def equal_steps(
     # blow-up shows in what is saved after it.
     result = result_of(ys)
     if is_ours:
-        ys = checked(ys, lambda ys: _error_of(result_of(ys))) if throw else ys
+        ys = error_if(ys, lambda ys: ~is_finite(ys), _BLOW_UP) if throw else ys
     else:
         is_known = carry[3] != diffrax.RESULTS.successful
         result = diffrax.RESULTS.where(is_known, carry[3], result)
@@ -289,6 +294,8 @@ def _raised(solution: diffrax.Solution, fault: Fault) -> diffrax.Solution:
     if jtu.tree_leaves(solution.ys):
         if number := int(fault.number):
             raise eqx.EquinoxRuntimeError(fault.messages[number - 1])
+        if solution.result == diffrax.RESULTS.nonfinite:
+            raise eqx.EquinoxRuntimeError(_BLOW_UP)
         if solution.result != diffrax.RESULTS.successful:
             raise eqx.EquinoxRuntimeError(diffrax.RESULTS[solution.result])
     return solution

@@ -7,7 +7,7 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 import jax.tree_util as jtu
-from jaxtyping import Array, PyTree, Real
+from jaxtyping import Array, Bool, PyTree, Real
 
 from .._arrays import Weight
 from .._field import AbstractAlgebraElement, AbstractFrozenField, combine
@@ -213,3 +213,7 @@ class ElementwiseElement(Elementwise, AbstractAlgebraElement):
     def dexpinv(self, other: Any, degree: int) -> Any:
         images = self._each(lambda a, b: a.dexpinv(b, degree))(self.field, other.field)
         return elementwise(images, self.num_axes)
+
+    def has_dexpinv(self) -> Bool[Array, ""] | None:
+        found = self._each(lambda a: a.has_dexpinv())(self.field)
+        return None if found is None else jnp.all(found)

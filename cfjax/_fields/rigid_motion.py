@@ -6,11 +6,12 @@ from typing import Any, ClassVar, Literal
 
 import equinox as eqx
 import jax.numpy as jnp
-from jaxtyping import Array, Float, Real
+from jaxtyping import Array, Bool, Float, Real
 
 from .._field import AbstractAlgebraElement
 from .._numerics import planar_motion, rigid_motion
 from .._numerics.matmul import matmul
+from .._numerics.stumpff import is_below_full_turn
 from .elementwise import check_other, check_point, each
 
 Frame = Literal["body", "fixed"]
@@ -51,10 +52,10 @@ class AbstractMotion(AbstractAlgebraElement):
             raise ValueError(f'frame must be "body" or "fixed", got {self.frame!r}.')
 
     def flow(self, point: Float[Array, "..."]) -> Float[Array, "..."]:
-        return point + self.increment(point)
+        return point + self._each(partial(self.numerics.increment, leads_back=False), point)
 
     def increment(self, point: Float[Array, "..."]) -> Float[Array, "..."]:
-        return self._each(self.numerics.increment, point)
+        return self._each(partial(self.numerics.increment, leads_back=True), point)
 
     def tangent(self, point: Float[Array, "..."]) -> Float[Array, "..."]:
         return self._each(self.numerics.tangent, point)
@@ -63,8 +64,14 @@ class AbstractMotion(AbstractAlgebraElement):
         return self._with(self.numerics.bracket, other)
 
     def dexpinv(self, other: Any, degree: int) -> "AbstractMotion":
-        """Exact, whatever the degree. Poles where `omega` makes full turns."""
+        """Exact, whatever the degree, for angles below a full turn, whatever `v` is."""
         return self._with(self.numerics.dexpinv, other)
+
+    def has_dexpinv(self) -> Bool[Array, ""]:
+        squares = self.omega * self.omega
+        # In the plane omega is one number.
+        s = squares if squares.ndim < self.v.ndim else jnp.sum(squares, axis=-1)
+        return jnp.all(is_below_full_turn(s))
 
     def _with(self, fun: Any, other: Any) -> "AbstractMotion":
         check_other(self, other)

@@ -4,10 +4,11 @@ from typing import Any
 
 import equinox as eqx
 import jax.numpy as jnp
-from jaxtyping import Array, Float
+from jaxtyping import Array, Bool, Float
 
 from .._field import AbstractAlgebraElement
 from .._numerics.rotate import cross_product, dexpinv, increment, mean, rotate
+from .._numerics.stumpff import is_below_full_turn
 from .elementwise import check_other, check_point, each
 
 
@@ -60,8 +61,11 @@ class Rotation(AbstractAlgebraElement):
         return self._with(cross_product, other)
 
     def dexpinv(self, other: Any, degree: int) -> "Rotation":
-        """Exact, whatever the degree. Poles where `omega` makes full turns."""
+        """Exact, whatever the degree, for angles below a full turn."""
         return self._with(dexpinv, other)
+
+    def has_dexpinv(self) -> Bool[Array, ""]:
+        return jnp.all(is_below_full_turn(jnp.sum(self.omega * self.omega, axis=-1)))
 
     def _with(self, fun: Any, other: Any) -> "Rotation":
         check_other(self, other)

@@ -4,12 +4,14 @@ import abc
 import functools
 from collections.abc import Callable, Sequence
 from fractions import Fraction
-from typing import Any, ClassVar, Literal
+from typing import Any, ClassVar, Literal, NamedTuple
 
 import diffrax
 import equinox as eqx
+import jax
+import jax.numpy as jnp
 import jax.tree_util as jtu
-from jaxtyping import PyTree
+from jaxtyping import Array, Bool, PyTree
 
 from .._control_term import is_driven
 from .._field import (
@@ -17,6 +19,7 @@ from .._field import (
     bracket,
     combine,
     dexpinv,
+    has_dexpinv,
     is_field,
     tangent,
     without_bracket,
@@ -66,38 +69,62 @@ class AbstractMuntheKaas(AbstractChartSolver, diffrax.AbstractStratonovichSolver
         check_choice("unroll", self.unroll, True, False, None)
 
     @abc.abstractmethod
-    def elements(self, chart: Chart) -> list[PyTree]:
+    def elements(self, chart: Chart) -> "_Elements":
         """What v is the combination of that has the weights `b`."""
 
-    def estimating(
-        self, elements: list[PyTree], v: PyTree, end: PyTree, chart: Chart
-    ) -> list[PyTree]:
+    def estimating(self, found: "_Elements", v: PyTree, end: PyTree, chart: Chart) -> "_Elements":
         """These and what else the estimate takes; v leads to the end."""
-        return elements
+        return found
 
     def logarithm(self, field: Callable[[Any, PyTree], PyTree], y0: PyTree) -> PyTree:
         """The element v, where `field(c, y)` is `h f(t + c h, y)`."""
-        return _combine_nonzero(self.b, self.elements(Chart(field, y0)))
+        return _combine_nonzero(self.b, self.elements(Chart(field, y0)).elements)
 
     def step_in(self, chart):
-        elements = self.elements(chart)
+        found = self.elements(chart)
+        elements = found.elements
         v = _combine_nonzero(self.b, elements)
         end = chart.flow(v, chart.start)
+        y1 = found.or_else(chart.from_start(end), jnp.nan)
         error = None
         # All that follows is for error control and output within the step. The compiler leaves it
         # out where the caller asks for neither.
         if self.estimate is not None and self.b_error is not None:
-            elements = self.estimating(elements, v, end, chart)
+            found = self.estimating(found, v, end, chart)
+            elements = found.elements
             off = _combine_nonzero(self.b_error, elements)
             if self.estimate == "algebra":
                 error = tangent(off, chart.state(end))
             else:
                 embedded = chart.flow(combine((1.0, -1.0), (v, off)), chart.start)
                 error = chart.difference(end, embedded)
+            # So that the step is taken again, shorter.
+            error = found.or_else(error, jnp.inf)
         # All of them are results then, and XLA would compute the step anew for each.
         elements = chart.shared(elements)
         path = Path.of(self.continuous_extension, chart.without_sums(chart.start), elements)
-        return Step(chart.from_start(end), path, error)
+        return Step(y1, path, error)
+
+
+class _Elements(NamedTuple):
+    """Elements of the algebra, and whether each `dexpinv` among them had a value; None is yes.
+
+    Where there was none the elements mean nothing, but they are finite: of a step that is not kept
+    the derivative must be zero, and that of NaN is NaN.
+    """
+
+    elements: list[PyTree]
+    has_value: Bool[Array, ""] | None = None
+
+    def and_known(self, *has_value: Bool[Array, ""] | None) -> "_Elements":
+        known = [x for x in (self.has_value, *has_value) if x is not None]
+        return self._replace(has_value=functools.reduce(jnp.logical_and, known) if known else None)
+
+    def or_else(self, tree: PyTree, value: float) -> PyTree:
+        """The same arrays, or this value where something had none."""
+        if self.has_value is None:
+            return tree
+        return jtu.tree_map(lambda x: jnp.where(self.has_value, x, value), tree)
 
 
 def _frozen(chart: Chart, c: float, u: PyTree) -> PyTree:
@@ -140,7 +167,7 @@ class RKMK3(AbstractMuntheKaas, diffrax.AbstractAdaptiveSolver):
         k1 = _frozen(chart, 0.0, None)
         k2 = _frozen(chart, 0.5, combine((1 / 2,), (k1,)))
         k3 = _frozen(chart, 1.0, combine((-1.0, 2.0), (k1, k2)))
-        return [k1, k2, k3, bracket(k1, k2)]
+        return _Elements([k1, k2, k3, bracket(k1, k2)])
 
 
 class RKMK4(AbstractMuntheKaas):
@@ -171,7 +198,7 @@ class RKMK4(AbstractMuntheKaas):
         k2 = _frozen(chart, 0.5, combine((1 / 2,), (k1,)))
         k3 = _frozen(chart, 0.5, combine((1 / 2, -1 / 8), (k2, bracket(k1, k2))))
         k4 = _frozen(chart, 1.0, k3)
-        return [k1, k2, k3, k4, bracket(k1, k4)]
+        return _Elements([k1, k2, k3, k4, bracket(k1, k4)])
 
 
 class RKMK(AbstractMuntheKaas, diffrax.AbstractAdaptiveSolver):
@@ -180,7 +207,10 @@ class RKMK(AbstractMuntheKaas, diffrax.AbstractAdaptiveSolver):
     Each stage but the first takes the inverse derivative of the exponential, `dexpinv` of the
     field: a closed form for `Rotation`, `QuaternionRotation`, `RigidMotion` and `PlanarMotion`,
     otherwise a series. The series of a method of order q has up to q - 2 commutators, or q - 3 if q
-    is odd and above 3. A step must not make a full turn, where the exponential cannot be inverted.
+    is odd and above 3. From a full turn on the exponential cannot be inverted. For the four fields
+    with a closed form, a step where one of them, times the step size, is an angular velocity of
+    2 pi or more at some stage is an error, or taken again, shorter, with adaptive steps. A series
+    converges below this bound only, and the step is as wrong as any that is too long.
 
     The estimate comes at no extra cost, unless the tableau is first same as last: then it needs the
     field at the end of the step, which is the first field of the next step. Dense output has order
@@ -259,15 +289,16 @@ class RKMK(AbstractMuntheKaas, diffrax.AbstractAdaptiveSolver):
         n = len(self.b)
         return self._stages([_frozen(chart, 0.0, None)], self.a[1:n], self.c[1:n], chart)
 
-    def estimating(self, elements, v, end, chart):
-        n, elements = len(self.b), list(elements)
+    def estimating(self, found, v, end, chart):
+        n, elements = len(self.b), list(found.elements)
         for c, row in zip(self.c[n:], self.a[n:], strict=True):
             u, here = v, end
             if row != self.b:
                 u = _combine_nonzero(row, elements)
                 here = chart.flow(u, chart.start)
             elements.append(dexpinv(u, chart.frozen_after(elements, c, here), self._degree))
-        return elements
+            found = found.and_known(has_dexpinv(u))
+        return found._replace(elements=elements)
 
     def extended(self, path: Any, field: Callable[[Any, PyTree], PyTree]):
         n = len(self.b)
@@ -278,7 +309,8 @@ class RKMK(AbstractMuntheKaas, diffrax.AbstractAdaptiveSolver):
 
         def later(start: PyTree) -> list[PyTree]:
             chart = Chart.at_path(field, start, elements)
-            return self._stages(elements[:n], rows, times, chart)[n:]
+            found = self._stages(elements[:n], rows, times, chart)
+            return found.or_else(found.elements[n:], jnp.nan)
 
         elements = [*elements[:n], *scalarised(later, start, is_derived=False)]
         return Path.of(path.continuous_extension, start, elements)
@@ -293,20 +325,21 @@ class RKMK(AbstractMuntheKaas, diffrax.AbstractAdaptiveSolver):
 
     def _stages(
         self, known: list[PyTree], rows: Sequence[Row], times: Sequence[float], chart: Chart
-    ) -> list[PyTree]:
+    ) -> _Elements:
         """These, and a stage for each row and time."""
 
         inverse = functools.partial(dexpinv, degree=self._degree)
         made = rolled_elements(self.unroll, chart, known, rows, times, inverse)
         if made is not None:
-            return made
-        stages = list(known)
+            return _Elements(made, _have_dexpinv(rows, made))
+        stages, have_dexpinv = list(known), []
         for c, row in zip(times, rows, strict=True):
             # Rows may be shorter than what is known.
             u = _combine_nonzero(row, stages) if any(row) else None
             field = _frozen(chart, c, u)
             stages.append(field if u is None else inverse(u, field))
-        return stages
+            have_dexpinv.append(None if u is None else has_dexpinv(u))
+        return _Elements(stages).and_known(*have_dexpinv)
 
 
 class RKMK5(RKMK):
@@ -348,6 +381,14 @@ class RKMK8(RKMK):
         unroll: bool | None = None,
     ):
         super().__init__(diffrax.Dopri8.tableau, estimate=estimate, unroll=unroll)
+
+
+def _have_dexpinv(rows: Sequence[Row], elements: list[PyTree]) -> Bool[Array, ""] | None:
+    """Whether combinations of elements, one for each row, all have a `dexpinv` with a value."""
+    if has_dexpinv(elements[0]) is None:
+        return None
+    weights = jnp.asarray([_padded(row, len(elements)) for row in rows])
+    return jnp.all(jax.vmap(lambda row: has_dexpinv(combine(list(row), elements)))(weights))
 
 
 @functools.lru_cache
