@@ -122,9 +122,10 @@ class _Elements(NamedTuple):
 
     def or_else(self, tree: PyTree, value: float) -> PyTree:
         """The same arrays, or this value where something had none."""
-        if self.has_value is None:
+        has_value = self.has_value
+        if has_value is None:
             return tree
-        return jtu.tree_map(lambda x: jnp.where(self.has_value, x, value), tree)
+        return jtu.tree_map(lambda x: jnp.where(has_value, x, value), tree)
 
 
 def _frozen(chart: Chart, c: float, u: PyTree) -> PyTree:
@@ -387,8 +388,9 @@ def _have_dexpinv(rows: Sequence[Row], elements: list[PyTree]) -> Bool[Array, ""
     """Whether combinations of elements, one for each row, all have a `dexpinv` with a value."""
     if has_dexpinv(elements[0]) is None:
         return None
-    weights = jnp.asarray([_padded(row, len(elements)) for row in rows])
-    return jnp.all(jax.vmap(lambda row: has_dexpinv(combine(list(row), elements)))(weights))
+    weights = jnp.asarray([[*map(float, row), *[0.0] * (len(elements) - len(row))] for row in rows])
+    each: Any = jax.vmap(lambda row: has_dexpinv(combine(list(row), elements)))
+    return jnp.all(each(weights))
 
 
 @functools.lru_cache
