@@ -10,9 +10,12 @@ import sys
 from pathlib import Path
 
 import diffrax
+import jax
+import numpy as np
 import optimistix
 import pytest
 from messages import FOLDERS, messages, template
+from scipy.integrate import solve_ivp
 from test_public import PUBLIC
 
 import cfjax
@@ -71,6 +74,62 @@ def test_code_runs_when_pasted(pages):
     )
     assert done.returncode == 0, done.stderr
     assert "nan" not in done.stdout
+
+
+def section(page, heading):
+    """The text below a heading, up to the next one of that level."""
+    text = (ROOT / "docs" / page).read_text()
+    return text.split(f"\n## {heading}\n")[1].split("\n## ")[0]
+
+
+def blocks(text):
+    return "\n".join(re.findall(r"^```python\n(.*?)^```", text, re.DOTALL | re.MULTILINE))
+
+
+def substitute(code, **values):
+    """The code with other values of variables."""
+    for name, value in values.items():
+        code, count = re.subn(rf"^{name} = .*$", f"{name} = {value}", code, flags=re.MULTILINE)
+        assert count == 1, name
+    return code
+
+
+def test_lindblad_recipes_take_complex_jumps():
+    # As NumPy and users' programs promote.
+    with jax.numpy_dtype_promotion("standard"), jax.numpy_rank_promotion("allow"):
+        code = substitute(
+            blocks(section("state/quantum.md", "A Lindblad equation")),
+            c="np.sqrt(0.1) * lower + 0.2j * lower @ lower + 0.1j * np.diag([0.3, -0.2, 1j])",
+            **{"h0, h1": "10 * np.diag(np.arange(n)), 1j * lower - 1j * lower.T"},
+        )
+        scope = {}
+        exec(code, scope)
+    h0, h1, c = scope["h0"], scope["h1"], scope["c"]
+    assert np.abs(c.T - c.conj().T).max() > 0.1 and np.abs(h1 - h1.T).max() > 0.1
+
+    def rate(t, flat):
+        rho = flat.reshape(3, 3)
+        h = h0 + np.cos(10 * t) / 2 * h1
+        adjoint = np.conj(np.transpose(c))
+        change = -1j * (h @ rho - rho @ h) + c @ rho @ adjoint
+        return (change - (adjoint @ c @ rho + rho @ adjoint @ c) / 2).ravel()
+
+    start = np.zeros(9, complex)
+    start[0] = 1
+    end = solve_ivp(rate, (0.0, 10.0), start, "DOP853", rtol=1e-10, atol=1e-10).y[:, -1]
+    # The page has steps for errors of 1e-6; with the transpose they are of order one.
+    for found in (scope["rho"], scope["sol"].ys[-1]):
+        np.testing.assert_allclose(found, end.reshape(3, 3), atol=1e-5)
+
+
+def test_quasienergies_are_those_of_a_constant_hamiltonian():
+    with jax.numpy_dtype_promotion("standard"), jax.numpy_rank_promotion("allow"):
+        code = blocks(section("state/quantum.md", "Many periods, and pulses"))
+        # Levels at 1/4 and 1/2, without a drive.
+        code = substitute(code, **{"X, Z": "jnp.zeros((2, 2)), jnp.diag(jnp.array([0.5, 1.0]))"})
+        scope = {}
+        exec(code.partition("def shaped")[0], scope)
+    np.testing.assert_allclose(np.sort(scope["quasienergies"]), [0.25, 0.5], rtol=1e-12)
 
 
 def test_every_block_of_code_is_seen():

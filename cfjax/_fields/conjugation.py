@@ -71,9 +71,10 @@ class Conjugation(AbstractTwoSided):
     """The linear field `x' = a x - x a`, whose flow is `x -> exp(a) x exp(-a)`.
 
     It acts on a square matrix, shape `(n, n)`, and keeps its eigenvalues. Examples are isospectral
-    flows such as Toda's, the Heisenberg picture, and density matrices with `a = -1j * H`. (If `a`
-    is skew-Hermitian, as for density matrices, `cfjax.Congruence(a)` is the same field: it is a
-    fifth cheaper, and keeps Hermitian matrices Hermitian to the last bit.)
+    flows such as Toda's, density matrices with `a = -1j * H`, and operators in the Heisenberg
+    picture with `a = 1j * H`. (If `a` is skew-Hermitian, as for density matrices,
+    `cfjax.Congruence(a)` is the same field: it is a fifth cheaper, and keeps Hermitian matrices
+    Hermitian to the last bit.)
 
     With leading axes, shape `(*batch, n, n)`, each element moves on its own. An axis of 1 is
     broadcast.
