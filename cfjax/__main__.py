@@ -85,8 +85,8 @@ def main(argv: Sequence[str] | None = None) -> int:
         "scene",
         help="run a scene",
         description=(
-            "Solves a scene with 1000 steps of CF4, prints what it keeps and how long it takes, "
-            "and draws its picture as PNG and PDF. In float64. " + _SCENE_TIME
+            "Solves a scene with 1000 steps of the method for it, prints what the solution keeps "
+            "and how long it takes, and draws a picture as PNG and PDF. In float64. " + _SCENE_TIME
         ),
     )
     scene.add_argument("scene", metavar="SCENE", choices=_SCENES, help=", ".join(_SCENES))

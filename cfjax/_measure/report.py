@@ -24,7 +24,6 @@ from rich.table import Table
 from .._batch.progress import on_terminal, progress_bar
 from .._integrate import integrate
 from .._signals import busy
-from .._solvers.commutator_free import CF4
 from .style import new_figure
 from .work_precision import WorkPrecision, compiled, take_turns
 
@@ -85,13 +84,13 @@ def chart(
     The first line of the docstring of `measure` is in the chart's caption.
     """
     work = measure(budget=budget, progress=progress)
-    subject = (inspect.getdoc(measure) or name).splitlines()[0]
-    figure = new_figure(
-        (7.0, 4.8),
-        f"{subject} Time: the fastest of {work.seconds.shape[1]} runs in turns on one "
-        f"{jax.default_backend().upper()}; bars reach to the upper quartile. Flops: operations of "
-        "one step as traced, times the steps.",
+    caption = (
+        f"{_first_line(measure, name)} Time: the fastest of {work.seconds.shape[1]} runs in turns "
+        f"on one {jax.default_backend().upper()}; bars reach to the upper quartile."
     )
+    if np.any(np.isfinite(work.flops)):
+        caption += " Flops: operations of one step as traced, times the steps."
+    figure = new_figure((7.0, 4.8), caption)
     figures = {name: work.plot(figure)}
     if picture is not None:
         figures[f"{name}_picture"] = picture()
@@ -107,10 +106,11 @@ def scene(
     num_saves: int = 100,
     budget: float = 2.0,
 ) -> Report:
-    """One solve of a scene by CF4: its invariants, what it takes, and its picture.
+    """One solve of a scene by its solver: its invariants, what it takes, and its picture.
 
-    The scene has functions `problem`, `invariants` and `picture`. Invariants are looked at in
-    `num_saves` states, and times measured for `budget` seconds.
+    The scene has a `solver`, and functions `problem`, `invariants` and `picture`. Invariants are
+    looked at in `num_saves` states, and times measured for `budget` seconds. The picture may be of
+    another run: the first line of its docstring is printed.
     """
     problem = {"args": None} | module.problem()
     names = "t0", "t1", "y0", "args"
@@ -119,7 +119,14 @@ def scene(
     def solve(t0: Any, t1: Any, y0: Any, args: Any) -> diffrax.Solution:
         save_every = num_steps // num_saves
         return integrate(
-            problem["term"], CF4(), t0, t1, y0, args, num_steps=num_steps, save_every=save_every
+            problem["term"],
+            module.solver,
+            t0,
+            t1,
+            y0,
+            args,
+            num_steps=num_steps,
+            save_every=save_every,
         )
 
     y0, args = arrays[2:]
@@ -135,11 +142,14 @@ def scene(
         figure = module.picture()
         update(advance=1)
 
-    title = f"{num_steps} equal steps of CF4, t = {float(arrays[0]):g} to {float(arrays[1]):g}"
+    method = type(module.solver).__name__
+    title = f"{num_steps} equal steps of {method}, t = {float(arrays[0]):g} to {float(arrays[1]):g}"
     table = Table(box=box.SIMPLE_HEAD, padding=(0, 1), title=title, title_justify="left")
-    table.add_column("")
-    for heading in ("start", "end", "largest change"):
-        table.add_column(heading, justify="right", no_wrap=True)
+    table.add_column("", no_wrap=True)
+    # In a narrow terminal values take several lines, so that names and changes stay whole.
+    for heading in ("start", "end"):
+        table.add_column(heading, justify="right")
+    table.add_column("largest\nchange", justify="right", no_wrap=True)
     start = module.invariants(y0, args)
     found = jax.vmap(lambda y: module.invariants(y, args))(ys)
     for label, value in start.items():
@@ -151,8 +161,13 @@ def scene(
         f"Compiled in {show(compile_seconds)}. Ran in {show(fastest)}, {show(fastest / num_steps)} "
         f"a step: the fastest of {len(seconds)} runs on one {jax.default_backend().upper()}."
     )
-    subject = (inspect.getdoc(module) or name).splitlines()[0]
-    return Report([subject, table, times], {f"{name}_picture": figure})
+    picture = f"The picture: {_first_line(module.picture, name)}"
+    printed = [_first_line(module, name), table, times, picture]
+    return Report(printed, {f"{name}_picture": figure})
+
+
+def _first_line(documented: object, name: str) -> str:
+    return (inspect.getdoc(documented) or name).splitlines()[0]
 
 
 def _span(values: Float[Array, "..."]) -> str:

@@ -108,7 +108,8 @@ class WorkPrecision(NamedTuple):
     def table(self) -> "rich.table.Table":
         """The table for a terminal, with the notes below. Needs `cfjax[paper]`.
 
-        The table shows the fastest run, and beside it how much longer the upper quartile took.
+        The table shows the fastest run, and beside it how much longer the upper quartile took. A
+        count that is not known is an empty cell, and one that is known for no row has no column.
 
         **Raises** `ModuleNotFoundError` without rich.
         """
@@ -117,28 +118,40 @@ class WorkPrecision(NamedTuple):
             from rich.table import Table
 
         is_adaptive = bool(np.any(np.isfinite(self.tolerance)))
-        headings = ["error", "steps", "evals", "flows", "flops", "compile\n(s)", "time\n(ms)"]
-        if is_adaptive:
-            headings = ["tol", *headings[:2], "rejected", *headings[2:]]
-        failed = [i for i, note in enumerate(self.note) if note]
-        settings = self.tolerance if is_adaptive else self.num_steps
-        notes = [f"{self.method[i]}, {settings[i]:g}: {self.note[i]}" for i in failed]
-        table = Table(box=box.SIMPLE_HEAD, padding=0, caption="\n".join(notes) or None)
-        table.add_column("method", no_wrap=True)
-        for heading in headings:
-            table.add_column(heading, justify="right", no_wrap=True)
         best, upper = np.percentile(self.seconds, (0, 75), axis=-1)
+        spread = [f" +{more:.0%}" for more in upper / best - 1]
+        times = [f"{1e3 * x:.3g}{more}" for x, more in zip(best, spread, strict=True)]
+        columns = {
+            "tol": [f"{x:.0e}" for x in self.tolerance],
+            "error": [f"{x:.1e}" for x in self.error],
+            "steps": [f"{x:.0f}" for x in self.num_steps],
+            "rejected": [f"{x:.0f}" for x in self.num_rejected] if is_adaptive else [],
+            "evals": [f"{x:.6g}" for x in self.num_evaluations],
+            "flows": [f"{x:.6g}" for x in self.num_flows],
+            "flops": [f"{x:.2e}" for x in self.flops],
+            "compile\n(s)": [f"{x:.2f}" for x in self.compile_seconds],
+            "time\n(ms)": times,
+        }
+        blank = {
+            heading: ["" if cell.startswith("nan") else cell for cell in cells]
+            for heading, cells in columns.items()
+        }
+        shown = {heading: cells for heading, cells in blank.items() if any(cells)}
+
+        settings = self.tolerance if is_adaptive else self.num_steps
+        failed: dict[tuple[str, str], list[str]] = {}
+        for name, setting, note in zip(self.method, settings, self.note, strict=True):
+            if note:
+                failed.setdefault((name, note), []).append(f"{setting:g}")
+        notes = [f"{name}, {', '.join(some)}: {note}" for (name, note), some in failed.items()]
+        caption = "\n".join(notes) or None
+        table = Table(box=box.SIMPLE_HEAD, padding=0, caption=caption, caption_justify="left")
+        table.add_column("method", no_wrap=True)
+        for heading in shown:
+            table.add_column(heading, justify="right", no_wrap=True)
         for i, name in enumerate(self.method):
-            cells = [f"{self.error[i]:.1e}", f"{self.num_steps[i]:.0f}"]
-            if is_adaptive:
-                cells = [f"{self.tolerance[i]:.0e}", *cells, f"{self.num_rejected[i]:.0f}"]
-            cells += [f"{count:.6g}" for count in (self.num_evaluations[i], self.num_flows[i])]
-            cells.append(f"{self.flops[i]:.2e}")
-            cells += [f"{self.compile_seconds[i]:.2f}", f"{1e3 * best[i]:.3g}"]
-            if not self.note[i]:
-                cells[-1] += f" +{upper[i] / best[i] - 1:.0%}"
             last = i + 1 == len(self.method) or self.method[i + 1] != name
-            table.add_row(name, *cells, end_section=last)
+            table.add_row(name, *(cells[i] for cells in shown.values()), end_section=last)
         return table
 
     def to_csv(self, path: str | os.PathLike[str]) -> None:

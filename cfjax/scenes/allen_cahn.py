@@ -51,6 +51,7 @@ if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
 t0, t1 = 0.0, 6.0
+solver = ETD54()
 
 # One, two or three axes.
 Phases = Float[Array | np.ndarray, "*cells"]
@@ -134,13 +135,13 @@ def chart(**options: Any) -> WorkPrecision:
 
 
 def picture(n: int = 128) -> "Figure":
-    """Fronts on a line that meet, a drop that shrinks, and its area."""
+    """Fronts on a line that meet, and a drop that shrinks, with its area."""
     from matplotlib.figure import Figure
 
     figure = Figure((12.5, 3.2), layout="constrained")
     left, *squares, right = figure.subplots(1, 5, width_ratios=(1.4, 1, 1, 1, 1.4))
     options: Any = dict(num_steps=15, save_every=5)
-    line: Any = integrate(solver=ETD54(), **problem() | options).ys
+    line: Any = integrate(solver=solver, **problem() | options).ys
     x = (np.arange(256) + 0.5) / 256
     colours = "#999999", "#E69F00", "#D55E00", "#0072B2"
     for k, (t, colour) in enumerate(zip((0.0, 2.0, 4.0, 6.0), colours, strict=True)):
@@ -151,11 +152,12 @@ def picture(n: int = 128) -> "Figure":
 
     start, width, end = drop(n), 0.02, 110.0
     options = dict(num_steps=110, save_every=1)
-    found: Any = integrate(LieTerm(field), ETD54(), 0.0, end, start, width, **options)
+    found: Any = integrate(LieTerm(field), solver, 0.0, end, start, width, **options)
     ys, times = np.concatenate([start[None], found.ys]), np.append(0.0, found.ts)
     for ax, t in zip(squares, (0, 10, 90), strict=True):
         ax.imshow(ys[t].T, origin="lower", cmap="RdBu_r", vmin=-1, vmax=1)
         ax.set(xticks=[], yticks=[], title=f"A drop, t = {t}")
+    figure.colorbar(squares[0].images[0], ax=squares, label="u", shrink=0.7)
     area = np.mean((1 + ys) / 2, axis=(1, 2))
     right.plot(times, area, color="#0072B2", label="area of the drop")
     law = area[0] - 2 * np.pi * width**2 * times

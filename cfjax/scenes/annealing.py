@@ -39,6 +39,7 @@ if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
 t0, t1 = 0.0, 20.0
+solver = Magnus6()
 
 State = Complex[Array | np.ndarray, " size"]
 
@@ -171,7 +172,7 @@ def picture(num_spins: int = 8) -> "Figure":
 
     def solve(duration: Any) -> Any:
         start = y0(num_spins)
-        return integrate(term, Magnus6(), 0.0, duration, start, duration, num_steps=n, save_every=1)
+        return integrate(term, solver, 0.0, duration, start, duration, num_steps=n, save_every=1)
 
     durations = np.geomspace(1.0, 100.0, 25)
     ends = jax.lax.map(lambda duration: solve(duration).ys[-1], jnp.asarray(durations))
@@ -189,7 +190,7 @@ def picture(num_spins: int = 8) -> "Figure":
     levels, spins, slow = figure.subplots(1, 3)
     levels.plot(times, np.asarray(lowest), color="0.75", linewidth=1)
     levels.plot(times, energies, color="#D55E00", label="the state")
-    levels.set(title="Lowest levels, and the energy", xlabel="t")
+    levels.set(title="Lowest levels, and the energy", xlabel="t", ylabel="energy")
     levels.legend(frameon=False)
     up = 1 - (np.arange(2**num_spins)[:, None] >> np.arange(num_spins)[::-1] & 1)
     means = 2 * (np.abs(ys) ** 2) @ up - 1

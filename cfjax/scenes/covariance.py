@@ -41,6 +41,8 @@ if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
 t0, t1 = 0.0, 5.0
+# Adaptive steps too: CF54 does not keep covariances positive.
+solver = CF4()
 
 Covariance = Float[Array | np.ndarray, "4 4"]
 
@@ -151,7 +153,7 @@ def chart(**options: Any) -> WorkPrecision:
 
 
 def picture() -> "Figure":
-    """Once around the radar: what is known of the position, and the smallest eigenvalue."""
+    """Once around the radar, to t = 60: what is known of the position; the smallest eigenvalue."""
     from matplotlib.figure import Figure
     from matplotlib.patches import Ellipse, Wedge
 

@@ -49,6 +49,7 @@ if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
 t0, t1 = 0.0, 100.0
+solver = ETD54()
 
 # Of u and v, with the keys "u" and "v".
 State = dict[str, Float[Array | np.ndarray, "n n"]]
@@ -156,12 +157,12 @@ def chart(**options: Any) -> WorkPrecision:
 
 
 def picture(n: int = 64) -> "Figure":
-    """The substance v at six times."""
+    """The substance v at six times, to t = 6000."""
     from matplotlib.figure import Figure
 
     start = jax.tree.map(jnp.asarray, y0(n))
     options: Any = dict(num_steps=600, save_every=50)
-    ys: Any = integrate(LieTerm(field), ETD54(), 0.0, 6000.0, start, Reactor(), **options).ys
+    ys: Any = integrate(LieTerm(field), solver, 0.0, 6000.0, start, Reactor(), **options).ys
     times = (0, 500, 1000, 1500, 2500, 6000)
     figure = Figure((12.0, 2.2), layout="constrained")
     side = Reactor().side

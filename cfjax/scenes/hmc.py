@@ -45,6 +45,7 @@ if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
 t0, t1 = 0.0, 1.0
+solver = BlanesMoan4()
 
 Links = Complex[Array | np.ndarray, "chains 2 rows columns n n"]
 State = dict[str, Links]
@@ -133,7 +134,7 @@ def samples(
     start: Links,
     beta: Any,
     num_trajectories: int,
-    solver: diffrax.AbstractSolver | None = None,
+    solver: diffrax.AbstractSolver = solver,
     *,
     num_steps: int = 2,
     seed: Any = 0,
@@ -148,7 +149,7 @@ def samples(
         first, second = jax.random.split(key)
         begin = {"U": links, "P": momenta(first, links.shape)}
         options: Any = dict(num_steps=num_steps, throw=False)
-        ys = integrate(term, solver or BlanesMoan4(), t0, t1, begin, beta, **options).ys
+        ys = integrate(term, solver, t0, t1, begin, beta, **options).ys
         end: Any = jax.tree.map(lambda y: y[-1], ys)
         dh = energy(end, beta) - energy(begin, beta)
         is_accepted = jax.random.uniform(second, dh.shape) < jnp.exp(-dh)

@@ -27,6 +27,8 @@ if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
 t0, t1 = 0.0, 60.0
+# Order 3 is enough for fields that do not depend on the state.
+solver = WeakOrder2(CF3())
 
 Pose = Float[Array | np.ndarray, "4"]
 
@@ -179,5 +181,4 @@ def _mean(t: Any, matrices: list[np.ndarray]) -> np.ndarray:
 @functools.partial(jax.vmap, in_axes=(0, None, None))
 def _samples(key: Any, args: Readings, num_steps: int) -> Any:
     # Order 3 is enough for fields that do not depend on the state.
-    solver = WeakOrder2(CF3())
     return integrate(term(key), solver, t0, t1, y0(), args, num_steps=num_steps, save_every=1).ys

@@ -47,6 +47,7 @@ if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
 t0, t1 = 0.0, 30.0
+solver = ETD54()
 
 Coefficients = Complex[Array | np.ndarray, " m"]
 
@@ -147,14 +148,14 @@ def chart(**options: Any) -> WorkPrecision:
 
 
 def picture(time: float = 200.0) -> "Figure":
-    """The solution, and how fast two solutions part that differ in the start or in the steps."""
+    """The solution to t = 200, and how fast two part that differ in the start or in the steps."""
     from matplotlib.figure import Figure
 
     start, n = jnp.asarray(y0()), round(2 * time)
 
     def run(y: Any, steps_between: int) -> Any:
         options: Any = dict(num_steps=n * steps_between, save_every=steps_between)
-        ys: Any = integrate(LieTerm(field), ETD54(), 0.0, time, y, PERIOD, **options).ys
+        ys: Any = integrate(LieTerm(field), solver, 0.0, time, y, PERIOD, **options).ys
         return np.asarray(jax.vmap(to_grid)(jnp.concatenate([y[None], ys])))
 
     u, times = run(start, 4), np.linspace(0.0, time, n + 1)

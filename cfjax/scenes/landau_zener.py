@@ -38,6 +38,7 @@ if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
 t0, t1 = -10.0, 10.0
+solver = Magnus6()
 
 
 class Sweep(NamedTuple):
@@ -146,7 +147,7 @@ def picture() -> "Figure":
     sweeps = {rate: Sweep(rate, 0.5) for rate in (0.3, 1.0, 3.0, 10.0)}
     states = {}
     for rate, args in sweeps.items():
-        sol = integrate(LieTerm(field), Magnus6(), t0, t1, y0(), args, num_steps=n, save_every=1)
+        sol = integrate(LieTerm(field), solver, t0, t1, y0(), args, num_steps=n, save_every=1)
         states[rate] = np.asarray(sol.ys)
     times = t0 + (t1 - t0) * np.arange(1, n + 1) / n
     figure = Figure((10.5, 3.6), layout="constrained")
@@ -188,7 +189,7 @@ def picture() -> "Figure":
     sphere.add_collection3d(
         Line3DCollection(pieces, array=times[1:], cmap="viridis", linewidth=1.4, zorder=1)
     )
-    sphere.set_title("The state on the sphere", y=0.97)
+    sphere.set_title("The state at rate 1, late is yellow", y=0.97)
     sphere.set_axis_off()
     sphere.set_box_aspect((1, 1, 1), zoom=1.25)
     return figure

@@ -29,6 +29,7 @@ if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
 t0, t1 = 0.0, 20.0
+solver = WeakOrder2()
 
 Direction = Float[Array | np.ndarray, "3"]
 
@@ -163,7 +164,6 @@ def picture(num_samples: int = 4000) -> "Figure":
 @functools.partial(jax.jit, static_argnums=2)
 @functools.partial(jax.vmap, in_axes=(0, None, None))
 def _samples(key: Any, args: Particle, num_steps: int) -> Any:
-    solver = WeakOrder2()
     return integrate(term(key), solver, t0, t1, y0(), args, num_steps=num_steps, save_every=1).ys
 
 

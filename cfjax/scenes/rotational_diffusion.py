@@ -25,6 +25,8 @@ if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
 t0, t1 = 0.0, 1.5
+# Order 3 is enough for fields that do not depend on the state.
+solver = WeakOrder2(CF3())
 
 Direction = Float[Array | np.ndarray, "3"]
 
@@ -131,8 +133,6 @@ def picture(num_samples: int = 50_000) -> "Figure":
 @functools.partial(jax.jit, static_argnums=2)
 @functools.partial(jax.vmap, in_axes=(0, None, None))
 def _samples(key: Any, diffusion: Any, num_steps: int) -> Any:
-    # Order 3 is enough for fields that do not depend on the state.
-    solver = WeakOrder2(CF3())
     return integrate(
         term(key), solver, t0, t1, y0(), diffusion, num_steps=num_steps, save_every=1
     ).ys

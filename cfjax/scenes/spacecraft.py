@@ -24,6 +24,7 @@ from .. import (
     CF43,
     CF54,
     RKMK4,
+    RKMK8,
     LieTerm,
     QuaternionRotation,
     RigidMotion,
@@ -38,6 +39,7 @@ if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
 t0, t1 = 0.0, 40.0
+solver = RKMK8()
 inertia = np.array([3.0, 2.0, 1.0])
 
 # `q`, shape `(*times, 4)`, and `m`, shape `(*times, 3)`.
@@ -159,6 +161,7 @@ def chart(**options: Any) -> WorkPrecision:
             "RKMK4": RKMK4(),
             "CF43": CF43(),
             "CF54": CF54(),
+            "RKMK8": RKMK8(),
             "Tsit5": (space, diffrax.Tsit5()),
             "Dopri8": (space, diffrax.Dopri8()),
         },
@@ -170,11 +173,11 @@ def chart(**options: Any) -> WorkPrecision:
 
 
 def picture() -> "Figure":
-    """The path of the body's middle axis on the sphere, and the momentum in the body."""
+    """The path of the body's middle axis on the sphere, and the momentum in the body, to t = 40."""
     from matplotlib.figure import Figure
 
     term = LieTerm(field)
-    sol = integrate(term, CF54(), 0.0, 100.0, y0(), Craft(), num_steps=2000, save_every=1)
+    sol = integrate(term, solver, t0, t1, y0(), Craft(), num_steps=800, save_every=1)
     ys: Any = sol.ys
     middle = jnp.broadcast_to(jnp.asarray([0.0, 1.0, 0.0], ys["q"].dtype), ys["m"].shape)
     path = np.asarray(quaternion_rotate(ys["q"], middle, order="wxyz"))

@@ -43,6 +43,7 @@ if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
 t0, t1 = 0.0, 4.0
+solver = Strang()
 
 Spins = Float[Array | np.ndarray, "rows columns 3"]
 
@@ -166,7 +167,7 @@ def chart(**options: Any) -> WorkPrecision:
 
 
 def picture(side: int = 64, time: float = 120.0) -> "Figure":
-    """Spectra for two step sizes on a path of waves, and the energy, against CF4's.
+    """Spectra for two step sizes on a path of waves, and the energy, against CF4's, to t = 120.
 
     The path leads from long waves, Γ, to those along an axis that alternate, X, to those that
     alternate along both, M, and back.

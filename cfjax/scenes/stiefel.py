@@ -33,6 +33,7 @@ if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
 t0, t1 = 0.0, 1.0
+solver = CF4()
 
 # The first two rows of Y(1) and the sum of its entries for n = 100, p = 4, from an independent
 # program, rounded to 13 decimals.
@@ -160,7 +161,7 @@ def picture(n: int = 40) -> "Figure":
     space = diffrax.ODETerm(lambda t, y, args: tangent(first(t, y, args), y))
     options: Any = dict(num_steps=steps, save_every=1)
     found = {
-        "CF4": integrate(**given, solver=CF4(), **options),
+        "CF4": integrate(**given, solver=solver, **options),
         "Tsit5 in plain space": integrate(
             **(given | dict(term=space)), solver=diffrax.Tsit5(), **options
         ),
@@ -176,12 +177,12 @@ def picture(n: int = 40) -> "Figure":
     columns.imshow(board, aspect="auto", cmap="magma_r", vmin=0, vmax=1, interpolation="nearest")
     labels = [f"t = {t:g}" for t in (0, *times[[19, 99, -1]])]
     columns.set_xticks([width * k + (width - 2) / 2 for k in range(len(shots))], labels)
-    columns.set(title="Entries of Y, by size", ylabel="row")
+    columns.set(title="Entries of Y, large ones dark", ylabel="row")
     height = np.einsum("tij,i,j->t", ys**2, d, c) / 2
     top = np.sum(d[: len(c)] * np.sort(c)) / 2
     climb.plot(times, height, color="#0072B2")
     climb.axhline(top, color="0.6", linestyle=":", linewidth=1)
-    climb.set(title="tr(C Y^T D Y) / 2, and its maximum", xlabel="t")
+    climb.set(title="tr($C\\,Y^T D\\,Y$) / 2, and its maximum", xlabel="t")
     for name, sol in found.items():
         y = np.asarray(sol.ys)
         off = np.abs(np.swapaxes(y, 1, 2) @ y - np.eye(y.shape[2])).max(axis=(1, 2))

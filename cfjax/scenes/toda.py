@@ -39,6 +39,7 @@ if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
 t0, t1 = 0.0, 10.0
+solver = CF4()
 
 # The particles of `y0()`: they run into each other.
 positions = np.array([-10.0, -5.0, -1.0, 4.0, 9.0])
@@ -137,18 +138,18 @@ def chart(**options: Any) -> WorkPrecision:
 
 
 def picture() -> "Figure":
-    """The paths of particles that collide, and the matrix that becomes diagonal."""
+    """The paths of particles that collide, to t = 14, and the matrix that becomes diagonal."""
     from matplotlib.figure import Figure
 
     n, end = 100, 14.0
-    solvers = {
-        "CF4": (LieTerm(field), CF4()),
+    methods = {
+        "CF4": (LieTerm(field), solver),
         "Tsit5": (diffrax.ODETerm(velocity), diffrax.Tsit5()),
     }
     options: Any = dict(num_steps=n, save_every=1)
     found = {
-        name: integrate(term, solver, 0.0, end, y0(), **options)
-        for name, (term, solver) in solvers.items()
+        name: integrate(term, method, t0, end, y0(), **options)
+        for name, (term, method) in methods.items()
     }
     times = np.asarray(found["CF4"].ts)
     ys = {name: np.asarray(sol.ys) for name, sol in found.items()}

@@ -65,6 +65,7 @@ class Pulse(NamedTuple):
 
 
 t0 = 0.0
+solver = Magnus6()
 
 
 def plain(duration: float = 8.0) -> Pulse:
@@ -199,7 +200,7 @@ def picture() -> "Figure":
         {"in phase only": plain(), "with quadrature": corrected()}.items()
     ):
         sol = integrate(
-            LieTerm(field), Magnus6(), t0, args.duration, y0(), args, num_steps=n, save_every=1
+            LieTerm(field), solver, t0, args.duration, y0(), args, num_steps=n, save_every=1
         )
         ys = np.asarray(sol.ys)
         times = args.duration * np.arange(1, n + 1) / n

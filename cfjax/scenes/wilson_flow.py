@@ -38,6 +38,7 @@ if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
 t0, t1 = 0.0, 0.5
+solver = CF4()
 
 Links = Complex[Array | np.ndarray, "d *sides 3 3"]
 
@@ -172,18 +173,19 @@ def reference(
 
 
 def picture(side: int = 8) -> "Figure":
-    """A slice of a `side`^4 lattice: where the action is, as it flows away."""
+    """A slice of a larger lattice: where the action is, as it flows away, to t = 3."""
     from matplotlib.figure import Figure
 
     start = y0(side)
     # The links at t = 0.1, 0.2, ...
-    ys: Any = integrate(LieTerm(field), Luscher3(), t0, 3.0, start, num_steps=60, save_every=2).ys
+    ys: Any = integrate(LieTerm(field), solver, t0, 3.0, start, num_steps=60, save_every=2).ys
     states = {0.0: start, 0.1: ys[0], 0.3: ys[2], 1.0: ys[9], 3.0: ys[29]}
-    figure = Figure((2.2 * len(states), 2.5), layout="constrained")
+    figure = Figure((2.2 * len(states), 3.1), layout="constrained")
     for ax, (t, y) in zip(figure.subplots(1, len(states)), states.items(), strict=True):
         values = np.asarray(density(jnp.asarray(y)))
         ax.imshow(values[:, :, 0, 0], interpolation="bicubic", vmin=0, cmap="magma")
-        ax.set(xticks=[], yticks=[], title=f"t = {t:g}, S/point {values.mean():.2g}")
+        ax.set(xticks=[], yticks=[], title=f"t = {t:g}, mean {values.mean():.2g}")
+        figure.colorbar(ax.images[0], ax=ax, location="bottom", label="action of a point")
     return figure
 
 

@@ -47,6 +47,8 @@ if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
 t0, t1 = 0.0, 4.0
+# Over shorter times than a million its energy is better than that of ImplicitMidpoint.
+solver = CF4()
 
 
 def y0(n: int = 32, seed: int = 0, degree: int = 6) -> Complex[np.ndarray, "N N"]:
@@ -257,14 +259,15 @@ def chart(**options: Any) -> WorkPrecision:
 
 
 def picture(n: int = 64) -> "Figure":
-    """Random vorticity that is wound up into a few vortices, and its stream function below."""
+    """Random vorticity that winds up into a few vortices, to t = 60, and its stream function."""
     from matplotlib.figure import Figure
 
     start, inverse = y0(n), jnp.asarray(inverse_laplacian(n))
     times, options = [0, 4, 8, 16, 60], dict(num_steps=600, save_every=40)
-    ys: Any = integrate(LieTerm(field), CF4(), 0.0, 60.0, start, inverse, **options).ys
+    ys: Any = integrate(LieTerm(field), solver, 0.0, 60.0, start, inverse, **options).ys
     latitude, longitude = np.linspace(-np.pi / 2, np.pi / 2, 121), np.linspace(-np.pi, np.pi, 241)
     figure = Figure((2.8 * len(times), 3.2), layout="constrained")
+    rows: Any = [], []
     for k, t in enumerate(times):
         y = np.asarray(ys[t // 4 - 1]) if t else start
         p = np.asarray(stream_function(y, inverse))
@@ -274,12 +277,15 @@ def picture(n: int = 64) -> "Figure":
             )
             values = on_sphere(matrix, latitude, longitude)
             options: Any = dict(cmap="RdBu_r", vmin=-most, vmax=most, shading="gouraud")
-            ax.pcolormesh(longitude, latitude, values, rasterized=True, **options)
+            shown = ax.pcolormesh(longitude, latitude, values, rasterized=True, **options)
+            rows[row].append(ax)
+            if k == 0:
+                ax.set_ylabel(("vorticity", "stream function")[row])
+            elif t == times[-1]:
+                figure.colorbar(shown, ax=rows[row])
             ax.set(xticks=[], yticks=[])
             if row == 0:
                 ax.set_title(f"t = {t}")
-            if k == 0:
-                ax.set_ylabel(("vorticity", "stream function")[row])
     return figure
 
 

@@ -408,6 +408,21 @@ def test_the_table_has_every_row(equal, adaptive):
     assert "rejected" in text and text.count("Tsit5") == 2
 
 
+def test_the_table_leaves_out_what_is_not_known(equal):
+    # diffrax's solver takes no flows, and its operations are not counted.
+    assert "flops" in rendered(equal.table()) and "nan" not in rendered(equal.table())
+    unknown = equal.select("Tsit5")
+    assert "flops" not in rendered(unknown.table())
+    failed = unknown._replace(
+        error=np.full(3, np.nan), seconds=np.full((3, 2), np.nan), note=3 * ("it blew up",)
+    )
+    text = rendered(failed.table())
+    assert "nan" not in text
+    # One note for all runs of a method that failed alike.
+    assert text.count("it blew up") == 1
+    assert f"Tsit5, {', '.join(f'{n:g}' for n in equal.num_steps[:3])}: it blew up" in text
+
+
 def test_csv_keeps_every_digit(equal, tmp_path):
     path = tmp_path / "work.csv"
     equal.to_csv(path)

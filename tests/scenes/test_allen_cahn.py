@@ -115,5 +115,5 @@ def test_the_area_of_a_drop():
 
 
 @pytest.mark.slow
-def test_the_picture_has_five_panels():
-    assert len(allen_cahn.picture(n=16).axes) == 5
+def test_the_picture_has_five_panels_and_a_scale():
+    assert len(allen_cahn.picture(n=16).axes) == 6

@@ -119,4 +119,6 @@ def test_an_attitude_has_two_quaternions():
 
 
 def test_the_picture():
-    assert len(spacecraft.picture().axes) == 2
+    _, body = spacecraft.picture().axes
+    # To the time of the table that `cfjax scene` prints.
+    assert [np.max(line.get_xdata()) for line in body.lines] == 3 * [spacecraft.t1]

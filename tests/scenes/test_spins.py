@@ -125,5 +125,5 @@ def test_error_control_and_the_gradient_of_a_lattice():
     np.testing.assert_allclose(slope, np.sum((up - down)[..., 2]) / (2 * h), rtol=0, atol=1e-4)
 
 
-def test_the_picture_has_one_panel_a_time():
-    assert len(spins.picture(side=4).axes) == 5
+def test_the_picture_has_one_panel_a_time_and_the_colours_of_directions():
+    assert len(spins.picture(side=4).axes) == 6

@@ -123,5 +123,5 @@ def test_the_velocity_is_that_of_the_field():
 
 
 @pytest.mark.slow
-def test_the_picture_has_one_panel_a_time():
-    assert len(wilson_flow.picture(side=2).axes) == 5
+def test_the_picture_has_one_panel_a_time_and_its_scale():
+    assert len(wilson_flow.picture(side=2).axes) == 10

@@ -190,5 +190,5 @@ def test_the_spectrum_at_32():
 
 
 @pytest.mark.slow
-def test_the_picture_has_two_panels_a_time():
-    assert len(zeitlin.picture(n=8).axes) == 10
+def test_the_picture_has_two_panels_a_time_and_two_scales():
+    assert len(zeitlin.picture(n=8).axes) == 12
