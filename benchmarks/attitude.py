@@ -29,7 +29,7 @@ CRAFT = spacecraft.Craft()
 def craft(t: Any, y: Any, args: Any) -> dict[str, Any]:
     """Without torque. The momentum as an array: its velocity, and no rotation, is of high order."""
     omega = y["m"] / spacecraft.inertia
-    attitude = cfjax.QuaternionRotation(omega, frame="body", order="wxyz")
+    attitude = cfjax.QuaternionRotation(omega, frame="body", layout="wxyz")
     return {"q": attitude, "m": jnp.cross(y["m"], omega)}
 
 

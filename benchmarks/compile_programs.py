@@ -130,7 +130,7 @@ def skew(t: Any, y: Any, args: Any) -> cfjax.LeftMatrix:
 
 def spacecraft(t: Any, y: Any, args: Any) -> dict[str, Any]:
     omega = y["m"] / jnp.array([3.0, 2.0, 1.0])
-    q = cfjax.QuaternionRotation(omega, frame="body", order="wxyz")
+    q = cfjax.QuaternionRotation(omega, frame="body", layout="wxyz")
     return {"q": q, "m": jnp.cross(y["m"], omega)}
 
 

@@ -246,8 +246,8 @@ def break_even(name: str, rate: float, found: dict[str, Run]) -> Iterator[result
 def top() -> System:
     """A heavy asymmetric top: attitude q, and momentum m in the body or in space."""
     inertia, center = jnp.asarray([1.0, 1.3, 2.0]), jnp.asarray([0.2, 0.3, 1.0])
-    order: Any = dict(order="wxyz")
-    body = lambda q, x: cfjax.quaternion_rotate(q * jnp.asarray([1.0, -1, -1, -1]), x, **order)  # noqa: E731
+    layout: Any = dict(layout="wxyz")
+    body = lambda q, x: cfjax.quaternion_rotate(q * jnp.asarray([1.0, -1, -1, -1]), x, **layout)  # noqa: E731
     upwards = jnp.asarray([0.0, 0.0, 1.0])
 
     def kick(y: PyTree) -> PyTree:
@@ -256,7 +256,7 @@ def top() -> System:
     def spin(axis: int) -> Part:
         def field(y: PyTree) -> PyTree:
             w = jnp.eye(3)[axis] * y["m"] / inertia
-            q = cfjax.QuaternionRotation(w, frame="body", **order)
+            q = cfjax.QuaternionRotation(w, frame="body", **layout)
             return {"q": q, "m": cfjax.Rotation(-w)}
 
         return field
@@ -264,7 +264,7 @@ def top() -> System:
     def field(y: PyTree) -> PyTree:
         w = y["m"] / inertia
         torque = jnp.cross(body(y["q"], upwards), center)
-        q = cfjax.QuaternionRotation(w, frame="body", **order)
+        q = cfjax.QuaternionRotation(w, frame="body", **layout)
         return {"q": q, "m": torque + jnp.cross(y["m"], w)}
 
     def energy(y: PyTree) -> Array:

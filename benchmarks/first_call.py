@@ -38,7 +38,7 @@ def fields(problem: str, xp: Any) -> tuple[Callable[..., Any], Callable[..., Any
         def frozen(cfjax):
             def field(t, y, args):
                 w = y["m"] / inertia
-                q = cfjax.QuaternionRotation(w, frame="body", order="wxyz")
+                q = cfjax.QuaternionRotation(w, frame="body", layout="wxyz")
                 return {"q": q, "m": cfjax.Rotation(-w)}
 
             return field

@@ -25,7 +25,7 @@ REPEATS = 10  # of a program in one turn
 def craft(t, y, inertia):
     omega = y["m"] / inertia
     return {
-        "q": cfjax.QuaternionRotation(omega, frame="body", order="wxyz"),
+        "q": cfjax.QuaternionRotation(omega, frame="body", layout="wxyz"),
         "m": cfjax.Rotation(-omega),
     }
 

@@ -30,17 +30,18 @@ def units(*shape: int) -> np.ndarray:
 
 
 def quaternion(t: Any, y: Any, args: Any) -> Any:
-    return cfjax.QuaternionRotation(y[..., 1:] * WEIGHTS + 0.2, frame="body", order="wxyz")
+    return cfjax.QuaternionRotation(y[..., 1:] * WEIGHTS + 0.2, frame="body", layout="wxyz")
 
 
 def attitude(t: Any, y: Any, args: Any) -> Any:
     w = y["m"] / WEIGHTS
-    rotation = cfjax.QuaternionRotation(w, frame="body", order="wxyz")
+    rotation = cfjax.QuaternionRotation(w, frame="body", layout="wxyz")
     return {"q": rotation, "m": cfjax.Rotation(-w)}
 
 
 def pose(t: Any, y: Any, args: Any) -> Any:
-    return cfjax.RigidMotion(omega=y[..., 1:4] * WEIGHTS, v=y[..., 4:], frame="body")
+    w, v = y[..., 1:4] * WEIGHTS, y[..., 4:]
+    return cfjax.RigidMotion(omega=w, v=v, frame="body", layout="wxyz_xyz")
 
 
 def own(t: Any, s: Any, args: Any) -> Any:

@@ -151,7 +151,7 @@ def of_spacecraft() -> Scene:
 
     def field(t: Any, y: Any, args: Any) -> Any:
         omega = y["m"] / inertia
-        attitude = cfjax.QuaternionRotation(omega, frame="body", order="wxyz")
+        attitude = cfjax.QuaternionRotation(omega, frame="body", layout="wxyz")
         return {"q": attitude, "m": jnp.cross(y["m"], omega)}
 
     def velocity(t: Any, y: Any, args: Any) -> Any:
@@ -225,7 +225,7 @@ def of_given_velocity() -> Scene:
         return cfjax.RightMatrix(jnp.cross(jnp.eye(3), omega(t)))
 
     def quaternion_field(t: Any, q: Any, args: Any) -> Any:
-        return cfjax.QuaternionRotation(omega(t), frame="body", order="wxyz")
+        return cfjax.QuaternionRotation(omega(t), frame="body", layout="wxyz")
 
     def quaternion_velocity(t: Any, q: Any, args: Any) -> Any:
         w = omega(t)
@@ -233,10 +233,10 @@ def of_given_velocity() -> Scene:
 
     def as_quaternion(solve: Callable) -> Callable:
         def solve_matrix(r: Any, num_steps: int) -> Any:
-            q = solve(cfjax.quaternion_from_matrix(r, order="wxyz"), num_steps)
+            q = solve(cfjax.quaternion_from_matrix(r, layout="wxyz"), num_steps)
             # Its length is to be seen in the matrix, which is quadratic in it.
             length = jnp.linalg.norm(q)
-            return length**2 * cfjax.quaternion_to_matrix(q / length, order="wxyz")
+            return length**2 * cfjax.quaternion_to_matrix(q / length, layout="wxyz")
 
         return solve_matrix
 

@@ -850,7 +850,7 @@ def test_the_transpose_of_a_small_solve_that_is_rewritten(rewritten):
 
 def turning(y0, rate=1.0, **options):
     term = cfjax.LieTerm(
-        lambda t, y, args: cfjax.QuaternionRotation(rate * jnp.ones(3), frame="body", order="wxyz")
+        lambda t, y, args: cfjax.QuaternionRotation(rate * jnp.ones(3), frame="body", layout="wxyz")
     )
     return cfjax.integrate(term, cfjax.CF4(), 0.0, 1.0, y0, num_steps=12, **options)
 

@@ -84,16 +84,21 @@ FIELDS = {
     "array": (lambda t, y, args: args * jnp.sin(y), ON_SPHERE),
     "Rotation": (unit, ON_SPHERE),
     "QuaternionRotation": (
-        lambda t, y, args: cfjax.QuaternionRotation(args * y[1:] + t, frame="body", order="wxyz"),
+        lambda t, y, args: cfjax.QuaternionRotation(args * y[1:] + t, frame="body", layout="wxyz"),
         np.array([0.1, 0.5, -0.5, 0.7]),
     ),
     "RigidMotion": (
-        lambda t, y, args: cfjax.RigidMotion(omega=args * y[4:] + t, v=args, frame="body"),
+        lambda t, y, args: cfjax.RigidMotion(
+            omega=args * y[4:] + t, v=args, frame="body", layout="wxyz_xyz"
+        ),
         np.array([0.6, 0.0, 0.8, 0.0, 0.3, -0.4, 0.5]),
     ),
     "PlanarMotion": (
         lambda t, y, args: cfjax.PlanarMotion(
-            omega=args[0] * y[2] + t, v=args[1:] + y[2:], frame="fixed"
+            omega=args[0] * y[2] + t,
+            v=args[1:] + y[2:],
+            frame="fixed",
+            layout="unit_complex_xy",
         ),
         np.array([0.6, 0.8, 0.3, -0.4]),
     ),

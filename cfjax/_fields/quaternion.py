@@ -10,7 +10,7 @@ from jaxtyping import Array, Bool, Float
 
 from .._arrays import describe
 from .._field import AbstractAlgebraElement
-from .._numerics.quaternion import Frame, Order, check_choice, increment, times
+from .._numerics.quaternion import Frame, Layout, check_choice, increment, times
 from .._numerics.rotate import cross_product, dexpinv
 from .._numerics.stumpff import is_below_full_turn
 from .elementwise import check_point, each
@@ -22,7 +22,7 @@ class QuaternionRotation(AbstractAlgebraElement):
     q takes body coordinates to fixed ones, `(0, x_fixed) = q (0, x_body) / q`. With
     `frame="fixed"`, `omega` is given in fixed coordinates and `q' = (0, omega) q / 2`; with
     `frame="body"`, `q' = q (0, omega) / 2`. So q moves as the matrix
-    `cfjax.quaternion_to_matrix(q, order=...)` moves along `cfjax.Rotation(omega)`, or along
+    `cfjax.quaternion_to_matrix(q, layout=...)` moves along `cfjax.Rotation(omega)`, or along
     `cfjax.RightMatrix` of the cross product with `omega`.
 
     With leading axes, shape `(*batch, 3)`, it acts on shape `(*batch, 4)`: each element moves on
@@ -37,23 +37,23 @@ class QuaternionRotation(AbstractAlgebraElement):
 
     - `omega`: shape `(*batch, 3)`, float32 or float64, in radians per unit of time.
     - `frame`: `"body"` or `"fixed"`, the frame in which `omega` is given.
-    - `order`: `"wxyz"` or `"xyzw"`, how q is stored; w is its scalar part.
+    - `layout`: `"wxyz"` or `"xyzw"`, how q is stored; w is its scalar part.
 
-    Neither `frame` nor `order` has a default, as a wrong guess would go unnoticed.
+    Neither `frame` nor `layout` has a default, as a wrong guess would go unnoticed.
 
-    **Raises** `ValueError` for another shape, frame or order, `TypeError` for another dtype, or
-    without frame or order. Fields of different frame or order cannot be added and have no bracket:
-    `TypeError`. Starting a solve from a quaternion whose squared length differs from 1 by more than
-    the root of a unit of rounding is an error.
+    **Raises** `ValueError` for another shape, frame or layout, `TypeError` for another dtype, or
+    without frame or layout. Fields of different frame or layout cannot be added and have no
+    bracket: `TypeError`. Starting a solve from a quaternion whose squared length differs from 1 by
+    more than the root of a unit of rounding is an error.
     """
 
     omega: Float[Array, "*batch 3"] = eqx.field(converter=jnp.asarray)
     frame: Frame = eqx.field(static=True, kw_only=True)
-    order: Order = eqx.field(static=True, kw_only=True)
+    layout: Layout = eqx.field(static=True, kw_only=True)
 
     def __check_init__(self):
         check_choice("frame", self.frame)
-        check_choice("order", self.order)
+        check_choice("layout", self.layout)
         if self.omega.ndim < 1 or self.omega.shape[-1] != 3:
             raise ValueError(f"omega must have shape (3,) or (*batch, 3), got {self.omega.shape}.")
         if self.omega.dtype not in (jnp.float32, jnp.float64):
@@ -83,12 +83,12 @@ class QuaternionRotation(AbstractAlgebraElement):
         if kinds[0] != kinds[1]:
             raise TypeError(
                 "QuaternionRotation has a bracket with another QuaternionRotation of the same "
-                f"frame and order only, got {describe(self)} and {describe(other)}."
+                f"frame and layout only, got {describe(self)} and {describe(other)}."
             )
         # Flows from the right compose the other way round, as if all turned backwards.
         sign = 1 if self.frame == "fixed" else -1
         omega = each(fun, self._num_axes)(sign * self.omega, other.omega)
-        return QuaternionRotation(omega, frame=self.frame, order=self.order)
+        return QuaternionRotation(omega, frame=self.frame, layout=self.layout)
 
     def defect(self, point: Float[Array, "*batch 4"]) -> tuple[Float[Array, ""], str]:
         off = jnp.abs(jnp.sum(point * point, axis=-1) - 1)
@@ -102,5 +102,5 @@ class QuaternionRotation(AbstractAlgebraElement):
         check_point(self, "omega", self._num_axes, [(4,)], point)
         if jnp.iscomplexobj(point):
             raise TypeError(f"QuaternionRotation acts on real arrays, got {point.dtype}.")
-        moved = partial(fun, frame=self.frame, order=self.order)
+        moved = partial(fun, frame=self.frame, layout=self.layout)
         return each(moved, self._num_axes)(self.omega, point)

@@ -15,6 +15,8 @@ from .._numerics.stumpff import is_below_full_turn
 from .elementwise import check_other, check_point, each
 
 Frame = Literal["body", "fixed"]
+Layout = Literal["wxyz_xyz", "xyz_xyzw", "xyzw_xyz", "xyz_wxyz"]
+PlanarLayout = Literal["unit_complex_xy", "xy_unit_complex"]
 
 
 class AbstractMotion(AbstractAlgebraElement):
@@ -23,11 +25,15 @@ class AbstractMotion(AbstractAlgebraElement):
     omega: eqx.AbstractVar[Array]
     v: eqx.AbstractVar[Array]
     frame: eqx.AbstractVar[Frame]
+    layout: eqx.AbstractVar[Any]
 
     dimension: ClassVar[int]
     # A pose in one vector is a unit number of so many entries, and a position.
     number: ClassVar[str]
     number_size: ClassVar[int]
+    # Where a pose in one vector has the entries of the number, then those of the position.
+    layouts: ClassVar[dict[str, tuple[int, ...]]]
+    conventions: ClassVar[str]
     # The module with its tangent, increment, bracket and dexpinv.
     numerics: ClassVar[Any]
 
@@ -50,6 +56,8 @@ class AbstractMotion(AbstractAlgebraElement):
             )
         if self.frame not in ("body", "fixed"):
             raise ValueError(f'frame must be "body" or "fixed", got {self.frame!r}.')
+        if self.layout is not None and self.layout not in tuple(self.layouts):
+            raise ValueError(f"layout must be one of {tuple(self.layouts)}, got {self.layout!r}.")
 
     def flow(self, point: Float[Array, "..."]) -> Float[Array, "..."]:
         return point + self._each(partial(self.numerics.increment, leads_back=False), point)
@@ -75,16 +83,17 @@ class AbstractMotion(AbstractAlgebraElement):
 
     def _with(self, fun: Any, other: Any) -> "AbstractMotion":
         check_other(self, other)
-        if other.frame != self.frame:
+        if (other.frame, other.layout) != (self.frame, self.layout):
             raise ValueError(
-                f"{type(self).__name__} has a bracket with a motion in the same frame only, got "
-                f"frame={self.frame!r} and frame={other.frame!r}."
+                f"{type(self).__name__} has a bracket with a motion of the same frame and layout "
+                f"only, got frame={self.frame!r}, layout={self.layout!r} and "
+                f"frame={other.frame!r}, layout={other.layout!r}."
             )
         # In the frame of the body flows compose the other way round, as if all moved backwards.
         sign = 1 if self.frame == "fixed" else -1
         mapped = each(fun, self._num_axes)
         omega, v = mapped(sign * self.omega, sign * self.v, other.omega, other.v)
-        return type(self)(omega=omega, v=v, frame=self.frame)
+        return type(self)(omega=omega, v=v, frame=self.frame, layout=self.layout)
 
     def defect(self, point: Float[Array, "..."]) -> tuple[Real[Array, ""], str] | None:
         n, core = self.dimension, point.shape[self._num_axes :]
@@ -95,10 +104,21 @@ class AbstractMotion(AbstractAlgebraElement):
             expected = f"a rotation, of determinant 1, before its last column and row {row}"
             off = each(_defect, self._num_axes)(point)
         else:
-            number = point[..., : self.number_size]
-            expected = f"{self.number} in its first {self.number_size} entries"
-            off = jnp.abs(jnp.sum(number * number, axis=-1) - 1)
+            places = self._places[: self.number_size]
+            end = "first" if 0 in places else "last"
+            expected = f"{self.number} in its {end} {len(places)} entries"
+            off = jnp.abs(sum(point[..., k] ** 2 for k in places) - 1)
         return jnp.max(off, initial=0), expected
+
+    @property
+    def _places(self) -> tuple[int, ...]:
+        if self.layout is None:
+            raise TypeError(
+                f"{type(self).__name__} needs a layout for poses of shape "
+                f"({self.number_size + self.dimension},): {self.conventions}. There is no default, "
+                "as a wrong guess would go unnoticed."
+            )
+        return self.layouts[self.layout]
 
     @property
     def _num_axes(self) -> int:
@@ -118,7 +138,9 @@ class AbstractMotion(AbstractAlgebraElement):
                 f"{name} with v in {self.v.dtype} acts on points in {self.v.dtype}, got "
                 f"{point.dtype}."
             )
-        return each(partial(fun, frame=self.frame), axes)(self.omega, self.v, point)
+        is_vector = point.shape[axes:] == poses[1]
+        places = self._places if is_vector else ()
+        return each(partial(fun, frame=self.frame, places=places), axes)(self.omega, self.v, point)
 
 
 class RigidMotion(AbstractMotion):
@@ -127,15 +149,15 @@ class RigidMotion(AbstractMotion):
     It acts on
 
     - a pose as a homogeneous matrix, `(4, 4)`: rotation and position, and (0, 0, 0, 1) below;
-    - a pose as one vector, `(7,)`: a unit quaternion (w, x, y, z), then the position. It takes the
-      coordinates of the body to fixed ones. This is the layout of `jaxlie.SE3`, and the fastest;
+    - a pose as one vector, `(7,)`, the fastest: a unit quaternion, which takes the coordinates of
+      the body to fixed ones, and the position. `layout` says where they are;
     - a point, `(3,)`, in the fixed frame only.
 
     With `frame="fixed"`, `omega` and `v` have fixed coordinates, and `v` is the velocity of the
     point at the origin: `T' = X T` for the matrix `X = [[omega x, v], [0, 0]]`, and
     `x' = omega x x + v` for positions and points. With `frame="body"` they have the coordinates of
     the body, and `v` is the velocity of its origin: `T' = T X`. There is no default. Only motions
-    in one frame can be added.
+    of one frame and layout can be added.
 
     With leading axes, shape `(*batch, 3)`, each pose of shapes `(*batch, 4, 4)` and `(*batch, 7)`
     moves on its own. An axis of 1 is broadcast.
@@ -149,9 +171,13 @@ class RigidMotion(AbstractMotion):
     - `omega`: shape `(*batch, 3)`, float32 or float64, in radians per unit of time.
     - `v`: shape and dtype of `omega`, in lengths per unit of time.
     - `frame`: `"body"` or `"fixed"`.
+    - `layout`: needed for poses of shape `(7,)`: `"wxyz_xyz"`, as in `jaxlie.SE3`, has the
+      quaternion first, and in it the scalar part w; `"xyz_xyzw"`, as in ROS `geometry_msgs/Pose`,
+      has the position first, and w last; also `"xyzw_xyz"` and `"xyz_wxyz"`.
 
-    **Raises** `ValueError` for another shape or frame, or for points in the frame of the body;
-    `TypeError` for another dtype. Starting a solve off the manifold by more than the root of a unit
+    **Raises** `ValueError` for another shape, frame or layout, or for points in the frame of the
+    body; `TypeError` for another dtype, or for shape `(7,)` without a layout, as a wrong guess
+    would go unnoticed. Starting a solve off the manifold by more than the root of a unit
     of rounding, in the square of the quaternion's length or in an entry of `R^T R`, is an error.
     """
 
@@ -159,10 +185,22 @@ class RigidMotion(AbstractMotion):
     omega: Float[Array, "*batch 3"] = eqx.field(converter=jnp.asarray)
     v: Float[Array, "*batch 3"] = eqx.field(converter=jnp.asarray)
     frame: Frame = eqx.field(static=True)
+    layout: Layout | None = eqx.field(static=True, default=None)
 
     dimension: ClassVar[int] = 3
     number: ClassVar[str] = "a unit quaternion"
     number_size: ClassVar[int] = 4
+    layouts: ClassVar[dict[str, tuple[int, ...]]] = {
+        "wxyz_xyz": (0, 1, 2, 3, 4, 5, 6),
+        "xyz_xyzw": (6, 3, 4, 5, 0, 1, 2),
+        "xyzw_xyz": (3, 0, 1, 2, 4, 5, 6),
+        "xyz_wxyz": (3, 4, 5, 6, 0, 1, 2),
+    }
+    conventions: ClassVar[str] = (
+        'layout="wxyz_xyz" (a quaternion, then a position, as in jaxlie.SE3), '
+        'layout="xyz_xyzw" (a position, then a quaternion, as in ROS geometry_msgs/Pose), '
+        '"xyzw_xyz" or "xyz_wxyz"'
+    )
     numerics: ClassVar[Any] = rigid_motion
 
 
@@ -172,8 +210,8 @@ class PlanarMotion(AbstractMotion):
     It acts on
 
     - a pose as a homogeneous matrix, `(3, 3)`: rotation and position, and (0, 0, 1) below;
-    - a pose as one vector, `(4,)`: cosine and sine of its angle, then the position: the layout of
-      `jaxlie.SE2`;
+    - a pose as one vector, `(4,)`: cosine and sine of its angle, and the position. `layout` says
+      which comes first;
     - a point, `(2,)`, in the fixed frame only.
 
     **Arguments:**
@@ -181,6 +219,8 @@ class PlanarMotion(AbstractMotion):
     - `omega`: shape `(*batch,)`, float32 or float64, in radians per unit of time.
     - `v`: shape `(*batch, 2)`, in lengths per unit of time.
     - `frame`: `"body"` or `"fixed"`.
+    - `layout`: needed for poses of shape `(4,)`: `"unit_complex_xy"`, as in `jaxlie.SE2`, or
+      `"xy_unit_complex"`, with the position first, as in Pinocchio's planar joint.
 
     Otherwise it is like `cfjax.RigidMotion`.
     """
@@ -189,10 +229,19 @@ class PlanarMotion(AbstractMotion):
     omega: Float[Array, "*batch"] = eqx.field(converter=jnp.asarray)
     v: Float[Array, "*batch 2"] = eqx.field(converter=jnp.asarray)
     frame: Frame = eqx.field(static=True)
+    layout: PlanarLayout | None = eqx.field(static=True, default=None)
 
     dimension: ClassVar[int] = 2
     number: ClassVar[str] = "a unit complex number"
     number_size: ClassVar[int] = 2
+    layouts: ClassVar[dict[str, tuple[int, ...]]] = {
+        "unit_complex_xy": (0, 1, 2, 3),
+        "xy_unit_complex": (2, 3, 0, 1),
+    }
+    conventions: ClassVar[str] = (
+        'layout="unit_complex_xy" (cosine and sine, then a position, as in jaxlie.SE2) or '
+        'layout="xy_unit_complex" (a position first, as in Pinocchio\'s planar joint)'
+    )
     numerics: ClassVar[Any] = planar_motion
 
 

@@ -11,28 +11,28 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Float
 
-from .quaternion import Order, check_choice, from_parts, parts
+from .quaternion import Layout, check_choice, from_parts, parts
 from .vectors import Vector, cross, is_rewritten, pack, smooth
 
 
 def quaternion_to_matrix(
-    q: Float[Array | np.ndarray, "*batch 4"], *, order: Order
+    q: Float[Array | np.ndarray, "*batch 4"], *, layout: Layout
 ) -> Float[Array, "*batch 3 3"]:
     """The rotation matrix of a quaternion: with `x_fixed = matrix @ x_body` for an attitude.
 
     It is the matrix of `q / |q|`, as a solver of linear spaces lets the length of q drift. So the
     derivative along q is zero. q and -q give the same matrix.
 
-    **Arguments:** `q`, shape `(*batch, 4)`, float32 or float64; `order`, `"wxyz"` or `"xyzw"`, how
+    **Arguments:** `q`, shape `(*batch, 4)`, float32 or float64; `layout`, `"wxyz"` or `"xyzw"`, how
     q is stored, where w is its scalar part.
 
     **Returns:** shape `(*batch, 3, 3)`.
 
-    **Raises** `ValueError` for another shape or order, `TypeError` for another dtype. A squared
+    **Raises** `ValueError` for another shape or layout, `TypeError` for another dtype. A squared
     length that differs from 1 by more than 0.1 (q = 0 is such a case) is an error; within a step of
     a small system it gives NaN. Divide such a q by its length.
     """
-    (w, x, y, z), c = _quaternion(q, order)
+    (w, x, y, z), c = _quaternion(q, layout)
     rows = [
         [1 - c * (y * y + z * z), c * (x * y - w * z), c * (x * z + w * y)],
         [c * (x * y + w * z), 1 - c * (x * x + z * z), c * (y * z - w * x)],
@@ -45,7 +45,7 @@ def quaternion_rotate(
     q: Float[Array | np.ndarray, "*#batch 4"],
     x: Float[Array | np.ndarray, "*#batch 3"],
     *,
-    order: Order,
+    layout: Layout,
 ) -> Float[Array, "*#batch 3"]:
     """A vector turned by a quaternion: `(0, x)` becomes `q (0, x) / q`.
 
@@ -53,14 +53,14 @@ def quaternion_rotate(
     length of x stays the same even if the length of q has drifted, as in `quaternion_to_matrix`.
 
     **Arguments:** `q`, shape `(*batch, 4)`, float32 or float64; `x`, shape `(*batch, 3)` and of the
-    same dtype, with as many axes; an axis of 1 is broadcast. `order` as in `quaternion_to_matrix`.
+    same dtype, with as many axes; an axis of 1 is broadcast. `layout` as in `quaternion_to_matrix`.
 
     **Returns:** shape `(*batch, 3)`.
 
     **Raises** as `quaternion_to_matrix`.
     """
     q, x = jnp.asarray(q), _array("x", x, (3,))
-    (w, *v), factor = _quaternion(q, order)
+    (w, *v), factor = _quaternion(q, layout)
     if x.dtype != q.dtype:
         raise TypeError(f"x must have the dtype of q, {q.dtype}, got {x.dtype}.")
     fits = x.ndim == q.ndim and all(
@@ -77,7 +77,7 @@ def quaternion_rotate(
 
 
 def quaternion_from_matrix(
-    matrix: Float[Array | np.ndarray, "*batch 3 3"], *, order: Order
+    matrix: Float[Array | np.ndarray, "*batch 3 3"], *, layout: Layout
 ) -> Float[Array, "*batch 4"]:
     """The unit quaternion of a rotation matrix, with a scalar part that is not negative.
 
@@ -85,21 +85,21 @@ def quaternion_from_matrix(
     that keep it orthogonal. Only at half turns, where the scalar part is zero and q jumps to -q,
     there is no derivative; cfjax returns the derivative from one side.
 
-    **Arguments:** `matrix`, shape `(*batch, 3, 3)`, float32 or float64; `order` as in
+    **Arguments:** `matrix`, shape `(*batch, 3, 3)`, float32 or float64; `layout` as in
     `quaternion_to_matrix`.
 
     **Returns:** shape `(*batch, 4)`, of length 1 to rounding.
 
-    **Raises** `ValueError` for another shape or order, `TypeError` for another dtype. A matrix that
-    is not orthogonal, by more than 1e-6 (float32: 3.5e-4) in an entry of `matrix.T @ matrix`, or
-    has determinant -1 is an error, except within a step of a small system. A solver of linear
+    **Raises** `ValueError` for another shape or layout, `TypeError` for another dtype. A matrix
+    that is not orthogonal, by more than 1e-6 (float32: 3.5e-4) in an entry of `matrix.T @ matrix`,
+    or has determinant -1 is an error, except within a step of a small system. A solver of linear
     spaces lets the matrix drift. The nearest rotation is then `u @ vh` for
     `u, _, vh = jnp.linalg.svd(matrix)`.
 
     Source: Shepperd, Quaternion from rotation matrix, J. Guid. Control 1 (1978),
     doi:10.2514/3.55767b.
     """
-    check_choice("order", order)
+    check_choice("layout", layout)
     m = _checked_matrix(_array("matrix", matrix, (3, 3)))
     (a, b, c), (d, e, f), (g, h, i) = ([m[..., j, k] for k in range(3)] for j in range(3))
     # The rows of 4 q q^T: each is q times four times one of its entries.
@@ -119,14 +119,14 @@ def quaternion_from_matrix(
     w, x, y, z = row
     length = jnp.sqrt(w * w + x * x + y * y + z * z)
     scale = jnp.where(w < 0, -1, 1).astype(m.dtype) / length
-    return from_parts((w * scale, x * scale, y * scale, z * scale), order)
+    return from_parts((w * scale, x * scale, y * scale, z * scale), layout)
 
 
 @smooth
-def _quaternion(q: Array | np.ndarray, order: Order) -> tuple[Vector, Array]:
+def _quaternion(q: Array | np.ndarray, layout: Layout) -> tuple[Vector, Array]:
     """The parts of q, and `2 / |q|^2`."""
-    check_choice("order", order)
-    w, x, y, z = parts(_array("q", q, (4,)), order)
+    check_choice("layout", layout)
+    w, x, y, z = parts(_array("q", q, (4,)), layout)
     # Without a division, at which XLA breaks a step of a small system into several functions: it
     # took 2.4 times as long. The product of all `1 + off^(2^k)` is `1 / (1 - off)`; of these four
     # it is so to rounding, and its derivative to 2e-14.

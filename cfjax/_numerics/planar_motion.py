@@ -14,20 +14,32 @@ import jax.numpy as jnp
 from jaxtyping import Array, Float
 
 from .stumpff import dexpinv_times, stumpff_1_to_3_apart
-from .vectors import Vector, entries, pack, plus
+from .vectors import Vector, entries, pack, placed, plus
 
 
-@functools.partial(jax.jit, static_argnames="frame")
+@functools.partial(jax.jit, static_argnames=("frame", "places"))
 def tangent(
-    w: Float[Array, ""], v: Float[Array, "2"], x: Float[Array, "..."], frame: str
+    w: Float[Array, ""],
+    v: Float[Array, "2"],
+    x: Float[Array, "..."],
+    frame: str,
+    places: tuple[int, ...],
 ) -> Float[Array, "..."]:
-    """The velocity of `x`: a point, shape `(2,)`, or a pose, shape `(3, 3)` or `(4,)`."""
-    return _moved(lambda w, u: u, _times_i, w, v, x, frame)
+    """The velocity of `x`: a point, shape `(2,)`, or a pose, shape `(3, 3)` or `(4,)`.
+
+    A pose in one vector has cosine and sine and x, y of its position at `places`.
+    """
+    return _moved(lambda w, u: u, _times_i, w, v, x, frame, places)
 
 
-@functools.partial(jax.jit, static_argnames=("frame", "leads_back"))
+@functools.partial(jax.jit, static_argnames=("frame", "places", "leads_back"))
 def increment(
-    w: Float[Array, ""], v: Float[Array, "2"], x: Float[Array, "..."], frame: str, leads_back: bool
+    w: Float[Array, ""],
+    v: Float[Array, "2"],
+    x: Float[Array, "..."],
+    frame: str,
+    places: tuple[int, ...],
+    leads_back: bool,
 ) -> Float[Array, "..."]:
     """What `x` moves by in unit time, with a rounding as small as it is.
 
@@ -35,10 +47,13 @@ def increment(
     """
     exponential = stumpff_1_to_3_apart(w * w)
 
+    def way(w: Array, u: Vector) -> Vector:
+        return exponential.increment(u, _times_i(w, u))
+
     def turned(w: Array, z: Vector) -> Vector:
         return exponential.turned(w * w, z, _times_i(w, z), leads_back)
 
-    return _moved(lambda w, u: exponential.increment(u, _times_i(w, u)), turned, w, v, x, frame)
+    return _moved(way, turned, w, v, x, frame, places)
 
 
 @jax.jit
@@ -66,6 +81,7 @@ def _moved(
     v: Array,
     x: Array,
     frame: str,
+    places: tuple[int, ...],
 ) -> Array:
     """What `x` moves by, where `way` makes it of a velocity that turns with w.
 
@@ -77,17 +93,18 @@ def _moved(
         r0, r1 = x[:, 0], x[:, 1]
         v0, v1 = way(w, vs)
         return pack([*way(-w, _times_i(-w, [r0, r1])), r0 * v0 + r1 * v1], axis=1, sums=True)
-    numbers = entries(x)
     if x.ndim == 2:
-        *rows, last = numbers
+        *rows, last = entries(x)
         u = plus(_times_i(w, rows), [last * a for a in vs])
         return pack([*way(w, u), jnp.zeros_like(last)], sums=True)
-    z, place = numbers[:-2], numbers[-2:]
+    if x.shape == (2,):
+        return pack(way(w, plus(_times_i(w, entries(x)), vs)), sums=True)
+    z, place = [x[k] for k in places[:2]], [x[k] for k in places[2:]]
     if frame == "fixed":
         u = plus(_times_i(w, place), vs)
     else:
         u = plus([z[0] * a for a in vs], _times_i(z[1], vs))
-    return pack([*(turned(w, z) if z else []), *way(w, u)], sums=True)
+    return pack(placed([*turned(w, z), *way(w, u)], places), sums=True)
 
 
 def _times_i(w: Any, x: Vector) -> Vector:

@@ -11,48 +11,48 @@ from .vectors import Vector, cross, dot, pack
 
 # In which frame a vector is given, and where the scalar part of a quaternion is stored.
 Frame = Literal["body", "fixed"]
-Order = Literal["wxyz", "xyzw"]
-_CHOICES = {"frame": ("body", "fixed"), "order": ("wxyz", "xyzw")}
+Layout = Literal["wxyz", "xyzw"]
+_CHOICES = {"frame": ("body", "fixed"), "layout": ("wxyz", "xyzw")}
 
 
 def check_choice(name: str, value: Any) -> None:
-    """Raises `ValueError` if `value` is not a frame or an order; `name` says which it should be."""
+    """Raises `ValueError` if `value` is not a frame or a layout; `name` says which it should be."""
     choices = _CHOICES[name]
     if value not in choices:
         raise ValueError(f"{name} must be {choices[0]!r} or {choices[1]!r}, got {value!r}.")
 
 
-def parts(q: Float[Array, "*batch 4"], order: Order) -> Vector:
+def parts(q: Float[Array, "*batch 4"], layout: Layout) -> Vector:
     """The scalar part and the three others."""
-    return [q[..., k] for k in ((0, 1, 2, 3) if order == "wxyz" else (3, 0, 1, 2))]
+    return [q[..., k] for k in ((0, 1, 2, 3) if layout == "wxyz" else (3, 0, 1, 2))]
 
 
-def from_parts(q: Vector, order: Order) -> Float[Array, "*batch 4"]:
+def from_parts(q: Vector, layout: Layout) -> Float[Array, "*batch 4"]:
     """The reverse of `parts`."""
     w, x, y, z = q
-    return pack((w, x, y, z) if order == "wxyz" else (x, y, z, w), axis=w.ndim, sums=True)
+    return pack((w, x, y, z) if layout == "wxyz" else (x, y, z, w), axis=w.ndim, sums=True)
 
 
 def times(
-    omega: Float[Array, "3"], q: Float[Array, "4"], frame: Frame, order: Order
+    omega: Float[Array, "3"], q: Float[Array, "4"], frame: Frame, layout: Layout
 ) -> Float[Array, "4"]:
     """The product of `omega / 2` with q from the left ("fixed") or from the right ("body")."""
-    return from_parts(product(half(omega), parts(q, order), frame), order)
+    return from_parts(product(half(omega), parts(q, layout), frame), layout)
 
 
 # One trace for the many flows of a step.
-@partial(jax.jit, static_argnames=("frame", "order", "leads_back"))
+@partial(jax.jit, static_argnames=("frame", "layout", "leads_back"))
 def increment(
-    omega: Float[Array, "3"], q: Float[Array, "4"], frame: Frame, order: Order, leads_back: bool
+    omega: Float[Array, "3"], q: Float[Array, "4"], frame: Frame, layout: Layout, leads_back: bool
 ) -> Float[Array, "4"]:
     """The product of `exp(omega / 2)` with q, from the side that `times` says, less q.
 
     Its rounding is as small as it is. It may lead the length of q back to 1.
     """
-    a, p = half(omega), parts(q, order)
+    a, p = half(omega), parts(q, layout)
     s = dot(a, a)
     exponential = stumpff_1_to_3_apart(s)
-    return from_parts(exponential.turned(s, p, product(a, p, frame), leads_back), order)
+    return from_parts(exponential.turned(s, p, product(a, p, frame), leads_back), layout)
 
 
 def half(omega: Any) -> Vector:

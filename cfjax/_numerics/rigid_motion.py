@@ -16,20 +16,32 @@ from jaxtyping import Array, Float
 from . import rotate
 from .quaternion import half, product
 from .stumpff import Exponential, stumpff_1_to_3_apart
-from .vectors import Vector, cross, dot, entries, pack, plus
+from .vectors import Vector, cross, dot, entries, pack, placed, plus
 
 
-@functools.partial(jax.jit, static_argnames="frame")
+@functools.partial(jax.jit, static_argnames=("frame", "places"))
 def tangent(
-    w: Float[Array, "3"], v: Float[Array, "3"], x: Float[Array, "..."], frame: str
+    w: Float[Array, "3"],
+    v: Float[Array, "3"],
+    x: Float[Array, "..."],
+    frame: str,
+    places: tuple[int, ...],
 ) -> Float[Array, "..."]:
-    """The velocity of `x`: a point, shape `(3,)`, or a pose, shape `(4, 4)` or `(7,)`."""
-    return _moved(entries(w), entries(v), x, frame)
+    """The velocity of `x`: a point, shape `(3,)`, or a pose, shape `(4, 4)` or `(7,)`.
+
+    A pose in one vector has w, x, y, z of its quaternion and x, y, z of its position at `places`.
+    """
+    return _moved(entries(w), entries(v), x, frame, places)
 
 
-@functools.partial(jax.jit, static_argnames=("frame", "leads_back"))
+@functools.partial(jax.jit, static_argnames=("frame", "places", "leads_back"))
 def increment(
-    w: Float[Array, "3"], v: Float[Array, "3"], x: Float[Array, "..."], frame: str, leads_back: bool
+    w: Float[Array, "3"],
+    v: Float[Array, "3"],
+    x: Float[Array, "..."],
+    frame: str,
+    places: tuple[int, ...],
+    leads_back: bool,
 ) -> Float[Array, "..."]:
     """What `x` moves by in unit time, with a rounding as small as it is.
 
@@ -38,7 +50,7 @@ def increment(
     ws = entries(w)
     if x.shape != (7,):
         exponential = stumpff_1_to_3_apart(dot(ws, ws))
-        return _moved(ws, entries(v), x, frame, exponential)
+        return _moved(ws, entries(v), x, frame, places, exponential)
     # A quaternion turns by half of the angle.
     s = dot(half(ws), half(ws))
     of_half = stumpff_1_to_3_apart(s)
@@ -46,7 +58,7 @@ def increment(
     def turned(q: Vector, once: Vector) -> Vector:
         return of_half.turned(s, q, once, leads_back)
 
-    return _moved(ws, entries(v), x, frame, _doubled(s, of_half), turned)
+    return _moved(ws, entries(v), x, frame, places, _doubled(s, of_half), turned)
 
 
 @jax.jit
@@ -76,6 +88,7 @@ def _moved(
     v: Vector,
     x: Array,
     frame: str,
+    places: tuple[int, ...],
     exponential: Exponential | None = None,
     turned: Callable[[Vector, Vector], Vector] = lambda q, once: once,
 ) -> Array:
@@ -86,12 +99,13 @@ def _moved(
     if x.shape == (3,):
         return pack(_along_screw(exponential, w, v, entries(x), 1), sums=True)
     if x.ndim == 1:
-        q, place = entries(x)[:4], entries(x)[4:]
+        q, place = [x[k] for k in places[:4]], [x[k] for k in places[4:]]
         if frame == "fixed":
             moved = _along_screw(exponential, w, v, place, 1)
         else:
             moved = _rotated(q, _way(exponential, w, v))
-        return pack([*turned(q, product(half(w), q, frame)), *moved], sums=True)
+        turned_q = turned(q, product(half(w), q, frame))
+        return pack(placed([*turned_q, *moved], places), sums=True)
     if frame == "fixed":
         *rows, last = entries(x)
         moved = _along_screw(exponential, w, v, rows, last)

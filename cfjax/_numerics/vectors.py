@@ -23,6 +23,11 @@ def entries(x: Float[Array, "n *k"]) -> list[Array]:
     return [x[k] for k in range(x.shape[0])]
 
 
+def placed(entries: Vector, places: Sequence[int]) -> Vector:
+    """Each entry at its place: `[x[k] for k in places]` has them in order again."""
+    return [entries[places.index(k)] for k in range(len(places))]
+
+
 def cross(a: Vector, b: Vector) -> Vector:
     """The cross product of two vectors of three entries."""
     return [

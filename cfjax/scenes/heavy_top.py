@@ -91,9 +91,9 @@ def field(t: Any, y: State, args: Top) -> dict[str, Any]:
     """The frozen field."""
     q, x = y["pose"][:4], y["pose"][4:]
     omega = angular_velocity(y, args)
-    center = jnp.asarray(args.center, q.dtype)
+    v = jnp.cross(omega, jnp.asarray(args.center, q.dtype))
     return {
-        "pose": RigidMotion(omega=omega, v=jnp.cross(omega, center), frame="body"),
+        "pose": RigidMotion(omega=omega, v=v, frame="body", layout="wxyz_xyz"),
         "m": jnp.cross(x, _weight(args, q.dtype)),
     }
 
@@ -115,7 +115,7 @@ def velocity(t: Any, y: State, args: Top) -> dict[str, Any]:
 def angular_velocity(y: State, args: Top) -> Float[Array, "*times 3"]:
     """The angular velocity omega, in the body."""
     q = y["pose"][..., :4]
-    momentum = quaternion_rotate(_conjugate(q), y["m"], order="wxyz")
+    momentum = quaternion_rotate(_conjugate(q), y["m"], layout="wxyz")
     return momentum / jnp.broadcast_to(jnp.asarray(args.inertia, q.dtype), momentum.shape)
 
 
@@ -136,7 +136,7 @@ def pivot(y: State, args: Top) -> Float[Array | np.ndarray, "*times 3"]:
     """Where the pose puts the point of the body that should stay at zero."""
     q, x = y["pose"][..., :4], y["pose"][..., 4:]
     center = jnp.broadcast_to(jnp.asarray(args.center, q.dtype), x.shape)
-    return x - quaternion_rotate(q, center, order="wxyz")
+    return x - quaternion_rotate(q, center, layout="wxyz")
 
 
 def reference(t: float, start: State | None = None, args: Top = benchmark) -> State:
@@ -245,7 +245,7 @@ def picture() -> "Figure":
         found = integrate(term, solver, 0.0, 5.6, start, benchmark, num_steps=5600, save_every=10)
         poses = np.asarray(found.ys["pose"])  # type: ignore
         path, end = poses[:, 4:], poses[-1, 4:]
-        rotation = np.asarray(quaternion_to_matrix(poses[-1, :4], order="wxyz"))
+        rotation = np.asarray(quaternion_to_matrix(poses[-1, :4], layout="wxyz"))
         ax: Any = figure.add_subplot(1, 3, k, projection="3d", computed_zorder=False)
         ax.plot_wireframe(*dome, color="0.88", linewidth=0.5, zorder=0)
         for part, colours in parts:

@@ -55,13 +55,13 @@ def field(t: Any, y: Pose, args: Readings) -> PlanarMotion:
     """The frozen field without noise: constant in the frame of the vehicle."""
     forwards = jnp.asarray([1.0, 0.0], y.dtype)
     turn = jnp.asarray(args.turn, y.dtype)
-    return PlanarMotion(omega=turn, v=args.speed * forwards, frame="body")
+    return PlanarMotion(omega=turn, v=args.speed * forwards, frame="body", layout="unit_complex_xy")
 
 
 def noise(t: Any, y: Pose, args: Readings, increment: Float[Array, "3"]) -> PlanarMotion:
     """The frozen field that an increment of Brownian motion causes."""
     turn, *v = jnp.asarray([args.turn_noise, args.speed_noise, args.slip], y.dtype) * increment
-    return PlanarMotion(omega=turn, v=jnp.stack(v), frame="body")
+    return PlanarMotion(omega=turn, v=jnp.stack(v), frame="body", layout="unit_complex_xy")
 
 
 def term(key: Key[Array, ""]) -> diffrax.MultiTerm:

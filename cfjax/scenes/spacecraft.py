@@ -67,7 +67,7 @@ def field(t: Any, y: State, args: Craft) -> dict[str, Any]:
     fires = (t >= args.on) & (t < args.off)
     torque = jnp.where(fires, jnp.asarray(args.torque, omega.dtype), 0)
     return {
-        "q": QuaternionRotation(omega, frame="body", order="wxyz"),
+        "q": QuaternionRotation(omega, frame="body", layout="wxyz"),
         "m": RigidMotion(omega=-omega, v=torque, frame="fixed"),
     }
 
@@ -89,7 +89,7 @@ def energy(y: State, args: Craft) -> Float[Array, "*times"]:
 
 def fixed_momentum(y: State) -> Float[Array, "*times 3"]:
     """The angular momentum in the fixed frame."""
-    return quaternion_rotate(jnp.asarray(y["q"]), jnp.asarray(y["m"]), order="wxyz")
+    return quaternion_rotate(jnp.asarray(y["q"]), jnp.asarray(y["m"]), layout="wxyz")
 
 
 def reference(t: float | Float[np.ndarray, "*times"]) -> State:
@@ -180,7 +180,7 @@ def picture() -> "Figure":
     sol = integrate(term, solver, t0, t1, y0(), Craft(), num_steps=800, save_every=1)
     ys: Any = sol.ys
     middle = jnp.broadcast_to(jnp.asarray([0.0, 1.0, 0.0], ys["q"].dtype), ys["m"].shape)
-    path = np.asarray(quaternion_rotate(ys["q"], middle, order="wxyz"))
+    path = np.asarray(quaternion_rotate(ys["q"], middle, layout="wxyz"))
     figure = Figure((9.0, 4.2), layout="constrained")
     sphere: Any = figure.add_subplot(1, 2, 1, projection="3d")
     longitude, latitude = np.mgrid[0 : 2 * np.pi : 25j, 0 : np.pi : 13j]

@@ -125,13 +125,13 @@ CASES = {
         lambda x, omega: (columns(hat(omega), 2), 0),
     ),
     "QuaternionRotation, body": Case(
-        partial(cfjax.QuaternionRotation, frame="body", order="wxyz"),
+        partial(cfjax.QuaternionRotation, frame="body", layout="wxyz"),
         lambda: unit(omega=normal(3)),
         unit(q=normal(4))["q"],
         lambda x, omega: (quaternions(-hat(omega), omega) / 2, 0),
     ),
     "QuaternionRotation, fixed": Case(
-        partial(cfjax.QuaternionRotation, frame="fixed", order="xyzw"),
+        partial(cfjax.QuaternionRotation, frame="fixed", layout="xyzw"),
         lambda: unit(omega=normal(3)),
         unit(q=normal(4))["q"],
         lambda x, omega: (np.roll(quaternions(hat(omega), omega), -1, (0, 1)) / 2, 0),
@@ -149,12 +149,12 @@ CASES = {
         lambda x, omega, v: (columns(screw(hat(omega), v), 4), 0),
     ),
     "RigidMotion of a quaternion and a position": Case(
-        partial(cfjax.RigidMotion, frame="fixed"),
+        partial(cfjax.RigidMotion, frame="fixed", layout="xyz_xyzw"),
         lambda: unit(omega=normal(3), v=normal(3)),
         normal(7),
         lambda x, omega, v: (
-            block_diagonal(quaternions(hat(omega), omega) / 2, hat(omega)),
-            np.concatenate([0 * x[:4], v]),
+            block_diagonal(hat(omega), np.roll(quaternions(hat(omega), omega), -1, (0, 1)) / 2),
+            np.concatenate([v, 0 * x[3:]]),
         ),
     ),
     "RigidMotion of a point": Case(

@@ -196,14 +196,16 @@ EMPTY = {name: FIELDS[name][0] for name in ("LeftMatrix", *FIELDS)} | {
     "Congruence without source": lambda t, x: of_matrices(cfjax.Congruence, x, t),
     "RightMatrix of long vectors": lambda t, x: cfjax.RightMatrix(jnp.outer(x, jnp.cos(x + t))),
     "QuaternionRotation": lambda t, x: cfjax.QuaternionRotation(
-        jnp.cos(t) * x[:3], frame="body", order="wxyz"
+        jnp.cos(t) * x[:3], frame="body", layout="wxyz"
     ),
-    "RigidMotion": lambda t, x: cfjax.RigidMotion(omega=jnp.cos(t) * x[:3], v=x[4:], frame="body"),
+    "RigidMotion": lambda t, x: cfjax.RigidMotion(
+        omega=jnp.cos(t) * x[:3], v=x[4:], frame="body", layout="wxyz_xyz"
+    ),
     "RigidMotion of matrices": lambda t, x: cfjax.RigidMotion(
         omega=jnp.cos(t) * x[0, :3], v=x[:3, 3], frame="fixed"
     ),
     "PlanarMotion": lambda t, x: cfjax.PlanarMotion(
-        omega=jnp.cos(t) * x[0], v=x[2:], frame="fixed"
+        omega=jnp.cos(t) * x[0], v=x[2:], frame="fixed", layout="unit_complex_xy"
     ),
     "translation": lambda t, x: jnp.cos(t) * x,
 }

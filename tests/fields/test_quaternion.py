@@ -1,4 +1,4 @@
-"""QuaternionRotation: the flow and its derivatives, what frame and order mean, lengths, errors."""
+"""QuaternionRotation: the flow and its derivatives, what frame and layout mean, lengths, errors."""
 
 from functools import partial
 
@@ -18,7 +18,7 @@ ANGLES = np.array([0, 1e-160, 1e-12, 1e-4, 0.1, 1, np.pi, 2 * np.pi, 4 * np.pi, 
 AXIS = np.array([2.0, -3.0, 6.0]) / 7
 OMEGAS = ANGLES[:, None] * AXIS
 Q = np.array([1.0, -3.0, 5.0, 1.0]) / 6
-KINDS = [(frame, order) for frame in ("body", "fixed") for order in ("wxyz", "xyzw")]
+KINDS = [(frame, layout) for frame in ("body", "fixed") for layout in ("wxyz", "xyzw")]
 
 
 def hamilton(p, q):
@@ -32,11 +32,11 @@ def hamilton(p, q):
     return product
 
 
-def generators(frame, order):
+def generators(frame, layout):
     """The matrices of q -> (0, e) q / 2, or q (0, e) / 2, for the three unit vectors e."""
     one = np.eye(4)
     sides = (lambda e, q: hamilton(e, q)) if frame == "fixed" else (lambda e, q: hamilton(q, e))
-    place = [0, 1, 2, 3] if order == "wxyz" else [1, 2, 3, 0]
+    place = [0, 1, 2, 3] if layout == "wxyz" else [1, 2, 3, 0]
     matrices = [np.stack([sides(e, q) / 2 for q in one], axis=1) for e in one[1:]]
     return np.stack([m[place][:, place] for m in matrices])
 
@@ -85,26 +85,26 @@ def hessian(omega, a, q):
     return np.stack(slices, axis=-1)
 
 
-def stored(q, order):
-    """A quaternion whose scalar part comes first, in some order."""
-    return q if order == "wxyz" else np.roll(q, -1, axis=-1)
+def stored(q, layout):
+    """A quaternion whose scalar part comes first, in a layout."""
+    return q if layout == "wxyz" else np.roll(q, -1, axis=-1)
 
 
-def flow(omega, q, frame, order):
-    return QuaternionRotation(omega, frame=frame, order=order).flow(q)
+def flow(omega, q, frame, layout):
+    return QuaternionRotation(omega, frame=frame, layout=layout).flow(q)
 
 
 @jax.jit
 def flows(omegas, q):
     return [
-        jax.vmap(partial(flow, frame=frame, order=order), in_axes=(0, None))(omegas, q)
-        for frame, order in KINDS
+        jax.vmap(partial(flow, frame=frame, layout=layout), in_axes=(0, None))(omegas, q)
+        for frame, layout in KINDS
     ]
 
 
 def test_flow_against_the_closed_form():
-    for (frame, order), ends in zip(KINDS, flows(OMEGAS, Q), strict=True):
-        a = generators(frame, order)
+    for (frame, layout), ends in zip(KINDS, flows(OMEGAS, Q), strict=True):
+        a = generators(frame, layout)
         for angle, omega, y in zip(ANGLES, OMEGAS, ends, strict=True):
             want = to_numpy(exact(omega, a)[0]) @ Q
             # Half the angle is known to a unit of rounding of itself; the formula adds a few.
@@ -113,9 +113,9 @@ def test_flow_against_the_closed_form():
 
 def test_flow_in_float32():
     omegas, q = OMEGAS.astype(np.float32), Q.astype(np.float32)
-    for (frame, order), ends in zip(KINDS, flows(omegas, q), strict=True):
+    for (frame, layout), ends in zip(KINDS, flows(omegas, q), strict=True):
         assert ends.dtype == np.float32
-        a = generators(frame, order)
+        a = generators(frame, layout)
         for omega, y in zip(omegas, ends, strict=True):
             angle = float(np.linalg.norm(omega.astype(float)))
             # The reference gets the rounded inputs, so the angle's rounding counts once.
@@ -124,8 +124,8 @@ def test_flow_in_float32():
 
 
 def test_flow_against_scipy():
-    for (frame, order), ends in zip(KINDS, flows(OMEGAS, Q), strict=True):
-        matrices = np.tensordot(OMEGAS, generators(frame, order), 1)
+    for (frame, layout), ends in zip(KINDS, flows(OMEGAS, Q), strict=True):
+        matrices = np.tensordot(OMEGAS, generators(frame, layout), 1)
         for angle, matrix, y in zip(ANGLES, matrices, ends, strict=True):
             # scipy scales and squares: a unit of rounding for every unit of the norm, and more.
             atol = 40 * EPS * (1 + angle)
@@ -135,7 +135,7 @@ def test_flow_against_scipy():
 @jax.jit
 @jax.vmap
 def first_derivatives(omega):
-    ends = partial(flow, frame="fixed", order="wxyz"), partial(flow, frame="body", order="xyzw")
+    ends = partial(flow, frame="fixed", layout="wxyz"), partial(flow, frame="body", layout="xyzw")
     modes = jax.jacfwd, jax.jacrev
     return [mode(end, argnums=(0, 1))(omega, Q) for mode, end in zip(modes, ends, strict=True)]
 
@@ -156,7 +156,7 @@ def test_first_derivatives():
 def test_second_derivatives(outer):
     angles = np.array([0.0, 1e-8, 1.0, np.pi, 2 * np.pi, 50.0])
     omegas = np.outer(angles, AXIS)
-    end = partial(flow, q=jnp.asarray(Q), frame="body", order="wxyz")
+    end = partial(flow, q=jnp.asarray(Q), frame="body", layout="wxyz")
     found = jax.jit(jax.vmap(outer(jax.jacrev(end))))(omegas)
     a = generators("body", "wxyz")
     for angle, omega, second in zip(angles, omegas, found, strict=True):
@@ -171,12 +171,12 @@ def test_second_derivatives(outer):
 def test_the_zero_field_is_the_identity_exactly():
     for ends in flows(OMEGAS, Q):
         np.testing.assert_array_equal(ends[0], Q)
-    field = QuaternionRotation(np.zeros(3), frame="body", order="wxyz")
+    field = QuaternionRotation(np.zeros(3), frame="body", layout="wxyz")
     np.testing.assert_array_equal(field.increment(jnp.asarray(Q)), np.zeros(4))
     np.testing.assert_array_equal(field.tangent(jnp.asarray(Q)), np.zeros(4))
 
 
-# What frame and order mean
+# What frame and layout mean
 
 
 def hat(w):
@@ -188,23 +188,23 @@ def hat(w):
 def attitudes(omega):
     """An end in each way of storing it, as a matrix, and back from there; and as matrices move."""
     found = []
-    for frame, order in KINDS:
-        q = jnp.asarray(stored(Q, order))
-        end = flow(omega, q, frame, order)
-        before, after = (cfjax.quaternion_to_matrix(p, order=order) for p in (q, end))
+    for frame, layout in KINDS:
+        q = jnp.asarray(stored(Q, layout))
+        end = flow(omega, q, frame, layout)
+        before, after = (cfjax.quaternion_to_matrix(p, layout=layout) for p in (q, end))
         a = jnp.cross(jnp.eye(3), omega[None])
         along = cfjax.Rotation(omega) if frame == "fixed" else cfjax.RightMatrix(a)
-        back = cfjax.quaternion_from_matrix(after, order=order)
+        back = cfjax.quaternion_from_matrix(after, layout=layout)
         found.append((end, back, after, along.flow(before)))
     return found
 
 
 def test_attitude_matrices_move_alike():
     found = attitudes(2.5 * AXIS)
-    for (_, order), (end, back, after, alike) in zip(KINDS, found, strict=True):
+    for (_, layout), (end, back, after, alike) in zip(KINDS, found, strict=True):
         # Entries of at most 1, each a sum of a few terms.
         np.testing.assert_allclose(after, alike, rtol=0, atol=20 * EPS)
-        sign = np.sign(end[0 if order == "wxyz" else 3])
+        sign = np.sign(end[0 if layout == "wxyz" else 3])
         np.testing.assert_allclose(back, sign * end, rtol=0, atol=10 * EPS)
     (body, *_), (body_last, *_), (fixed, *_), (fixed_last, *_) = found
     np.testing.assert_array_equal(stored(body, "xyzw"), body_last)
@@ -229,9 +229,9 @@ def test_group():
 def test_bracket(frame):
     rng = np.random.default_rng(0)
     v, w = rng.normal(size=(2, 3))
-    make = partial(QuaternionRotation, frame=frame, order="xyzw")
+    make = partial(QuaternionRotation, frame=frame, layout="xyzw")
     found = make(v).bracket(make(w))
-    assert (found.frame, found.order) == (frame, "xyzw")
+    assert (found.frame, found.layout) == (frame, "xyzw")
     a, b, c = (np.tensordot(x, generators(frame, "xyzw"), 1) for x in (v, w, found.omega))
     # Linear fields, so DX_a X_b - DX_b X_a is a product of matrices; sums of few terms.
     np.testing.assert_allclose(c, a @ b - b @ a, rtol=0, atol=10 * EPS)
@@ -239,19 +239,19 @@ def test_bracket(frame):
 
 @pytest.mark.representatives(1)
 @pytest.mark.parametrize(
-    ("frame", "order", "batch"),
+    ("frame", "layout", "batch"),
     [
         pytest.param("body", "wxyz", (), marks=pytest.mark.slow),
         ("fixed", "xyzw", ()),
         ("body", "wxyz", (2, 3)),
     ],
 )
-def test_fields_keep_their_promises(frame, order, batch):
+def test_fields_keep_their_promises(frame, layout, batch):
     rng = np.random.default_rng(1)
     q = rng.normal(size=(*batch, 4))
     q /= np.linalg.norm(q, axis=-1, keepdims=True)
     omegas = rng.normal(size=(3, *batch, 3))
-    fields = [QuaternionRotation(omega, frame=frame, order=order) for omega in omegas]
+    fields = [QuaternionRotation(omega, frame=frame, layout=layout) for omega in omegas]
     cfjax.check_field(fields, q)
 
 
@@ -263,8 +263,8 @@ NAMES = ("flow", "increment", "tangent")
 
 @jax.jit
 def on_axes(omega, q):
-    field = QuaternionRotation(omega, frame="body", order="wxyz")
-    other = QuaternionRotation(q[..., 1:], frame="body", order="wxyz")
+    field = QuaternionRotation(omega, frame="body", layout="wxyz")
+    other = QuaternionRotation(q[..., 1:], frame="body", layout="wxyz")
     return field.bracket(other).omega, *(getattr(field, name)(q) for name in NAMES)
 
 
@@ -287,7 +287,7 @@ def test_every_element_moves_as_it_does_alone():
     q /= jnp.linalg.norm(q, axis=-1, keepdims=True)
 
     def field(t, q, args):
-        return QuaternionRotation(jnp.sin(2 * q[..., 1:] + t), frame="fixed", order="wxyz")
+        return QuaternionRotation(jnp.sin(2 * q[..., 1:] + t), frame="fixed", layout="wxyz")
 
     def end(q):
         term = cfjax.LieTerm(field)
@@ -306,7 +306,7 @@ def back(omega, q):
     """What an increment has more than the flow, and its derivative."""
 
     def more(q):
-        field = QuaternionRotation(omega, frame="fixed", order="wxyz")
+        field = QuaternionRotation(omega, frame="fixed", layout="wxyz")
         return field.increment(q) - (field.flow(q) - q)
 
     return more(q), jax.jacfwd(more)(q)
@@ -332,7 +332,7 @@ def test_the_length_is_kept_over_many_steps(h, dtype):
     omega = jnp.asarray([0.3, 0.7, 1.1], dtype)
 
     def field(t, q, args):
-        return QuaternionRotation(omega * jnp.sin(3 * q[1:] + t), frame="body", order="wxyz")
+        return QuaternionRotation(omega * jnp.sin(3 * q[1:] + t), frame="body", layout="wxyz")
 
     n = 100_000
     term, q = cfjax.LieTerm(field), jnp.asarray(Q, dtype)
@@ -348,9 +348,9 @@ def test_the_length_is_kept_over_many_steps(h, dtype):
 
 def test_a_step_with_a_check_of_its_quaternion_is_taken_apart(rewritten):
     def field(t, y, args):
-        down = cfjax.quaternion_rotate(y["q"], jnp.array([0.0, 0.0, -1.0]), order="wxyz")
-        rotation = QuaternionRotation(y["m"], frame="body", order="wxyz")
-        return {"q": rotation, "m": cfjax.quaternion_to_matrix(y["q"], order="wxyz") @ down}
+        down = cfjax.quaternion_rotate(y["q"], jnp.array([0.0, 0.0, -1.0]), layout="wxyz")
+        rotation = QuaternionRotation(y["m"], frame="body", layout="wxyz")
+        return {"q": rotation, "m": cfjax.quaternion_to_matrix(y["q"], layout="wxyz") @ down}
 
     def end(y0):
         term = cfjax.LieTerm(field)
@@ -366,9 +366,9 @@ def test_a_step_with_a_check_of_its_quaternion_is_taken_apart(rewritten):
 @pytest.mark.parametrize(
     ("kinds", "text"),
     [
-        ({}, "missing 2 required keyword-only arguments: 'frame' and 'order'"),
-        ({"frame": "body"}, "missing 1 required keyword-only argument: 'order'"),
-        ({"order": "wxyz"}, "missing 1 required keyword-only argument: 'frame'"),
+        ({}, "missing 2 required keyword-only arguments: 'frame' and 'layout'"),
+        ({"frame": "body"}, "missing 1 required keyword-only argument: 'layout'"),
+        ({"layout": "wxyz"}, "missing 1 required keyword-only argument: 'frame'"),
     ],
 )
 def test_frame_and_order_have_no_default(kinds, text, no_shape_hook):
@@ -377,32 +377,32 @@ def test_frame_and_order_have_no_default(kinds, text, no_shape_hook):
 
 
 @pytest.mark.parametrize(
-    ("frame", "order", "text"),
+    ("frame", "layout", "text"),
     [
         ("left", "wxyz", "frame must be 'body' or 'fixed', got 'left'"),
-        ("body", "wxzy", "order must be 'wxyz' or 'xyzw', got 'wxzy'"),
-        ("body", None, "order must be 'wxyz' or 'xyzw', got None"),
+        ("body", "wxzy", "layout must be 'wxyz' or 'xyzw', got 'wxzy'"),
+        ("body", None, "layout must be 'wxyz' or 'xyzw', got None"),
     ],
 )
-def test_wrong_frame_and_order(frame, order, text, no_shape_hook):
+def test_wrong_frame_and_order(frame, layout, text, no_shape_hook):
     with pytest.raises(ValueError, match=text):
-        QuaternionRotation(np.ones(3), frame=frame, order=order)
+        QuaternionRotation(np.ones(3), frame=frame, layout=layout)
 
 
 @pytest.mark.parametrize("shape", [(4,), (3, 1), (), (0,)])
 def test_wrong_shape(shape):
     with pytest.raises(ValueError, match=r"omega must have shape \(3,\) or \(\*batch, 3\), got"):
-        QuaternionRotation(np.ones(shape), frame="body", order="wxyz")
+        QuaternionRotation(np.ones(shape), frame="body", layout="wxyz")
 
 
 @pytest.mark.parametrize("dtype", [np.int32, np.float16, np.complex128])
 def test_wrong_dtype(dtype):
     with pytest.raises(TypeError, match="omega must be float32 or float64, got"):
-        QuaternionRotation(jnp.ones(3, dtype), frame="body", order="wxyz")
+        QuaternionRotation(jnp.ones(3, dtype), frame="body", layout="wxyz")
 
 
 def test_wrong_point(no_shape_hook):
-    field = QuaternionRotation(np.ones(3), frame="body", order="wxyz")
+    field = QuaternionRotation(np.ones(3), frame="body", layout="wxyz")
     for name in ("flow", "increment", "tangent"):
         with pytest.raises(ValueError, match=r"acts on shapes \(4,\), got \(3,\)"):
             getattr(field, name)(jnp.ones(3))
@@ -416,17 +416,17 @@ def test_wrong_point(no_shape_hook):
 
 
 def test_kinds_are_not_mixed():
-    fields = [QuaternionRotation(np.ones(3), frame=f, order=o) for f, o in KINDS]
+    fields = [QuaternionRotation(np.ones(3), frame=f, layout=o) for f, o in KINDS]
     text = "must agree in all but arrays, got QuaternionRotation.*'body'.* and Quaternion.*'fixed'"
     with pytest.raises(TypeError, match=text):
         cfjax.combine((1.0, 1.0), (fields[0], fields[2]))
-    with pytest.raises(TypeError, match=r"got .*order='wxyz'\) and .*order='xyzw'\)"):
+    with pytest.raises(TypeError, match=r"got .*layout='wxyz'\) and .*layout='xyzw'\)"):
         cfjax.combine((1.0, 1.0), (fields[0], fields[1]))
     terms = diffrax.MultiTerm(*(cfjax.LieTerm(lambda t, y, a, f=f: f) for f in fields[:2]))
     with pytest.raises(TypeError, match="must agree in all but arrays"):
         cfjax.integrate(terms, cfjax.CF4(), 0.0, 1.0, Q, num_steps=1)
     for other in (fields[1], fields[2], cfjax.Rotation(np.ones(3))):
-        with pytest.raises(TypeError, match="of the same frame and order only, got"):
+        with pytest.raises(TypeError, match="of the same frame and layout only, got"):
             cfjax.bracket(fields[0], other)
 
 
@@ -434,7 +434,7 @@ def test_a_field_that_changes_its_frame_is_refused():
     kinds = iter(["body", "body"] + 20 * ["fixed"])
 
     def changes(t, q, args):
-        return QuaternionRotation(q[..., 1:], frame=next(kinds), order="wxyz")
+        return QuaternionRotation(q[..., 1:], frame=next(kinds), layout="wxyz")
 
     # Many, so that the stages are a loop.
     q = np.broadcast_to(Q, (30, 4))
@@ -443,7 +443,7 @@ def test_a_field_that_changes_its_frame_is_refused():
 
 
 def along(t, q, args):
-    return QuaternionRotation(q[..., 1:], frame="fixed", order="wxyz")
+    return QuaternionRotation(q[..., 1:], frame="fixed", layout="wxyz")
 
 
 @pytest.mark.parametrize(

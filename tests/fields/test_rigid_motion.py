@@ -1,5 +1,6 @@
 """Rigid motions of space and plane: flows, derivatives, drift, and what they refuse."""
 
+from dataclasses import replace
 from functools import partial
 from typing import Any, cast
 
@@ -84,8 +85,9 @@ def start(n, kind):
 
 
 def motion(w, v, frame):
-    cls = RigidMotion if v.shape[-1] == 3 else PlanarMotion
-    return cls(omega=w, v=v, frame=frame)
+    if v.shape[-1] == 3:
+        return RigidMotion(omega=w, v=v, frame=frame, layout="wxyz_xyz")
+    return PlanarMotion(omega=w, v=v, frame=frame, layout="unit_complex_xy")
 
 
 def coordinates(n):
@@ -223,28 +225,80 @@ def test_the_plane_in_space():
     w, v = jnp.asarray(2.5), jnp.array([0.8, -0.4])
     for frame in ("fixed", "body"):
         c, s, *place = POSES[2]
-        flat = PlanarMotion(omega=w, v=v, frame=frame).flow(POSES[2])
+        flat = motion(w, v, frame).flow(POSES[2])
         half = jnp.arctan2(s, c) / 2
         pose = jnp.array([jnp.cos(half), 0, 0, jnp.sin(half), *place, 0.3])
-        thick = RigidMotion(omega=jnp.array([0, 0, w]), v=jnp.append(v, 0.0), frame=frame)
+        thick = motion(jnp.array([0, 0, w]), jnp.append(v, 0.0), frame)
         got = to_matrix(thick.flow(pose))[np.ix_([0, 1, 3], [0, 1, 3])]
         np.testing.assert_allclose(got, to_matrix(flat), rtol=0, atol=20 * EPS)
 
 
-def test_the_layout():
-    """A quarter turn about the third axis, by hand."""
+def test_a_quarter_turn():
+    """About the third axis, by hand."""
     half, quarter = np.sqrt(0.5), np.pi / 2
     # It looks along the second axis, and stands on the first.
     pose = jnp.array([half, 0, 0, half, 1.0, 0, 0])
     w, v = np.array([0, 0, quarter]), np.array([quarter, 0, 2.0])
     # To its left around the origin; and around (0, 1), whose velocity is zero.
     for frame, want in {"body": [0, 0, 0, 1, 0, 1, 2], "fixed": [0, 0, 0, 1, 1, 2, 2]}.items():
-        got = RigidMotion(omega=w, v=v, frame=frame).flow(pose)
+        got = motion(w, v, frame).flow(pose)
         np.testing.assert_allclose(got, want, rtol=0, atol=8 * EPS)
     pose = jnp.array([0, 1.0, 1, 0])
     for frame, want in {"body": [-1, 0, 0, 1], "fixed": [-1, 0, 1, 2]}.items():
-        got = PlanarMotion(omega=quarter, v=v[:2], frame=frame).flow(pose)
+        got = motion(quarter, v[:2], frame).flow(pose)
         np.testing.assert_allclose(got, want, rtol=0, atol=8 * EPS)
+
+
+# Where each has what the first has: the quaternion by its letters, then the position.
+LAYOUTS = {
+    "wxyz_xyz": [0, 1, 2, 3, 4, 5, 6],
+    "xyzw_xyz": [3, 0, 1, 2, 4, 5, 6],
+    "xyz_wxyz": [3, 4, 5, 6, 0, 1, 2],
+    "xyz_xyzw": [6, 3, 4, 5, 0, 1, 2],
+    "unit_complex_xy": [0, 1, 2, 3],
+    "xy_unit_complex": [2, 3, 0, 1],
+}
+
+
+def test_layouts():
+    """The same motion and the same check of the start, with the entries in other places."""
+
+    @jax.jit
+    def run():
+        found = {}
+        for layout, places in LAYOUTS.items():
+            n = 3 if len(places) == 7 else 2
+            w, v = (normal(3) if n == 3 else jnp.asarray(0.7)), normal(n, seed=1)
+            x = jnp.zeros_like(POSES[n]).at[np.array(places)].set(POSES[n])
+            for frame in ("body", "fixed"):
+                field: Any = replace(motion(w, v, frame), layout=layout)
+                ends = field.flow(x), field.increment(x), field.tangent(x)
+                off, _ = field.defect(x.at[places[0]].add(0.1))
+                found[layout, frame] = [end[np.array(places)] for end in ends], off
+        return found
+
+    found = run()
+    for (layout, frame), (ends, off) in found.items():
+        first = "wxyz_xyz" if len(LAYOUTS[layout]) == 7 else "unit_complex_xy"
+        # The same operations, which the compiler may join otherwise, on numbers of size 3.
+        for got, want in zip(ends, found[first, frame][0], strict=True):
+            np.testing.assert_allclose(got, want, rtol=0, atol=10 * EPS)
+        # Of (q_0 + 0.1)^2 - q_0^2, to rounding.
+        want = abs(0.2 * POSES[3 if len(LAYOUTS[layout]) == 7 else 2][0] + 0.01)
+        np.testing.assert_allclose(off, want, rtol=0, atol=10 * EPS)
+
+
+def test_a_pose_of_ros():
+    """By hand: a quarter turn about the third axis, at (0, 1, 0)."""
+    half = np.sqrt(0.5)
+    pose = jnp.array([0, 1.0, 0, 0, 0, half, half])
+    field = RigidMotion(omega=np.zeros(3), v=np.eye(3)[0], frame="body", layout="xyz_xyzw")
+    # The first axis of the body is the second one of space.
+    want = [0, 2, 0, 0, 0, half, half]
+    np.testing.assert_allclose(field.flow(pose), want, rtol=0, atol=4 * EPS)
+    # The numbers are a pose in jaxlie's layout too, so no check could tell.
+    off, _ = cast(Any, replace(field, layout="wxyz_xyz").defect(pose))
+    assert off < 4 * EPS
 
 
 @pytest.mark.representatives(3)
@@ -315,12 +369,20 @@ def test_no_drift_in_many_steps():
 # What is refused, at trace time
 
 
-def rigid(frame="body", w=(3,), v=(3,), dtypes=(np.float64, np.float64)):
-    return RigidMotion(omega=jnp.ones(w, dtypes[0]), v=jnp.ones(v, dtypes[1]), frame=frame)
+def rigid(frame="body", w=(3,), v=(3,), dtypes=(np.float64, np.float64), layout: Any = "wxyz_xyz"):
+    w, v = jnp.ones(w, dtypes[0]), jnp.ones(v, dtypes[1])
+    return RigidMotion(omega=w, v=v, frame=frame, layout=layout)
 
 
-def planar(frame="body", w=(), v=(2,)):
-    return PlanarMotion(omega=jnp.ones(w), v=jnp.ones(v), frame=frame)
+def planar(frame="body", w=(), v=(2,), layout: Any = "unit_complex_xy"):
+    return PlanarMotion(omega=jnp.ones(w), v=jnp.ones(v), frame=frame, layout=layout)
+
+
+NO_LAYOUT = (
+    r'RigidMotion needs a layout for poses of shape \(7,\): layout="wxyz_xyz" .* as in jaxlie\.SE3'
+    r'\), layout="xyz_xyzw" .* as in ROS geometry_msgs/Pose\), "xyzw_xyz" or "xyz_wxyz"\. There is '
+    "no default, as a wrong guess would go unnoticed"
+)
 
 
 @pytest.mark.parametrize(
@@ -400,7 +462,7 @@ def planar(frame="body", w=(), v=(2,)):
             lambda: cfjax.combine((1.0, 1.0), [rigid("body"), rigid("fixed")]),
             TypeError,
             r"must agree in all but arrays, got RigidMotion\(omega=f64\[3\], v=f64\[3\], "
-            r"frame='body'\) and RigidMotion\(.*frame='fixed'\)",
+            r"frame='body', layout='wxyz_xyz'\) and RigidMotion\(.*frame='fixed', ",
         ),
         (
             lambda: cfjax.combine((1.0, 1.0), [rigid(), planar()]),
@@ -410,7 +472,48 @@ def planar(frame="body", w=(), v=(2,)):
         (
             lambda: cfjax.bracket(rigid("body"), rigid("fixed")),
             ValueError,
-            "with a motion in the same frame only, got frame='body' and frame='fixed'",
+            "with a motion of the same frame and layout only, got frame='body', "
+            "layout='wxyz_xyz' and frame='fixed', layout='wxyz_xyz'",
+        ),
+        (
+            lambda: cfjax.bracket(rigid(), rigid(layout="xyz_xyzw")),
+            ValueError,
+            "layout='wxyz_xyz' and frame='body', layout='xyz_xyzw'",
+        ),
+        (
+            lambda: cfjax.combine((1.0, 1.0), [rigid(), rigid(layout=None)]),
+            TypeError,
+            r"must agree in all but arrays, got .*layout='wxyz_xyz'\) and .*frame='body'\)",
+        ),
+        (
+            lambda: rigid(layout="xyzw"),
+            ValueError,
+            r"layout must be one of \('wxyz_xyz', 'xyz_xyzw', 'xyzw_xyz', 'xyz_wxyz'\), got 'xyzw'",
+        ),
+        (
+            lambda: planar(layout="wxyz_xyz"),
+            ValueError,
+            r"layout must be one of \('unit_complex_xy', 'xy_unit_complex'\), got 'wxyz_xyz'",
+        ),
+        (lambda: rigid(layout=None).flow(jnp.ones(7)), TypeError, NO_LAYOUT),
+        (lambda: rigid(layout=None).defect(jnp.ones(7)), TypeError, NO_LAYOUT),
+        (
+            lambda: cfjax.integrate(
+                cfjax.LieTerm(lambda t, y, args: rigid("fixed", (2, 3), (2, 3), layout=None)),
+                cfjax.RKMK8(),
+                0.0,
+                1.0,
+                jnp.ones((2, 7)),
+                num_steps=1,
+            ),
+            TypeError,
+            rf"for y, where the state is f64\[2,7\]\. It does not act there: {NO_LAYOUT}",
+        ),
+        (
+            lambda: planar(layout=None).increment(jnp.ones(4)),
+            TypeError,
+            r"PlanarMotion needs a layout for poses of shape \(4,\): layout=\"unit_complex_xy\" .* "
+            r"as in jaxlie\.SE2\) or layout=\"xy_unit_complex\"",
         ),
         (
             lambda: planar().bracket(cfjax.Rotation(np.ones(3))),
@@ -429,10 +532,19 @@ def test_starts_off_the_manifold():
     for field, y0, text in [
         (rigid(), MATRICES[3].at[0].multiply(-1), a_rotation),
         (planar(), POSES[2].at[0].add(0.1), "a unit complex number in its first 2 entries"),
+        (rigid(layout="xyz_wxyz"), POSES[3], "a unit quaternion in its last 4 entries"),
     ]:
         term = cfjax.LieTerm(lambda t, y, args, field=field: field)
         with pytest.raises(RuntimeError, match=f"y0 must have {text}"):
             cfjax.integrate(term, cfjax.LieEuler(), 0.0, 1.0, y0, num_steps=1)
+    # Matrices and points need no layout.
+    for n, field in {3: rigid(layout=None), 2: planar(layout=None)}.items():
+        for x in (MATRICES[n], POSES[n][-n:]):
+            field = replace(field, frame="fixed")
+            assert field.flow(x).shape == field.tangent(x).shape == x.shape
+        assert field.defect(POSES[n][-n:]) is None
+        off, _ = cast(Any, field.defect(MATRICES[n]))
+        assert off < 8 * EPS
     for n, field in {3: rigid(), 2: planar()}.items():
         assert field.defect(POSES[n][-n:]) is None
         for x in (POSES[n], MATRICES[n]):

@@ -273,12 +273,12 @@ FRICTION, DIPOLE = 1.0, 2.0
 
 
 def turn(w):
-    return cfjax.QuaternionRotation(w, frame="body", order="wxyz")
+    return cfjax.QuaternionRotation(w, frame="body", layout="wxyz")
 
 
 def kick(t, y, args):
     """The torque of a vertical field on a dipole along the body's third axis."""
-    vertical = cfjax.quaternion_to_matrix(y["q"], order="wxyz")[:, 2, :]
+    vertical = cfjax.quaternion_to_matrix(y["q"], layout="wxyz")[:, 2, :]
     axis = jnp.asarray([[0.0, 0.0, 1.0]])
     return {"q": None, "m": DIPOLE * jnp.cross(axis, vertical)}
 
@@ -346,7 +346,7 @@ def test_a_body_at_a_temperature(number, solver, inertia):
     args = jnp.asarray(amplitudes_of(inertia, h))
     ys = cfjax.integrate(term, solver, 0.0, 10.0, y0, args, num_steps=round(10 / h)).ys
     assert ys is not None
-    height = cfjax.quaternion_to_matrix(ys["q"][-1], order="wxyz")[:, 2, 2]
+    height = cfjax.quaternion_to_matrix(ys["q"][-1], layout="wxyz")[:, 2, 2]
     # Weak errors at these steps, measured with more paths: 1 % of the temperature, and 0.002.
     assert_mean(np.asarray(ys["m"][-1]) ** 2 / inertia, HEAT, 0.02)
     assert_mean(height, langevin(DIPOLE / HEAT), 3e-3)
@@ -437,14 +437,14 @@ def test_the_manifold_is_kept_to_rounding():
     def drift(t, y, args):
         return {
             "s": cfjax.Rotation(y["s"][::-1]),
-            "q": cfjax.QuaternionRotation(y["s"], frame="body", order="wxyz"),
+            "q": cfjax.QuaternionRotation(y["s"], frame="body", layout="wxyz"),
             "r": cfjax.Rotation(-y["s"]),
         }
 
     def noise(t, y, args, dw):
         return {
             "s": cfjax.Rotation((1 + y["s"]) * dw),
-            "q": cfjax.QuaternionRotation(0.7 * dw, frame="body", order="wxyz"),
+            "q": cfjax.QuaternionRotation(0.7 * dw, frame="body", layout="wxyz"),
             "r": cfjax.Rotation(dw * y["s"]),
         }
 

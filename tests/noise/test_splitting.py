@@ -21,12 +21,12 @@ START = {"q": np.array([0.6, 0.0, 0.48, 0.64]), "m": np.array([0.5, -0.8, 1.1])}
 
 
 def turn(w):
-    return cfjax.QuaternionRotation(w, frame="body", order="wxyz")
+    return cfjax.QuaternionRotation(w, frame="body", layout="wxyz")
 
 
 def kick(t, y, args):
     """A torque that depends on attitude and time."""
-    frame = cfjax.quaternion_to_matrix(y["q"], order="wxyz")
+    frame = cfjax.quaternion_to_matrix(y["q"], layout="wxyz")
     strength = (1.5 + jnp.sin(3 * t)).astype(frame.dtype)
     return {"q": None, "m": strength * jnp.cross(frame[2], jnp.asarray([0.3, 0, 1], frame.dtype))}
 

@@ -118,10 +118,10 @@ INERTIA = np.array([1.0, 2.0, 3.0])
 
 def body(t, y, args):
     spin = y["m"] / INERTIA
-    frame = cfjax.quaternion_to_matrix(y["q"], order="wxyz")
+    frame = cfjax.quaternion_to_matrix(y["q"], layout="wxyz")
     torque = 2 * jnp.cross(frame[2], jnp.asarray([0.0, 0.6, 0.8]))
     return {
-        "q": cfjax.QuaternionRotation(spin, frame="body", order="wxyz"),
+        "q": cfjax.QuaternionRotation(spin, frame="body", layout="wxyz"),
         "m": jnp.cross(y["m"], spin) - y["m"] + torque,
     }
 

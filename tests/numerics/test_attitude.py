@@ -54,15 +54,15 @@ def exact_matrix(q):
 
 
 MATRICES = np.array([exact_matrix(q) for q in QS.tolist()], dtype=float)
-to_matrix = eqx.filter_jit(partial(quaternion_to_matrix, order="wxyz"))
-from_matrix = eqx.filter_jit(partial(quaternion_from_matrix, order="wxyz"))
+to_matrix = eqx.filter_jit(partial(quaternion_to_matrix, layout="wxyz"))
+from_matrix = eqx.filter_jit(partial(quaternion_from_matrix, layout="wxyz"))
 
 
 def test_matrices():
     # Sums of few products of at most 1, and a length that is rounded.
     np.testing.assert_allclose(to_matrix(QS), MATRICES, rtol=0, atol=4 * EPS)
     np.testing.assert_array_equal(to_matrix(-QS), to_matrix(QS))
-    last = quaternion_to_matrix(jnp.asarray(np.roll(QS[7], -1)), order="xyzw")
+    last = quaternion_to_matrix(jnp.asarray(np.roll(QS[7], -1)), layout="xyzw")
     np.testing.assert_array_equal(last, to_matrix(QS)[7])
 
 
@@ -71,7 +71,7 @@ def test_from_matrices():
     # The length of what is divided by is 2 at least, each entry a sum of four that are rounded.
     np.testing.assert_allclose(found, QS, rtol=0, atol=4 * EPS)
     np.testing.assert_allclose(np.linalg.norm(found, axis=-1), np.ones(len(QS)), rtol=0, atol=EPS)
-    last = quaternion_from_matrix(jnp.asarray(MATRICES[7]), order="xyzw")
+    last = quaternion_from_matrix(jnp.asarray(MATRICES[7]), layout="xyzw")
     np.testing.assert_array_equal(last, np.roll(found[7], -1))
 
 
@@ -98,7 +98,7 @@ def of_turned(velocity, matrix):
 
     def at(t):
         turned = cfjax.Rotation(t * velocity).flow(matrix)
-        return quaternion_from_matrix(turned, order="wxyz")
+        return quaternion_from_matrix(turned, layout="wxyz")
 
     def slope(t):
         return jax.jvp(at, (t,), (jnp.ones_like(t),))
@@ -123,10 +123,10 @@ def test_gradients_of_all_three():
     weights = jnp.asarray(RNG.normal(size=3))
 
     def by_matrix(q, x):
-        return weights @ (quaternion_to_matrix(q, order="wxyz") @ x)
+        return weights @ (quaternion_to_matrix(q, layout="wxyz") @ x)
 
     def by_rotate(q, x):
-        return weights @ quaternion_rotate(q, x, order="wxyz")
+        return weights @ quaternion_rotate(q, x, layout="wxyz")
 
     @jax.jit
     def gradients(q, x):
@@ -138,11 +138,11 @@ def test_gradients_of_all_three():
         np.testing.assert_allclose(a, b, rtol=0, atol=40 * EPS)
 
 
-@pytest.mark.parametrize("order", ["wxyz", "xyzw"])
-def test_rotate(order):
-    q = jnp.asarray(QS if order == "wxyz" else np.roll(QS, -1, axis=-1))
+@pytest.mark.parametrize("layout", ["wxyz", "xyzw"])
+def test_rotate(layout):
+    q = jnp.asarray(QS if layout == "wxyz" else np.roll(QS, -1, axis=-1))
     x = jnp.asarray(RNG.normal(size=(len(QS), 3)))
-    rotate = jax.jit(partial(quaternion_rotate, order=order))
+    rotate = jax.jit(partial(quaternion_rotate, layout=layout))
     # Few terms of size three.
     for a, b in [(q, x), (q[3:4], x), (q, x[5:6])]:
         matrices = MATRICES if len(a) > 1 else MATRICES[3:4]
@@ -166,7 +166,7 @@ def test_leading_axes():
 def test_the_length_of_a_quaternion_does_not_count(dtype, length):
     eps = np.finfo(dtype).eps
     q, x = (length * QS).astype(dtype), np.ones((len(QS), 3), dtype)
-    matrices, turned = to_matrix(q), quaternion_rotate(jnp.asarray(q), x, order="wxyz")
+    matrices, turned = to_matrix(q), quaternion_rotate(jnp.asarray(q), x, layout="wxyz")
     # The entries of q are rounded, and then as in the tests of those of length 1.
     np.testing.assert_allclose(matrices, MATRICES, rtol=0, atol=6 * eps)
     np.testing.assert_allclose(turned, MATRICES.sum(axis=-1), rtol=0, atol=12 * eps)
@@ -179,17 +179,17 @@ def test_the_derivative_along_a_quaternion_is_zero_and_that_across_is_of_its_dir
     x, weights = jnp.asarray(RNG.normal(size=3)), jnp.asarray(RNG.normal(size=3))
 
     def fun(q):
-        return weights @ quaternion_rotate(q, x, order="wxyz")
+        return weights @ quaternion_rotate(q, x, layout="wxyz")
 
     def of_direction(q):
-        return weights @ (quaternion_to_matrix(q / jnp.linalg.norm(q), order="wxyz") @ x)
+        return weights @ (quaternion_to_matrix(q / jnp.linalg.norm(q), layout="wxyz") @ x)
 
     found, expected = jax.grad(fun)(q), jax.grad(of_direction)(q)
     # Some 40 products of numbers below 3.
     np.testing.assert_allclose(found, expected, rtol=0, atol=100 * EPS)
     assert abs(found @ q) < 100 * EPS
     assert np.abs(found).max() > 0.1
-    matrices = jax.jvp(partial(quaternion_to_matrix, order="wxyz"), (q,), (q,))[1]
+    matrices = jax.jvp(partial(quaternion_to_matrix, layout="wxyz"), (q,), (q,))[1]
     np.testing.assert_allclose(matrices, np.zeros((3, 3)), rtol=0, atol=20 * EPS)
 
 
@@ -200,7 +200,7 @@ def test_a_quaternion_of_quite_another_length_is_no_attitude(length):
     with pytest.raises(RuntimeError, match=text):
         to_matrix(q)
     with pytest.raises(RuntimeError, match=text):
-        quaternion_rotate(q, jnp.ones((2, 3)), order="wxyz")
+        quaternion_rotate(q, jnp.ones((2, 3)), layout="wxyz")
 
 
 def spiral(rewrite, rate):
@@ -209,7 +209,7 @@ def spiral(rewrite, rate):
     def field(t, y, args):
         q = y["q"]
         grows = rate * q + jnp.stack([-q[1], q[0], -q[3], q[2]]) / 2
-        return {"q": grows, "x": quaternion_rotate(q, jnp.array([0.0, 1.0, 0.0]), order="wxyz")}
+        return {"q": grows, "x": quaternion_rotate(q, jnp.array([0.0, 1.0, 0.0]), layout="wxyz")}
 
     y0 = {"q": jnp.asarray([1.0, 0.0, 0.0, 0.0]), "x": jnp.zeros(3)}
     with cfjax.rewriting(rewrite):
@@ -232,7 +232,7 @@ def test_a_wrong_matrix_within_a_field(rewrite):
     """Where single numbers leave no room for the check itself, it makes NaN, which ends a solve."""
 
     def vector_field(t, y, matrix):
-        return cfjax.Rotation(quaternion_from_matrix(matrix, order="wxyz")[1:] + y)
+        return cfjax.Rotation(quaternion_from_matrix(matrix, layout="wxyz")[1:] + y)
 
     def end(matrix):
         with cfjax.rewriting(rewrite):
@@ -273,27 +273,27 @@ def test_matrices_that_are_no_rotations():
     np.testing.assert_allclose(from_matrix(u @ vh), QS[:2], rtol=0, atol=1e-6)
 
 
-def test_wrong_shapes_types_and_orders(no_shape_hook):
+def test_wrong_shapes_types_and_layouts(no_shape_hook):
     q, x, m = np.array([1.0, 0, 0, 0]), np.ones(3), np.eye(3)
     with pytest.raises(ValueError, match=r"q must have shape \(4,\) or \(\*batch, 4\), got \(3,\)"):
-        quaternion_to_matrix(x, order="wxyz")
+        quaternion_to_matrix(x, layout="wxyz")
     with pytest.raises(ValueError, match=r"x must have shape \(3,\) or \(\*batch, 3\), got \(4,\)"):
-        quaternion_rotate(q, q, order="wxyz")
+        quaternion_rotate(q, q, layout="wxyz")
     with pytest.raises(ValueError, match=r"matrix must have shape \(3, 3\) or .* got \(3,\)"):
-        quaternion_from_matrix(x, order="wxyz")
+        quaternion_from_matrix(x, layout="wxyz")
     with pytest.raises(ValueError, match=r"must agree or be 1, got q \(4,\) and x \(5, 3\)"):
-        quaternion_rotate(q, np.ones((5, 3)), order="wxyz")
+        quaternion_rotate(q, np.ones((5, 3)), layout="wxyz")
     with pytest.raises(ValueError, match=r"must agree or be 1, got q \(2, 4\) and x \(5, 3\)"):
-        quaternion_rotate(np.stack([q, q]), np.ones((5, 3)), order="wxyz")
+        quaternion_rotate(np.stack([q, q]), np.ones((5, 3)), layout="wxyz")
     with pytest.raises(TypeError, match="q must be float32 or float64, got complex128"):
-        quaternion_to_matrix(q + 0j, order="wxyz")
+        quaternion_to_matrix(q + 0j, layout="wxyz")
     with pytest.raises(TypeError, match="matrix must be float32 or float64, got int64"):
-        quaternion_from_matrix(m.astype(int), order="wxyz")
+        quaternion_from_matrix(m.astype(int), layout="wxyz")
     with pytest.raises(TypeError, match="x must have the dtype of q, float64, got float32"):
-        quaternion_rotate(q, x.astype(np.float32), order="wxyz")
+        quaternion_rotate(q, x.astype(np.float32), layout="wxyz")
     functions = [quaternion_to_matrix, quaternion_from_matrix, partial(quaternion_rotate, x=x)]
     for function, argument in zip(functions, (q, m, q), strict=True):
-        with pytest.raises(TypeError, match="'order'"):
+        with pytest.raises(TypeError, match="'layout'"):
             function(argument)
-        with pytest.raises(ValueError, match="order must be 'wxyz' or 'xyzw', got 'zyxw'"):
-            function(argument, order="zyxw")
+        with pytest.raises(ValueError, match="layout must be 'wxyz' or 'xyzw', got 'zyxw'"):
+            function(argument, layout="zyxw")

@@ -103,7 +103,7 @@ def turned(ys):
     """The centre of mass where the attitude alone has it."""
     q = ys["pose"][:, :4] / np.linalg.norm(ys["pose"][:, :4], axis=-1, keepdims=True)
     center = np.broadcast_to(np.array(TOP.center), (len(q), 3))
-    return cfjax.quaternion_rotate(q, center, order="wxyz")
+    return cfjax.quaternion_rotate(q, center, layout="wxyz")
 
 
 def test_kovalevskayas_integral_does_not_change():
@@ -115,12 +115,12 @@ def test_kovalevskayas_integral_does_not_change():
     def integral(y):
         omega = heavy_top.angular_velocity(y, args)
         q = y["pose"][:4] * np.array([1.0, -1.0, -1.0, -1.0])
-        up = cfjax.quaternion_rotate(q, jnp.array([0.0, 0.0, 1.0]), order="wxyz")
+        up = cfjax.quaternion_rotate(q, jnp.array([0.0, 0.0, 1.0]), layout="wxyz")
         real = omega[0] ** 2 - omega[1] ** 2 - mu * up[0]
         return real**2 + (2 * omega[0] * omega[1] - mu * up[1]) ** 2
 
     q = jnp.array([0.1, 0.5, -0.5, 0.7])
-    x = cfjax.quaternion_rotate(q, jnp.array(args.center), order="wxyz")
+    x = cfjax.quaternion_rotate(q, jnp.array(args.center), layout="wxyz")
     y = {"pose": jnp.concatenate([q, x]), "m": jnp.array([0.3, -1.0, 0.7])}
     for rate in (cfjax.tangent(heavy_top.field(0.0, y, args), y), heavy_top.velocity(0.0, y, args)):
         value, slope = jax.jvp(integral, (y,), (rate,))

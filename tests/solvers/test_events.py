@@ -33,7 +33,7 @@ def rotation_ode(t, y):
 
 
 def quaternion(t, y, args):
-    return cfjax.QuaternionRotation(-y[1:] * y[0], frame="fixed", order="wxyz")
+    return cfjax.QuaternionRotation(-y[1:] * y[0], frame="fixed", layout="wxyz")
 
 
 def quaternion_ode(t, y):

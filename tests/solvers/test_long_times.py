@@ -141,11 +141,11 @@ VERTICAL = (TILTED @ SPIN)[2]
 
 
 def turn(w, frame) -> Any:
-    return cfjax.QuaternionRotation(w, frame=frame, order="wxyz")
+    return cfjax.QuaternionRotation(w, frame=frame, layout="wxyz")
 
 
 def frame_of(q):
-    return cfjax.quaternion_to_matrix(q, order="wxyz")
+    return cfjax.quaternion_to_matrix(q, layout="wxyz")
 
 
 def nutation(t):

@@ -150,15 +150,19 @@ FIELDS = {
     "array": (lambda t, y, _: wave(t, (3,)), START),
     "Rotation": (lambda t, y, _: cfjax.Rotation(wave(t, (3,))), START),
     "QuaternionRotation": (
-        lambda t, y, _: cfjax.QuaternionRotation(wave(t, (3,)), frame="body", order="wxyz"),
+        lambda t, y, _: cfjax.QuaternionRotation(wave(t, (3,)), frame="body", layout="wxyz"),
         np.array([0.5, 0.5, -0.5, 0.5]),
     ),
     "RigidMotion": (
-        lambda t, y, _: cfjax.RigidMotion(omega=wave(t, (3,)), v=wave(t, (3,), 1.0), frame="body"),
+        lambda t, y, _: cfjax.RigidMotion(
+            omega=wave(t, (3,)), v=wave(t, (3,), 1.0), frame="body", layout="wxyz_xyz"
+        ),
         np.array([0.6, 0.0, 0.8, 0.0, 0.3, -0.4, 0.5]),
     ),
     "PlanarMotion": (
-        lambda t, y, _: cfjax.PlanarMotion(omega=wave(t, ()), v=wave(t, (2,)), frame="fixed"),
+        lambda t, y, _: cfjax.PlanarMotion(
+            omega=wave(t, ()), v=wave(t, (2,)), frame="fixed", layout="unit_complex_xy"
+        ),
         np.array([0.6, 0.8, 0.3, -0.4]),
     ),
     "LeftMatrix": (lambda t, y, _: cfjax.LeftMatrix(wave(t, (4, 4))), np.eye(4)[:, :2]),

@@ -238,7 +238,7 @@ def test_error_control_keeps_to_its_tolerance(name):
 
     def field(t, y, args):
         omega = y["m"] / inertia
-        q = cfjax.QuaternionRotation(omega, frame="body", order="wxyz")
+        q = cfjax.QuaternionRotation(omega, frame="body", layout="wxyz")
         return {"q": q, "m": jnp.cross(y["m"], omega)}
 
     solver = cfjax.RKMK(getattr(diffrax, name).tableau)
@@ -521,7 +521,7 @@ def test_a_named_method_turns_a_symmetric_body_with_its_order(name):
 
     def field(t, y, args):
         w = y["m"] / inertia
-        q = cfjax.QuaternionRotation(w, frame="body", order="wxyz")
+        q = cfjax.QuaternionRotation(w, frame="body", layout="wxyz")
         return {"q": q, "m": cfjax.Rotation(-w)}
 
     def turn(w):

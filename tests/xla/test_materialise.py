@@ -37,7 +37,7 @@ def test_increments_of_a_step_are_computed_together(rewritten):
     """The angular momentum moves the attitude too, and is computed once for both."""
 
     def field(t, y, args):
-        rotation = cfjax.QuaternionRotation(y["m"] / args, frame="body", order="wxyz")
+        rotation = cfjax.QuaternionRotation(y["m"] / args, frame="body", layout="wxyz")
         return {"q": rotation, "m": cfjax.Rotation(-y["m"] / args)}
 
     def solve(y0, args):

@@ -19,7 +19,7 @@ BODY = jnp.array([0.9, 0.4, 0.1])
 def craft(t, y, inertia):
     omega = y["m"] / inertia
     return {
-        "q": cfjax.QuaternionRotation(omega, frame="body", order="wxyz"),
+        "q": cfjax.QuaternionRotation(omega, frame="body", layout="wxyz"),
         "m": cfjax.Rotation(-omega),
     }
 
