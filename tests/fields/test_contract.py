@@ -170,12 +170,12 @@ CASES = {
         lambda x, omega, v: (rows(screw(omega * TURN, v), 3), 0),
     ),
     "PlanarMotion of a complex number and a position": Case(
-        partial(cfjax.PlanarMotion, frame="fixed"),
+        partial(cfjax.PlanarMotion, frame="fixed", layout="xy_unit_complex"),
         lambda: unit(omega=normal(), v=normal(2)),
         normal(4),
         lambda x, omega, v: (
             block_diagonal(omega * TURN, omega * TURN),
-            np.concatenate([0 * x[:2], v]),
+            np.concatenate([v, 0 * x[2:]]),
         ),
     ),
     "LeftMatrix": Case(
