@@ -646,6 +646,27 @@ DEFECTS = [
         "batch/test_batch.py -k chunks",
     ),
     Defect(
+        "_batch/program.py",
+        "if len(self.traced.jaxpr.in_avals) != len(leaves):",
+        "if False:",
+        "a batch that captures what is traced",
+        "batch/test_batch.py -k traced",
+    ),
+    Defect(
+        "_batch/failure.py",
+        "(first, middle) if _fails(program, first, middle)",
+        "(middle, last) if _fails(program, first, middle)",
+        "a search for the member that failed in the wrong half",
+        "batch/test_batch.py -k names_the_member",
+    ),
+    Defect(
+        "_batch/store.py",
+        'path.with_suffix(f".{secrets.token_hex(8)}.part")',
+        'path.with_suffix(".part")',
+        "a partial file that all processes write",
+        "batch/test_batch.py -k another_process_writes",
+    ),
+    Defect(
         "_batch/store.py",
         "if belongs != digest(self.fingerprint, *inputs):",
         "if False:",

@@ -11,11 +11,13 @@ import jax
 import jax.numpy as jnp
 import jax.tree_util as jtu
 import numpy as np
+from jax.core import Tracer
 from jax.sharding import Mesh
 from jaxtyping import Bool, Int, PyTree
 
 from .._arguments import count
-from .program import Program
+from .failure import solved
+from .program import OUTSIDE, Program
 from .progress import progress_bar
 from .store import Store
 
@@ -56,7 +58,10 @@ def map_batch(
 
     - `solve`: a JAX function of one member. Return no more than you need: all results are kept in
       the host's memory. An error raised within `solve`, as `diffrax.diffeqsolve` does on failure,
-      stops the batch; if `solve` uses `throw=False`, a failed member does not affect the others.
+      stops the batch, and names the first member that fails. `map_batch` finds it by bisection,
+      in up to `2 + log2(chunk_size)` times the time of a chunk. If `solve` uses `throw=False`, a
+      failed member does not affect the others. `solve` must not capture traced values: call
+      `map_batch` outside of `jax.jit`, `jax.vmap` and `jax.grad`.
     - `members`: a pytree of arrays of numbers or of PRNG keys, each with the batch's axis in front.
       They may be NumPy memory maps: only one chunk at a time goes to the devices.
     - `chunk_size`: how many members are solved at once, rounded up to a multiple of the number of
@@ -77,9 +82,12 @@ def map_batch(
       there is none.
 
     **Raises** `TypeError` or `ValueError` if members are not arrays or differ in length, if the
-    batch is empty, if `chunk_size < 1`, if `mesh` is not a `Mesh`, if `folder` has another batch,
-    or if there is a `folder` and `solve` calls a function of the host, as `jax.pure_callback` and
-    progress meters do; `OSError` if the folder cannot be made or written to.
+    batch is empty, if members or what `solve` captures are traced, if `chunk_size < 1`, if `mesh`
+    is not a `Mesh`, if `folder` has another batch, or if there is a `folder` and `solve` calls a
+    function of the host, as `jax.pure_callback` and progress meters do; `OSError` if the folder
+    cannot be made or written to, or has a folder in place of a file;
+    `equinox.EquinoxRuntimeError`, with the number of the member, for an error raised within
+    `solve`.
     """
     size = _batch_size(members)
     if not isinstance(mesh, Mesh | None):
@@ -95,7 +103,7 @@ def map_batch(
             inputs = program.inputs(start, stop)
             outputs = None if store is None else store.read(number, inputs)
             if outputs is None:
-                outputs = program(inputs)
+                outputs = solved(program, inputs, start, stop, update)
                 if store is not None:
                     store.write(number, inputs, outputs)
             chunks.append([a[: stop - start] for a in outputs])
@@ -109,6 +117,11 @@ def _batch_size(members: PyTree) -> int:
     if not leaves:
         raise TypeError(f"members must have at least one array, got {members!r}.")
     for path, leaf in leaves:
+        if isinstance(leaf, Tracer):
+            raise TypeError(
+                f"members{jtu.keystr(path)} must be an array with values, got one that is traced. "
+                f"{OUTSIDE}"
+            )
         is_array = isinstance(leaf, jax.Array | np.ndarray)
         if not is_array or leaf.ndim == 0 or not _is_of_jax(leaf.dtype):
             raise TypeError(

@@ -15,6 +15,12 @@ from jaxtyping import Array, PyTree
 
 from .fingerprint import environment, fingerprint
 
+OUTSIDE = (
+    "map_batch compiles and runs solve itself: call it outside of jax.jit, jax.vmap, jax.grad and "
+    "loops of jax. For derivatives of a batch, or a batch within another program, use "
+    "jax.vmap(solve)(members)."
+)
+
 
 class Structure(NamedTuple):
     """That of a pytree of arrays, whose leaves are kept apart, and PRNG keys as their numbers."""
@@ -73,6 +79,12 @@ class Program:
         ]
         run = jax.jit(jax.vmap(one), in_shardings=self.sharding, out_shardings=self.sharding)
         self.traced = run.trace(shapes)
+        # JAX makes what is traced elsewhere an input.
+        if len(self.traced.jaxpr.in_avals) != len(leaves):
+            raise TypeError(
+                "solve must not capture values that are traced, and it captures one of the "
+                f"function that calls map_batch. {OUTSIDE}"
+            )
         self.lowered = self.traced.lower()
         self.outputs = jtu.tree_leaves(self.traced.out_info)
         self.static, self.structure = found["static"], found["structure"]

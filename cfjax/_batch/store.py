@@ -5,6 +5,7 @@ import hashlib
 import json
 import math
 import os
+import secrets
 import warnings
 from collections.abc import Callable, Sequence
 from pathlib import Path
@@ -58,17 +59,43 @@ class Store:
 
     def _open(self) -> None:
         """Makes the folder, or sees that what it holds is of this batch."""
-        self.folder.mkdir(parents=True, exist_ok=True)
-        path, text = self.folder / "batch.json", json.dumps(self.description, indent=2)
-        found = path.read_text() if path.exists() else None
+        try:
+            self.folder.mkdir(parents=True, exist_ok=True)
+        except OSError as error:
+            raise type(error)(
+                f"folder must be a folder, or a path where one can be made, got "
+                f"{str(self.folder)!r}: {error}"
+            ) from None
+        # Of processes that run, or that were killed.
+        self.parts = list(self.folder.glob("*.part"))
+        path, text = self.folder / "batch.json", json.dumps(self.description, indent=2).encode()
+        # In this order: another process writes the description before its first chunk.
+        has_chunks = any(self.folder.glob("chunk_*.bin"))
+        found = self._content(path)
         if found == text:
             return
-        if any(self.folder.glob("chunk_*.bin")):
+        if has_chunks:
             what = f"chunks, but no {path.name}" if found is None else self._differences(found)
             raise ValueError(self._other(what))
-        self._write(path, text.encode())
+        self._write(path, text)
 
-    def _differences(self, text: str) -> str:
+    def _content(self, path: Path) -> bytes | None:
+        """Of a file: None where there is none, nothing where it cannot be read."""
+        if path.is_dir():
+            raise IsADirectoryError(
+                f"folder must hold files, but in {str(self.folder)!r} {path.name} is a folder. "
+                "Remove it, or give another folder."
+            )
+        for _ in range(2):  # On some file systems not while another process replaces it.
+            try:
+                return path.read_bytes()
+            except FileNotFoundError:
+                return None
+            except OSError:
+                continue
+        return b""
+
+    def _differences(self, text: bytes) -> str:
         try:
             found = json.loads(text)
             names = [name for name in self.description if name not in ("computation", "arrays")]
@@ -108,12 +135,9 @@ class Store:
 
     def _read(self, number: int, inputs: Sequence[np.ndarray]) -> bytes | None:
         path = self._path(number)
-        try:
-            content = path.read_bytes()
-        except FileNotFoundError:
+        content = self._content(path)
+        if content is None:
             return None
-        except OSError:
-            content = b""
         middle = self.START // 2
         belongs, whole, data = content[:middle], content[middle : self.START], content[self.START :]
         if whole != digest(belongs, data):
@@ -132,21 +156,28 @@ class Store:
             self._write(self._path(number), belongs + digest(belongs, data) + data)
 
     def _write(self, path: Path, content: bytes) -> None:
-        # One name for each file: what a killed process leaves is written over.
-        part = path.with_suffix(".part")
+        # A name of its own: another process may write the same file at the same time.
+        part = path.with_suffix(f".{secrets.token_hex(8)}.part")
         try:
             with open(part, "wb") as file:
                 file.write(content)
                 file.flush()
                 os.fsync(file.fileno())
-            # The file gets its name when it is whole and on the disk. It is there under it already
-            # where another process has written the same just now.
-            with contextlib.suppress(FileNotFoundError):
+            # The file gets its name when it is whole and on the disk.
+            try:
                 os.replace(part, path)
-        except BaseException:
+            except OSError:
+                # Another process has written it and removed this part, or reads it on Windows.
+                if not path.is_file():
+                    raise
+        finally:
             part.unlink(missing_ok=True)
-            raise
         _sync(self.folder)
+        # Who was writing this file needs it no more.
+        for other in self.parts:
+            if other.name.startswith(f"{path.stem}."):
+                with contextlib.suppress(OSError):
+                    other.unlink()
 
     def _path(self, number: int) -> Path:
         return self.folder / f"chunk_{number:06}.bin"

@@ -291,11 +291,14 @@ def test_no_damage_is_taken_for_results(tmp_path, computed):
     paths[0].unlink()
     np.testing.assert_array_equal(run(), expected)
     assert computed[-1] == x[0] and paths[0].read_bytes() == before[0]
-    # What is no file is damaged, and is not written over.
+    # What is no file is not written over, and nothing is computed first.
     paths[0].unlink()
     paths[0].mkdir()
-    with pytest.warns(UserWarning, match="is damaged"), pytest.raises(OSError):
+    del computed[:]
+    text = r"folder must hold files, but in '.*many' chunk_000000\.bin is a folder\. Remove it"
+    with pytest.raises(IsADirectoryError, match=text):
         run()
+    assert computed == []
     paths[0].rmdir()
     paths[0].write_bytes(before[0])
     del computed[:]
@@ -332,7 +335,7 @@ def test_files_have_the_mode_that_the_user_wants(tmp_path):
     assert stat.S_IMODE((tmp_path / "chunk_000000.bin").stat().st_mode) == 0o640
 
 
-def test_what_a_killed_process_leaves_is_written_over(tmp_path):
+def test_what_a_killed_process_leaves_is_removed(tmp_path):
     killed = """
 import os, signal, sys
 import numpy as np
@@ -345,11 +348,12 @@ def killed(part, path):
 os.replace = killed
 cfjax.map_batch(lambda x: x, np.ones(3, np.float32), folder=sys.argv[1])
 """
-    for name, left in [("batch", ["batch.part"]), ("chunk", ["batch.json", "chunk_000000.part"])]:
+    for name, left in [("batch", ["batch"]), ("chunk", ["batch", "chunk_000000"])]:
         folder = tmp_path / name
         process = subprocess.run([sys.executable, "-c", killed, str(folder), name])
         assert process.returncode == -9
-        assert sorted(os.listdir(folder)) == left
+        found = sorted(os.listdir(folder))
+        assert [path.split(".")[0] for path in found] == left and found[-1].endswith(".part")
         # Another batch too may have a folder in which no chunk is finished.
         cfjax.map_batch(lambda x: x, np.ones(3), folder=folder)
         assert sorted(os.listdir(folder)) == ["batch.json", "chunk_000000.bin"]
@@ -361,10 +365,11 @@ def test_another_process_writes_the_same_chunk_at_the_same_time(tmp_path, monkey
     run()
     path = tmp_path / "chunk_000000.bin"
     path.unlink()
-    sync, others = os.fsync, [run]
+    sync, others, parts = os.fsync, [run], []
 
     def other_comes_between(descriptor):
         sync(descriptor)
+        parts.append(len(list(tmp_path.glob("*.part"))))
         while others:
             np.testing.assert_array_equal(others.pop()(), 2 * x)
             assert path.exists()
@@ -372,10 +377,72 @@ def test_another_process_writes_the_same_chunk_at_the_same_time(tmp_path, monkey
     monkeypatch.setattr(os, "fsync", other_comes_between)
     np.testing.assert_array_equal(run(), 2 * x)
     assert others == []
+    # Each has a file of its own. If one began the file that another one gave its name, a third one
+    # would read less than all of it.
+    assert max(parts) == 2
     assert sorted(os.listdir(tmp_path)) == ["batch.json", "chunk_000000.bin"]
     # What is there is read.
     monkeypatch.setattr(jax.stages.Lowered, "compile", None)
     np.testing.assert_array_equal(run(), 2 * x)
+
+
+def test_another_process_begins_the_same_batch_at_the_same_time(tmp_path, monkeypatch):
+    """Between two looks at the folder it writes the description and all chunks."""
+    x = np.arange(3.0)
+    run = lambda: cfjax.map_batch(lambda x: 2 * x, x, folder=tmp_path).values  # noqa: E731
+    others, read = [run], Path.read_bytes
+
+    def missing(path):
+        if path.name == "batch.json" and others:
+            others.pop()()
+            raise FileNotFoundError(path)
+        return read(path)
+
+    monkeypatch.setattr(Path, "read_bytes", missing)
+    np.testing.assert_array_equal(run(), 2 * x)
+    assert others == []
+
+
+def test_a_file_that_another_process_holds(tmp_path, monkeypatch, computed):
+    """Some file systems refuse to read or replace it at that moment."""
+    x = np.arange(3.0)
+    run = lambda: cfjax.map_batch(lambda x: 2 * x, x, folder=tmp_path).values  # noqa: E731
+    run()
+    read, refused = Path.read_bytes, []
+
+    def once(path):
+        if path not in refused:
+            refused.append(path)
+            raise OSError("Stale file handle")
+        return read(path)
+
+    with monkeypatch.context() as patch:
+        patch.setattr(Path, "read_bytes", once)
+        np.testing.assert_array_equal(run(), 2 * x)
+    assert len(refused) == 2 and len(computed) == 1
+
+    def held(old, new):
+        raise PermissionError(f"{new} is open")
+
+    monkeypatch.setattr(os, "replace", held)
+    # Written by another process after this one has looked for it.
+    path = tmp_path / "chunk_000000.bin"
+    content = path.read_bytes()
+    path.unlink()
+    sync = os.fsync
+
+    def other_comes_between(descriptor):
+        sync(descriptor)
+        path.write_bytes(content)
+
+    with monkeypatch.context() as patch:
+        patch.setattr(os, "fsync", other_comes_between)
+        np.testing.assert_array_equal(run(), 2 * x)
+    assert sorted(os.listdir(tmp_path)) == ["batch.json", "chunk_000000.bin"]
+    path.unlink()
+    with pytest.raises(PermissionError, match="is open"):
+        run()
+    assert os.listdir(tmp_path) == ["batch.json"]
 
 
 @pytest.mark.skipif(os.name != "posix", reason="Elsewhere no folder can be opened.")
@@ -469,7 +536,12 @@ def test_a_folder_of_another_version(tmp_path, monkeypatch):
 
 @pytest.mark.parametrize(
     ("text", "message"),
-    [(None, "chunks, but no batch.json"), ("{", "a batch.json that is damaged"), ("[]", "damaged")],
+    [
+        (None, "chunks, but no batch.json"),
+        (b"{", "a batch.json that is damaged"),
+        (b"[]", "damaged"),
+        (b"\xff", "a batch.json that is damaged"),
+    ],
 )
 def test_a_folder_whose_description_is_lost(tmp_path, text, message):
     run = lambda: cfjax.map_batch(lambda x: x, np.ones(3), folder=tmp_path)  # noqa: E731
@@ -477,7 +549,7 @@ def test_a_folder_whose_description_is_lost(tmp_path, text, message):
     if text is None:
         (tmp_path / "batch.json").unlink()
     else:
-        (tmp_path / "batch.json").write_text(text)
+        (tmp_path / "batch.json").write_bytes(text)
     with pytest.raises(ValueError, match=message):
         run()
 
@@ -901,9 +973,132 @@ def test_a_chunk_size_of_numpy(no_shape_hook):
     np.testing.assert_array_equal(values, [0, 2, 4])
 
 
-def test_a_folder_that_is_a_file(tmp_path):
+def test_what_is_no_folder_or_no_file(tmp_path):
     path = tmp_path / "file"
     path.write_text("mine")
-    with pytest.raises(FileExistsError):
-        cfjax.map_batch(solve, members(), folder=path)
+    for folder in (path, path / "results"):
+        with pytest.raises(OSError, match=r"folder must be a folder, or a path where one .* got '"):
+            cfjax.map_batch(solve, members(), folder=folder)
     assert path.read_text() == "mine"
+    (tmp_path / "folder" / "batch.json").mkdir(parents=True)
+    with pytest.raises(
+        IsADirectoryError, match=r"folder must hold files, .* batch\.json is a fold"
+    ):
+        cfjax.map_batch(solve, members(), folder=tmp_path / "folder")
+
+
+# Within transformations.
+
+
+def in_a_loop(run):
+    return lambda x: jax.lax.scan(lambda carry, _: (run(carry), None), x, length=2)[0]
+
+
+@pytest.mark.parametrize(
+    "transformed",
+    [jax.jit, lambda run: lambda x: jax.vmap(run)(x[None]), jax.jacrev, jax.jacfwd, in_a_loop],
+)
+def test_no_traced_value_is_captured(tmp_path, transformed):
+    def run(scale):
+        return jnp.asarray(
+            cfjax.map_batch(lambda x: scale * x, np.ones((4, 3)), folder=tmp_path / "no").values[0]
+        )
+
+    with pytest.raises(TypeError, match=CAPTURED):
+        transformed(run)(jnp.ones(3))
+    assert os.listdir(tmp_path) == []
+
+
+CAPTURED = (
+    "solve must not capture values that are traced, .* map_batch compiles and runs solve itself: "
+    r"call it outside of jax\.jit, jax\.vmap, jax\.grad and loops"
+)
+
+
+def test_traced_keys_and_members(no_shape_hook):
+    noise = lambda key: cfjax.map_batch(lambda x: x + jax.random.normal(key), np.ones(2)).values  # noqa: E731
+    with pytest.raises(TypeError, match=CAPTURED):
+        jax.jit(noise)(jax.random.key(0))
+    with pytest.raises(TypeError, match=r"members\['x'\] must be an array with values, .* traced"):
+        jax.jit(lambda x: cfjax.map_batch(lambda m: m["x"], {"x": x}).values)(jnp.ones(2))
+    # Without them it is a function of the host like others.
+    found = jax.jit(lambda x: x + cfjax.map_batch(lambda m: 2 * m, np.ones(2)).values)(jnp.ones(2))
+    np.testing.assert_array_equal(found, [3, 3])
+
+
+# Errors within the solve.
+
+
+@pytest.mark.parametrize("mesh", [False, True])
+def test_an_error_names_the_member(tmp_path, computed, capfd, mesh):
+    """One in a chunk of five, two in the last chunk of three: the first of them."""
+
+    def solve(x):
+        return eqx.error_if(x, x < 0, "the member is negative:\n\nbe positive")
+
+    x = np.arange(1.0, SIZE + 1)
+    for bad, chunks in [([7], 1), ([22, 21], 4), ([20], 4)]:
+        del computed[:]
+        changed = x.copy()
+        changed[bad] *= -1
+        options: dict = {"mesh": jax.make_mesh((1,), ("i",))} if mesh else {}
+        folder = tmp_path / str(bad)
+        text = rf"solve failed for member {min(bad)}: the member is negative:\n\nbe positive\n"
+        with pytest.raises(eqx.EquinoxRuntimeError, match=text) as raised:
+            cfjax.map_batch(solve, changed, chunk_size=CHUNK, folder=folder, **options)
+        message = str(raised.value)
+        assert "use throw=False in cfjax.integrate or diffrax.diffeqsolve" in message
+        assert len(message.splitlines()) == 4
+        assert raised.value.__cause__ is None and raised.value.__context__ is None
+        # The chunks before are kept, and the search took few programs: log2(5) of them, and two.
+        assert len(list(folder.glob("chunk_*.bin"))) == chunks
+        assert len(computed) <= chunks + 1 + 3 + 1
+    assert capfd.readouterr() == ("", "")
+
+
+def test_a_failed_solve_names_the_member():
+    y0 = np.full((SIZE, 1), 0.1)
+    y0[17] = 3.0
+    term = cfjax.LieTerm(lambda t, y, args: y * y)
+
+    def solve(y0):
+        return cfjax.integrate(term, cfjax.LieEuler(), 0.0, 9.0, y0, num_steps=90).ys
+
+    with pytest.raises(eqx.EquinoxRuntimeError, match="solve failed for member 17: Nonfinite"):
+        cfjax.map_batch(solve, y0, chunk_size=CHUNK)
+
+
+def test_an_error_that_no_member_repeats_names_the_chunk(monkeypatch):
+    checked = lambda x: eqx.error_if(x, x < 0, "negative")  # noqa: E731
+    x = np.ones(SIZE)
+    x[7] = -1
+    run = lambda: cfjax.map_batch(checked, x, chunk_size=CHUNK)  # noqa: E731
+    with monkeypatch.context() as patch:
+        patch.setattr(jax, "process_count", lambda: 2)
+        with pytest.raises(eqx.EquinoxRuntimeError, match="one of the members 5 to 9: negative"):
+            run()
+    call, calls = jax.stages.Compiled.__call__, []
+
+    def once(self, inputs):
+        calls.append(inputs)
+        return call(self, inputs) if len(calls) < 3 else inputs
+
+    monkeypatch.setattr(jax.stages.Compiled, "__call__", once)
+    with pytest.raises(eqx.EquinoxRuntimeError, match="one of the members 5 to 9: negative"):
+        run()
+
+
+def test_another_error_has_the_members_in_a_note(capfd):
+    def failing(x):
+        if np.any(x < 0):
+            raise ArithmeticError("not on my host")
+        return x
+
+    def solve(x):
+        return jax.pure_callback(failing, x, x, vmap_method="expand_dims")
+
+    x = np.ones(SIZE)
+    x[7] = -1
+    with pytest.raises(RuntimeError, match="not on my host") as raised:
+        cfjax.map_batch(solve, x, chunk_size=CHUNK)
+    assert raised.value.__notes__ == ["cfjax.map_batch was solving the members 5 to 9."]
