@@ -10,6 +10,7 @@ import jax.numpy as jnp
 import jax.tree_util as jtu
 import numpy as np
 from jax.core import Tracer
+from jax.stages import Traced
 from jaxtyping import Array, PyTree, Real
 
 
@@ -97,3 +98,8 @@ def count(name: str, value: Any) -> int:
     if isinstance(value, bool) or not isinstance(value, int | np.integer) or value < 1:
         raise ValueError(f"{name} must be an integer of at least 1, got {value!r}.")
     return int(value)
+
+
+def captures_traced(program: Traced, inputs: PyTree) -> bool:
+    """Whether a program captures values that are traced elsewhere: jax makes these inputs too."""
+    return len(program.jaxpr.in_avals) != len(jtu.tree_leaves(inputs))

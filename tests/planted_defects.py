@@ -646,9 +646,9 @@ DEFECTS = [
         "batch/test_batch.py -k chunks",
     ),
     Defect(
-        "_batch/program.py",
-        "if len(self.traced.jaxpr.in_avals) != len(leaves):",
-        "if False:",
+        "_arguments.py",
+        "return len(program.jaxpr.in_avals) != len(jtu.tree_leaves(inputs))",
+        "return False",
         "a batch that captures what is traced",
         "batch/test_batch.py -k traced",
     ),

@@ -13,6 +13,7 @@ from jax.experimental import multihost_utils
 from jax.sharding import Mesh, NamedSharding, PartitionSpec
 from jaxtyping import Array, PyTree
 
+from .._arguments import captures_traced
 from .fingerprint import environment, fingerprint
 
 OUTSIDE = (
@@ -79,8 +80,7 @@ class Program:
         ]
         run = jax.jit(jax.vmap(one), in_shardings=self.sharding, out_shardings=self.sharding)
         self.traced = run.trace(shapes)
-        # JAX makes what is traced elsewhere an input.
-        if len(self.traced.jaxpr.in_avals) != len(leaves):
+        if captures_traced(self.traced, shapes):
             raise TypeError(
                 "solve must not capture values that are traced, and it captures one of the "
                 f"function that calls map_batch. {OUTSIDE}"

@@ -12,10 +12,12 @@ import jax
 import jax.numpy as jnp
 import jax.tree_util as jtu
 import numpy as np
+from jax.core import Tracer
 from jaxtyping import Array, Float, Int, PyTree
 
 from .._arguments import (
     as_state,
+    captures_traced,
     check_own_tolerances,
     check_term_and_solver,
     count,
@@ -30,6 +32,11 @@ from .result import WorkPrecision
 
 if TYPE_CHECKING:
     import rich.progress
+
+_TRACED = (
+    "What is measured must not be traced, in arguments or captured by a field: call work_precision "
+    "outside of jax.jit, jax.vmap and jax.grad."
+)
 
 Method = diffrax.AbstractSolver | tuple[PyTree, diffrax.AbstractSolver]
 
@@ -95,9 +102,11 @@ def work_precision(
     its own row, with NaN as its error and the reason as its note.
 
     **Raises:** `TypeError` or `ValueError` for arguments of wrong type or value, for example a
-    solver without an error estimate if there are tolerances. An error that a method raises when it
-    is traced is raised again, with the name of the method added.
+    solver without an error estimate if there are tolerances, or a traced value. An error that a
+    method raises when it is traced is raised again, with the name of the method added.
     """
+    if any(isinstance(x, Tracer) for x in jtu.tree_leaves((term, methods, t0, t1, y0, args))):
+        raise TypeError(_TRACED)
     settings = _checked_settings(num_steps, tolerances)
     is_adaptive = tolerances is not None
     solvers = _checked_methods(methods, term, is_adaptive)
@@ -173,8 +182,10 @@ def compiled(fun: Callable[..., PyTree], *args: PyTree) -> tuple[Callable[[PyTre
     arrays, static = eqx.partition(args, eqx.is_array)
     start = time.perf_counter()
     # A new function each time, or jax would remember the old program.
-    program = jax.jit(lambda arrays: fun(*eqx.combine(arrays, static))).lower(arrays).compile()
-    return program, time.perf_counter() - start
+    traced = jax.jit(lambda arrays: fun(*eqx.combine(arrays, static))).trace(arrays)
+    if captures_traced(traced, arrays):
+        raise TypeError(_TRACED)
+    return traced.lower().compile(), time.perf_counter() - start
 
 
 def take_turns(

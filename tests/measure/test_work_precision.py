@@ -569,6 +569,25 @@ def test_a_missing_extra(package, part, equal, monkeypatch):
         getattr(equal, part)()
 
 
+@pytest.mark.parametrize("is_captured", [True, False])
+def test_what_is_traced_is_not_measured(is_captured):
+    def measured(a):
+        args, captured = (None, a) if is_captured else (a, None)
+
+        def field(t, y, args):
+            return cfjax.Rotation(-y / (captured if is_captured else args))
+
+        term, y0 = cfjax.LieTerm(field), jnp.ones(3)
+        methods = {"Euler": cfjax.LieEuler()}
+        cfjax.work_precision(
+            term, 0.0, 1.0, y0, args, methods=methods, reference=np.ones(3), num_steps=[1]
+        )
+        return jnp.sum(a)
+
+    with pytest.raises(TypeError, match=r"must not be traced, .* call work_precision outside of"):
+        jax.grad(measured)(jnp.ones(3))
+
+
 def test_plot_refuses_what_is_no_figure(equal):
     with pytest.raises(TypeError, match=r"figure must be a matplotlib figure, got 'work\.png'"):
         equal.plot("work.png")
