@@ -53,7 +53,7 @@ BUILT_IN: dict[str, tuple[Any, Any]] = {
     "LowRankSkew": (lambda: cfjax.LowRankSkew(random(F64, 5, 2)), frame(F64, 5, 2)),
     "SphereRotation": (lambda: cfjax.SphereRotation(random(F64, 5)), frame(F64, 5, 1)[:, 0]),
     "QuaternionRotation": (
-        lambda: cfjax.QuaternionRotation(random(F64, 3), frame="body", order="wxyz"),
+        lambda: cfjax.QuaternionRotation(random(F64, 3), frame="body", layout="wxyz"),
         jnp.asarray([0.5, -0.1, 0.7, 0.5]),
     ),
     "BorderedSkew": (lambda: cfjax.BorderedSkew(random(F32, 5, 2)), frame(F32, 5, 2)),

@@ -151,7 +151,7 @@ CASES = {
     "RigidMotion of a quaternion and a position": Case(
         partial(cfjax.RigidMotion, frame="fixed", layout="xyz_xyzw"),
         lambda: unit(omega=normal(3), v=normal(3)),
-        normal(7),
+        np.concatenate([normal(3), unit(q=normal(4))["q"]]),
         lambda x, omega, v: (
             block_diagonal(hat(omega), np.roll(quaternions(hat(omega), omega), -1, (0, 1)) / 2),
             np.concatenate([v, 0 * x[3:]]),
@@ -172,7 +172,7 @@ CASES = {
     "PlanarMotion of a complex number and a position": Case(
         partial(cfjax.PlanarMotion, frame="fixed", layout="xy_unit_complex"),
         lambda: unit(omega=normal(), v=normal(2)),
-        normal(4),
+        np.concatenate([normal(2), unit(z=normal(2))["z"]]),
         lambda x, omega, v: (
             block_diagonal(omega * TURN, omega * TURN),
             np.concatenate([v, 0 * x[2:]]),

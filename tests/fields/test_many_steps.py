@@ -33,15 +33,19 @@ def pose(rotation: Any, place: Any) -> Any:
 
 
 def motion(frame: Any) -> Any:
-    return lambda angle, y: cfjax.RigidMotion(omega=angle * AXIS, v=V, frame=frame)
+    return lambda angle, y: cfjax.RigidMotion(
+        omega=angle * AXIS, v=V, frame=frame, layout="wxyz_xyz"
+    )
 
 
 def planar(frame: Any) -> Any:
-    return lambda angle, y: cfjax.PlanarMotion(omega=angle, v=V[:2], frame=frame)
+    return lambda angle, y: cfjax.PlanarMotion(
+        omega=angle, v=V[:2], frame=frame, layout="unit_complex_xy"
+    )
 
 
-def quaternion(frame: Any, order: Any) -> Any:
-    return lambda angle, y: cfjax.QuaternionRotation(angle * AXIS, frame=frame, order=order)
+def quaternion(frame: Any, layout: Any) -> Any:
+    return lambda angle, y: cfjax.QuaternionRotation(angle * AXIS, frame=frame, layout=layout)
 
 
 def sphere(angle: Any, y: Any) -> Any:
@@ -146,8 +150,8 @@ def test_a_fast_spin_at_a_loose_tolerance():
         return quaternion("body", "wxyz")(1.0, q).combine(
             (6.0, 1.0),
             (
-                cfjax.QuaternionRotation(AXIS, frame="body", order="wxyz"),
-                cfjax.QuaternionRotation(wobble, frame="body", order="wxyz"),
+                cfjax.QuaternionRotation(AXIS, frame="body", layout="wxyz"),
+                cfjax.QuaternionRotation(wobble, frame="body", layout="wxyz"),
             ),
         )
 

@@ -15,7 +15,7 @@ Q = jnp.asarray([1.0, 0.0, 0.0, 0.0])
 def tumbling(t, q, args):
     """About 6 radians in a unit of time, about an axis that follows the state."""
     omega = jnp.asarray([6.0, 0.0, 0.0]) + args * q[1:]
-    return cfjax.QuaternionRotation(omega, frame="body", order="wxyz")
+    return cfjax.QuaternionRotation(omega, frame="body", layout="wxyz")
 
 
 def reference(t1, args):
@@ -53,7 +53,7 @@ def test_a_controlled_step_is_taken_again(estimate):
 FIELDS = {
     "Rotation": (lambda w: cfjax.Rotation(w), jnp.asarray([0.6, 0.0, 0.8])),
     "QuaternionRotation": (
-        lambda w: cfjax.QuaternionRotation(w, frame="fixed", order="wxyz"),
+        lambda w: cfjax.QuaternionRotation(w, frame="fixed", layout="wxyz"),
         Q,
     ),
     "RigidMotion": (
