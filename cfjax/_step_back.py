@@ -8,10 +8,10 @@ import jax
 import jax.numpy as jnp
 import jax.tree_util as jtu
 from jax import lax
-from jaxtyping import Array, Bool, PyTree
+from jaxtyping import Array, Bool, Inexact, PyTree, Real
 
 from ._numerics.checks import Fault
-from ._solvers.base import largest
+from ._solvers.base import size
 
 Step = Callable[[PyTree], PyTree]
 
@@ -53,8 +53,8 @@ def repeat_and_undo(
         rest, back = eqx.combine(rest, static)
         fixed = rest[1]
 
-        def undo(state: tuple[PyTree, PyTree, PyTree], _: None) -> tuple[Any, None]:
-            carry, of_end, of_step = state
+        def undo(state: tuple[PyTree, ...], _: None) -> tuple[Any, None]:
+            carry, of_end, of_step, sizes = state
             carry = back(carry)
             varying, rest = _parts(carry)
 
@@ -64,13 +64,20 @@ def repeat_and_undo(
 
             _, pullback = jax.vjp(stepped, varying, moving[1])
             of_start, more = pullback(of_end)
-            return (carry, of_start, jtu.tree_map(jnp.add, of_step, more)), None
+            of_step = jtu.tree_map(jnp.add, of_step, more)
+            sizes = jtu.tree_map(lambda most, y: jnp.maximum(most, size(y)), sizes, carry[1])
+            return (carry, of_start, of_step, sizes), None
 
         of_end = eqx.filter(derivative, jtu.tree_map(eqx.is_inexact_array, end))
-        state = end, of_end, jtu.tree_map(jnp.zeros_like, moving[1])
-        (found, *derivatives), _ = lax.scan(undo, state, length=num_steps)
-        start, _ = eqx.combine(moving, rest)
-        fault = Fault.none().with_case(_misses(start[1], found[1], end[1]), _MISSED)
+        state = end, of_end, jtu.tree_map(jnp.zeros_like, moving[1]), jtu.tree_map(size, end[1])
+        (found, *derivatives, sizes), _ = lax.scan(undo, state, length=num_steps)
+        start, step = eqx.combine(moving, rest)
+
+        def moved(y: PyTree) -> PyTree:
+            return step(eqx.tree_at(lambda carry: carry[1], start, y))[1]
+
+        misses = _misses(moved, start[1], found[1], sizes)
+        fault = Fault.none().with_case(misses, _MISSED)
         zero = (fault.error if throw else fault.nan)(jnp.zeros(()))
         return jtu.tree_map(lambda x: x + zero.astype(x.dtype), tuple(derivatives)), None
 
@@ -83,11 +90,31 @@ def _parts(tree: PyTree) -> tuple[PyTree, PyTree]:
     return eqx.partition(tree, eqx.is_inexact_array)
 
 
-def _misses(start: PyTree, found: PyTree, end: PyTree) -> Bool[Array, ""]:
-    """Whether two states differ by more than half of the digits of what is on the way.
+def _misses(
+    step: Callable[[PyTree], PyTree], start: PyTree, found: PyTree, sizes: PyTree
+) -> Bool[Array, ""]:
+    """Whether an array of the state is off by more than half of its digits.
 
-    The digits are those of the part of lowest precision.
+    `sizes` are those of the arrays on the way. An array that is zero but for the rounding of the
+    others has no digits of its own, so it may be as far off as a step moves it if all others change
+    in half of their digits.
     """
-    eps = max((float(jnp.finfo(x.dtype).eps) for x in jtu.tree_leaves(start)), default=0.0)
-    off = largest(jtu.tree_map(jnp.subtract, found, start))
-    return ~(off <= eps**0.5 * largest((start, end)))
+
+    def half(x: Array, own: Real[Array, ""]) -> Real[Array, ""]:
+        return float(jnp.finfo(x.dtype).eps) ** 0.5 * own
+
+    allowed = jtu.tree_map(half, start, sizes)
+    _, moves = jax.jvp(step, (start,), (jtu.tree_map(_change, start, allowed),))
+
+    def part(start: Array, found: Array, own: Real[Array, ""], move: Array) -> Bool[Array, ""]:
+        # True for NaN.
+        return ~(size(found - start) <= jnp.maximum(own, size(move)))
+
+    parts = jtu.tree_map(part, start, found, allowed, moves)
+    return jnp.any(jnp.asarray(jtu.tree_leaves(parts), bool))
+
+
+def _change(x: Array, by: Real[Array, ""]) -> Inexact[Array, "..."]:
+    """A change of all entries by up to this, in which no symmetry hides what depends on them."""
+    change = by * jnp.cos(jnp.arange(x.size, dtype=by.dtype)).reshape(x.shape)
+    return (1 + 1j) * change if jnp.iscomplexobj(x) else change

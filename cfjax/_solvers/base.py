@@ -222,12 +222,9 @@ def is_finite(y: PyTree) -> Bool[Array, ""]:
     return jnp.asarray([jnp.all(jnp.isfinite(leaf)) for leaf in jtu.tree_leaves(y)], bool).all()
 
 
-def largest(y: PyTree) -> Real[Array, ""]:
+def size(x: Array) -> Real[Array, ""]:
     """The largest modulus of an entry."""
-    sizes = [jnp.max(jnp.abs(leaf), initial=0) for leaf in jtu.tree_leaves(y)]
-    # Parts may be of different precisions.
-    with jax.numpy_dtype_promotion("standard"):
-        return jnp.max(jnp.asarray(sizes), initial=0)
+    return jnp.max(jnp.abs(x), initial=0)
 
 
 def result_of(y: PyTree) -> diffrax.RESULTS:

@@ -1,23 +1,22 @@
 """The implicit midpoint rule at the mean of a flow: an exact Poisson map where nothing splits."""
 
-from collections.abc import Callable
 from typing import Any
 
 import diffrax
 import equinox as eqx
 import jax.numpy as jnp
 import jax.tree_util as jtu
-from jax import lax
-from jaxtyping import Array, Bool, PyTree
+from jaxtyping import PyTree
 
 from .._control_term import is_driven
 from .._field import is_field, to_chart
 from .._term import product
-from .base import AbstractLieSolver, begun, ended, largest, time_at
+from .base import AbstractLieSolver, begun, ended, time_at
 from .chart import moved
 from .compensation import with_sums
 from .compiled import shared_end
 from .dense import Interpolation, Path
+from .fixed_point import fixed_point
 
 # The flow of the step's one field, for a part of the step.
 _EXTENSION = (((1.0,),),)
@@ -109,54 +108,3 @@ def _mean(field: PyTree, y0: PyTree) -> PyTree:
         return charted.from_chart(charted.mean(point))
 
     return jtu.tree_map(part, field, y0, is_leaf=is_field)
-
-
-def fixed_point(
-    fun: Callable[[PyTree], PyTree], start: PyTree, rtol: Any, max_steps: int
-) -> tuple[PyTree, Bool[Array, ""]]:
-    """A solution of `fun(y) = y` by iteration from `start`, and whether it is one."""
-
-    def iterate(step: Callable[[PyTree], PyTree], start: PyTree) -> tuple[PyTree, Array]:
-        """Replaces y by `step(y)` until the changes are rounding, or below the tolerance.
-
-        Eigenvalues come in pairs of opposite signs, with which a change may be larger than the last
-        one. So it is compared with the one before.
-        """
-        eps = max(float(jnp.finfo(x.dtype).eps) for x in jtu.tree_leaves(start))
-        unit = 2 * eps if rtol is None else rtol
-
-        def goes_on(carry: Any) -> Array:
-            y, k, last, before = carry
-            is_falling = (last < before[0]) | (k < 4)
-            return (k < max_steps) & (last > unit * largest(y)) & is_falling
-
-        def turn(carry: Any) -> Any:
-            y, k, last, before = carry
-            new = step(y)
-            change = largest(jtu.tree_map(jnp.subtract, new, y))
-            return new, k + 1, change, jnp.stack([before[1], last])
-
-        infinite = jnp.full((), jnp.inf, jnp.result_type(largest(start)))
-        carry = start, 0, infinite, jnp.stack([infinite, infinite])
-        y, _, last, _ = lax.while_loop(goes_on, turn, carry)
-        # Where changes no longer fall they are of the size that the rounding of the field leaves.
-        least = 1e4 * eps if rtol is None else max(rtol, 1e4 * eps)
-        return y, (last <= least * largest(y)).astype(infinite.dtype)
-
-    def residual(y: PyTree) -> PyTree:
-        return jtu.tree_map(jnp.subtract, y, fun(y))
-
-    def solve(residual: Callable[[PyTree], PyTree], start: PyTree) -> tuple[PyTree, Array]:
-        return iterate(lambda y: jtu.tree_map(jnp.subtract, y, residual(y)), start)
-
-    def linear_solve(matvec: Callable[[PyTree], PyTree], b: PyTree) -> PyTree:
-        def step(x: PyTree) -> PyTree:
-            return jtu.tree_map(lambda x, a, b: x - (a - b), x, matvec(x), b)
-
-        return iterate(step, b)[0]
-
-    def tangent_solve(matvec: Callable[[PyTree], PyTree], b: PyTree) -> PyTree:
-        return lax.custom_linear_solve(matvec, b, linear_solve, linear_solve)
-
-    y, has_converged = lax.custom_root(residual, start, solve, tangent_solve, has_aux=True)
-    return y, has_converged > 0
