@@ -129,8 +129,9 @@ def integrate(
         )
     t0, t1 = time_scalar("t0", t0, dtype), time_scalar("t1", t1, dtype)
     args = jtu.tree_map(lambda x: jnp.asarray(x) if isinstance(x, float | complex) else x, args)
-    # In a program that somebody else compiles, an error is part of that.
-    is_traced = any(isinstance(x, Tracer) for x in (jnp.zeros(()), *jtu.tree_leaves((t0, y0))))
+    # In a program that somebody else compiles, an error is part of that. What else is traced, be it
+    # an argument or what a field closes over, shows in the results.
+    is_compiled = isinstance(jnp.zeros(()), Tracer)
     solution, fault = equal_steps(
         term,
         solver,
@@ -143,9 +144,10 @@ def integrate(
         save_initial,
         checkpoint_every,
         step_back,
-        throw=throw and is_traced,
+        throw=throw and is_compiled,
+        throw_in_reverse=throw,
     )
-    if throw and not is_traced:
+    if throw and not is_compiled:
         solution = _raised(solution, fault)
     return solution
 
@@ -164,8 +166,11 @@ def equal_steps(
     checkpoint_every: int | None,
     step_back: bool,
     throw: bool,
+    throw_in_reverse: bool = False,
 ) -> tuple[diffrax.Solution, Fault]:
     """`integrate` of checked arguments, and what is wrong with them, which is an error if `throw`.
+
+    What goes wrong in reverse mode is an error if `throw_in_reverse`: nobody sees it afterwards.
 
     If not, the program calls nothing on the host, so JAX can keep it on disk, and the states are
     NaN. `num_steps` may be traced where only the final state is saved. Then one program serves all
@@ -231,7 +236,7 @@ def equal_steps(
                 there = eqx.filter_closure_convert(forward, carry)
                 back = eqx.filter_closure_convert(back, carry)
             several = lambda step, carry, number: repeat(step, carry, number, order=0)[0]  # noqa: E731
-            return repeat_and_undo(several, there, back, carry, number, throw)
+            return repeat_and_undo(several, there, back, carry, number, throw_in_reverse)
         # XLA would scalarise a loop of one turn, and compute the step anew for each of its uses.
         if isinstance(number, int) and number == 1:
             return forward(carry)
@@ -288,7 +293,7 @@ def equal_steps(
 def _raised(solution: diffrax.Solution, fault: Fault) -> diffrax.Solution:
     """The solution, or the error that it is."""
     if any(isinstance(x, Tracer) for x in jtu.tree_leaves((fault, solution.result))):
-        # The field closes over values of `jax.vmap`.
+        # `jax.vmap` or a derivative outside of a program.
         zero = fault.error(jnp.zeros(())) + _error_of(solution.result)
         return eqx.tree_at(lambda s: s.ys, solution, needing(zero, solution.ys))
     if jtu.tree_leaves(solution.ys):
