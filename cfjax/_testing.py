@@ -95,8 +95,8 @@ def check_terms(term: diffrax.MultiTerm, t: Any, y: PyTree, args: PyTree = None)
     about all three is not.
 
     For each term the flow in one unit of time is compared with that in two halves, between which
-    the field is evaluated again. The tolerance is half of the digits, relative to how far the state
-    moves. Terms that a path drives, such as noise, are not checked.
+    the field is evaluated again. The tolerance is half of the digits, relative to how far each
+    array of the state moves. Terms that a path drives, such as noise, are not checked.
 
     **Arguments:** `term`, a `diffrax.MultiTerm`; `t`, `y` and `args` as the fields get them, with a
     state that is not special, such as a random one.
@@ -107,21 +107,23 @@ def check_terms(term: diffrax.MultiTerm, t: Any, y: PyTree, args: PyTree = None)
     if not isinstance(term, diffrax.MultiTerm):
         raise TypeError(f"term must be a diffrax.MultiTerm, got {term!r}.")
     y = jtu.tree_map(jnp.asarray, y)
-    eps = float(max(jnp.finfo(leaf.dtype).eps for leaf in jtu.tree_leaves(y)))
-    # What a flow of some roundings leaves of a state that it hardly moves.
-    rounding = 16 * eps * float(_size(y))
     for k, part in enumerate(term.terms):
         if is_driven(part):
             continue
         whole = _carried(part, t, y, args, 1.0)
         halves = _carried(part, t, _carried(part, t, y, args, 0.5), args, 0.5)
-        way, off = (float(_size(jtu.tree_map(jnp.subtract, whole, x))) for x in (y, halves))
-        if not off <= np.sqrt(eps) * way + rounding:
-            raise ValueError(
-                f"The field of terms[{k}] must not change along its own flow, and its flow in one "
-                f"unit of time is off by {off:.1g}, where it moves the state by {way:.1g}. Split "
-                "it into terms that do not change what they depend on."
-            )
+        for (path, start), *ends in zip(
+            jtu.tree_leaves_with_path(y), *map(jtu.tree_leaves, (whole, halves)), strict=True
+        ):
+            way, off = (float(_size(ends[0] - x)) for x in (start, ends[1]))
+            eps = float(jnp.finfo(start.dtype).eps)
+            # What a flow of some roundings leaves of an array that it hardly moves.
+            if not off <= np.sqrt(eps) * way + 16 * eps * float(_size(start)):
+                raise ValueError(
+                    f"The field of terms[{k}] must not change along its own flow, and its flow in "
+                    f"one unit of time is off by {off:.1g}, where it moves y{jtu.keystr(path)} by "
+                    f"{way:.1g}. Split it into terms that do not change what they depend on."
+                )
 
 
 def _carried(term: Any, t: Any, y: PyTree, args: PyTree, time: float) -> PyTree:

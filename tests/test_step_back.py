@@ -143,14 +143,16 @@ def decay(t, y, args):
     return cfjax.Scaling(jnp.full_like(y, -40.0))
 
 
+FADING = diffrax.MultiTerm(cfjax.LieTerm(source), cfjax.LieTerm(decay))
+
+
 @pytest.mark.parametrize("throw", [True, False])
 def test_a_way_back_that_misses_the_start(throw):
     """Of what has decayed by exp(-40) no digits are left beside the source."""
 
     def end(y0):
-        term = diffrax.MultiTerm(cfjax.LieTerm(source), cfjax.LieTerm(decay))
         options = dict(num_steps=10, step_back=True, throw=throw)
-        return jnp.sum(cfjax.integrate(term, cfjax.Strang(), 0.0, 1.0, y0, **options).ys)
+        return jnp.sum(cfjax.integrate(FADING, cfjax.Strang(), 0.0, 1.0, y0, **options).ys)
 
     y0 = jnp.asarray([1.0, 2.0])
     if throw:
@@ -158,6 +160,66 @@ def test_a_way_back_that_misses_the_start(throw):
             eqx.filter_jit(jax.grad(end))(y0)
     else:
         assert np.all(np.isnan(jax.grad(end)(y0)))
+
+
+def test_a_large_part_beside_one_that_misses_the_start():
+    """A position, to whose digits the other part is nothing."""
+
+    def beside(field):
+        return cfjax.LieTerm(lambda t, y, args: {"x": None, "y": field(t, y["y"], args)})
+
+    def end(y0, x):
+        term = diffrax.MultiTerm(beside(source), beside(decay))
+        start = {"x": x, "y": y0}
+        options = dict(num_steps=10, step_back=True, throw=False)
+        return jnp.sum(cfjax.integrate(term, cfjax.Strang(), 0.0, 1.0, start, **options).ys["y"])
+
+    assert np.all(np.isnan(jax.grad(end)(jnp.asarray([1.0, 2.0]), jnp.asarray(1.5e11))))
+
+
+def test_a_part_that_is_zero_but_for_rounding():
+    """Momenta among forces that cancel are never back at their digits, as they have none."""
+
+    def force(t, y, args):
+        x = jnp.pad(y["q"], 1, mode="edge")
+        # An equilibrium: each end is held by a constant force.
+        return {"q": None, "p": (x[2:] + x[:-2] - 2 * x[1:-1]).at[np.array([0, -1])].set(0.0)}
+
+    term = diffrax.MultiTerm(
+        cfjax.LieTerm(force), cfjax.LieTerm(lambda t, y, args: {"q": y["p"], "p": None})
+    )
+
+    def end(q, step_back):
+        start = {"q": q, "p": jnp.zeros(6)}
+        options = dict(num_steps=50, step_back=step_back, throw=False)
+        ys = cfjax.integrate(term, cfjax.Strang(), 0.0, 5.0, start, **options).ys
+        return jnp.sum(jnp.sin(ys["q"][-1]))
+
+    q = 100 / 3 + 0.1 * jnp.arange(6.0)
+    found, expected = (jax.grad(end)(q, step_back) for step_back in (True, False))
+    # Fifty steps, each of a few roundings of numbers that grow to 33, in the sine as well.
+    np.testing.assert_allclose(found, expected, rtol=0, atol=1e-12)
+
+
+@pytest.mark.parametrize("is_captured", [False, True], ids=["args", "captured"])
+@pytest.mark.parametrize("transform", ["grad", "vmap"])
+def test_the_error_where_the_start_has_no_derivative(transform, is_captured):
+    def end(rate):
+        if is_captured:
+            first, args = cfjax.LieTerm(lambda t, y, _: rate * jnp.ones_like(y)), None
+        else:
+            first, args = cfjax.LieTerm(lambda t, y, rate: rate * jnp.ones_like(y)), rate
+        term = diffrax.MultiTerm(first, FADING.terms[1])
+        options = dict(num_steps=10, step_back=True)
+        return jnp.sum(
+            cfjax.integrate(term, cfjax.Strang(), 0.0, 1.0, jnp.ones(2), args, **options).ys
+        )
+
+    gradient, rate = jax.grad(end), jnp.asarray(1.0)
+    if transform == "vmap":
+        gradient, rate = jax.vmap(gradient), rate[None]
+    with pytest.raises(RuntimeError, match="step_back led back to a start"):
+        jax.block_until_ready(gradient(rate))
 
 
 @pytest.mark.slow
