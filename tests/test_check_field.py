@@ -338,6 +338,14 @@ def test_terms_that_change_along_their_flow_are_named(fields, place):
         cfjax.check_terms(sum_of(*fields), 0.0, BODY, 2.0)
 
 
+def test_a_small_array_that_changes_beside_a_large_one_that_moves():
+    def far(t, y, args):
+        return {"q": jnp.full(3, 1e9), "p": tumble(jnp.ones(3))(t, y, args)["p"]}
+
+    with pytest.raises(ValueError, match=r"terms\[0\] must not change .* where it moves y\['p'\]"):
+        cfjax.check_terms(sum_of(far, drift), 0.0, BODY, 2.0)
+
+
 def test_a_term_that_is_no_sum(no_shape_hook):
     with pytest.raises(TypeError, match=r"must be a diffrax\.MultiTerm"):
         cfjax.check_terms(cfjax.LieTerm(drift), 0.0, BODY)
