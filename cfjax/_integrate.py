@@ -83,7 +83,8 @@ def integrate(
       what happened, and invalid values of the arguments give NaN. In a batch made by `jax.vmap` one
       failure is an error for the whole batch. An error check within a function that you compile is
       a call of the host, so JAX does not keep such a program on disk. It keeps programs with
-      `throw=False`, and every call from Python, where the host checks the result.
+      `throw=False`, and every call from Python, where the host checks the result; but a gradient
+      with `step_back` checks in its program.
 
     **Returns:** a `diffrax.Solution`. Its `ts` has shape `(num_saves,)`, and each leaf of `ys` has
     one more axis of that length in front; the last entry is the state at `t1`. The initial state is
@@ -92,7 +93,8 @@ def integrate(
     **Raises:** `TypeError` or `ValueError` for arguments of wrong type or value. A runtime error if
     `y0` or a saved state has an entry that is not finite, if `y0` is off the manifold that a field
     acts on, if a time is NaN, if a step is shorter than the rounding of a time, if the solver
-    reports a failure, or if the steps back miss the start by more than half of the digits.
+    reports a failure, or if the steps back miss an array of the start by more than half of its
+    digits.
     """
     check_term_and_solver(term, solver)
     check_own_tolerances(solver)

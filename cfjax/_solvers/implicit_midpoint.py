@@ -32,11 +32,12 @@ class ImplicitMidpoint(AbstractLieSolver):
     the middle of the flow (`AbstractFrozenField.mean`), and the step is symmetric only.
 
     Y is found by fixed-point iteration, 10 to 25 evaluations of the field for usual steps. It ends
-    where the changes are rounding, as what is left over makes the energy drift. Derivatives,
-    forward and reverse, are those of the implicit function, by the same iteration. Output within a
-    step follows the flow, which is of order 2.
+    where the changes of each array are rounding of its own size, as what is left over makes the
+    energy drift. Derivatives, forward and reverse, are those of the implicit function, by the same
+    iteration, and NaN where that does not converge. Output within a step follows the flow, which is
+    of order 2.
 
-    **Arguments:** `rtol`, a tolerance for the changes relative to the state, by default rounding:
+    **Arguments:** `rtol`, a tolerance for the changes relative to each array, by default rounding:
     1e-10 saves a third of the evaluations. `max_steps`, the most iterations.
 
     **Raises** `ValueError` for an `rtol` that is not positive or `max_steps` below 1. A step whose
