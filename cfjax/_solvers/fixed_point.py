@@ -5,9 +5,8 @@ from typing import NamedTuple
 
 import jax.numpy as jnp
 import jax.tree_util as jtu
-import numpy as np
 from jax import lax
-from jaxtyping import Array, Bool, Int, PyTree, Real
+from jaxtyping import Array, Bool, Int, PyTree
 
 from .base import size
 
@@ -45,13 +44,17 @@ def fixed_point(
 
 
 class _Turn(NamedTuple):
-    """How far an iteration is: the changes are of each array, in units of its rounding."""
+    """How far an iteration is.
+
+    `starts` are the sizes of the arrays at the start, and `changes` how much they changed, the last
+    time first.
+    """
 
     y: PyTree
+    new: PyTree
     number: Int[Array, ""]
-    change: Real[Array, " arrays"]
-    # The last change and the one before.
-    past: tuple[Real[Array, " arrays"], Real[Array, " arrays"]]
+    starts: list[Array]
+    changes: tuple[list[Array], list[Array], list[Array]]
 
 
 def _iterated(
@@ -66,47 +69,47 @@ def _iterated(
     may change small ones in every turn, such as a momentum among forces that nearly cancel.
     """
     leaves, structure = jtu.tree_flatten(start)
-    if not leaves:
-        return start, jnp.asarray(True)
-    sizes = list(map(size, leaves))
-    tolerance = np.asarray([1 if rtol is None else rtol / _unit(x) for x in leaves], np.float32)
-    # What the rounding of a field may leave.
-    most = np.maximum(tolerance, 5e3)
 
     def are_done(turn: _Turn) -> Bool[Array, " arrays"]:
-        # Eigenvalues come in pairs of opposite signs, with which a change may be larger than the
-        # last one. So it is compared with the one before.
-        has_stalled = (turn.number >= 4) & (turn.change >= turn.past[1])
-        return turn.change <= jnp.where(has_stalled, most, tolerance)
+        def is_done(new: Array, own: Array, last: Array, _: Array, before: Array) -> Array:
+            eps = float(jnp.finfo(new.dtype).eps)
+            tolerance = 2 * eps if rtol is None else rtol
+            # Eigenvalues come in pairs of opposite signs, with which a change may be larger than
+            # the last one. So it is compared with the one before. What does not fall may be what
+            # the rounding of the field leaves.
+            has_stalled = (turn.number >= 4) & (last >= before)
+            most = jnp.where(has_stalled, max(1e4 * eps, tolerance), tolerance)
+            whole = jnp.maximum(size(new), own)
+            return jnp.isfinite(last) & (last <= most.astype(own.dtype) * whole)
 
+        parts = map(is_done, structure.flatten_up_to(turn.new), turn.starts, *turn.changes)
+        return jnp.asarray(list(parts), bool)
+
+    # XLA computes the start and a step once if what else uses their entries is in another turn.
     def turned(turn: _Turn) -> _Turn:
-        new = step(turn.y)
-        ys, news = jtu.tree_leaves(turn.y), structure.flatten_up_to(new)
-        changes = jnp.stack(list(map(_change, ys, news, sizes)))
-        turn = _Turn(new, turn.number + 1, changes, (turn.change, turn.past[0]))
-        if len(leaves) == 1:
-            return turn
-        done = are_done(turn)
-        kept = done & ~jnp.all(done)
-        chosen = [jnp.where(k, y, new) for k, y, new in zip(kept, ys, news, strict=True)]
-        return turn._replace(y=structure.unflatten(chosen))
+        y = turn.new
+        if len(leaves) > 1:
+            done = are_done(turn)
+            pairs = zip(structure.flatten_up_to(turn.y), structure.flatten_up_to(y), strict=True)
+            y = structure.unflatten(
+                jnp.where(k, *pair) for k, pair in zip(done, pairs, strict=True)
+            )
+        new = step(y)
+        change = jtu.tree_leaves(jtu.tree_map(lambda new, y: size(new - y), new, y))
+        starts = [
+            jnp.where(turn.number == 0, size(y), own)
+            for y, own in zip(jtu.tree_leaves(y), turn.starts, strict=True)
+        ]
+        last, before, _ = turn.changes
+        return _Turn(y, new, turn.number + 1, starts, (change, last, before))
 
     def goes_on(turn: _Turn) -> Bool[Array, ""]:
-        # NaN never ends otherwise.
-        is_nan = jnp.isnan(jnp.max(turn.change))
-        return (turn.number < max_steps) & ~jnp.all(are_done(turn)) & ~is_nan
+        # What is not a number never ends otherwise.
+        is_number = jnp.all(jnp.asarray([~jnp.isnan(x) for x in turn.changes[0]], bool))
+        return (turn.number < max_steps) & ~jnp.all(are_done(turn)) & is_number
 
-    infinite = jnp.full(len(leaves), jnp.inf, jnp.float32)
-    turn = _Turn(start, jnp.asarray(0), infinite, (infinite, infinite))
+    zeros = [jnp.zeros((), jnp.finfo(x.dtype).dtype) for x in leaves]
+    infinite = [jnp.full_like(x, jnp.inf) for x in zeros]
+    turn = _Turn(start, start, jnp.asarray(0), zeros, (infinite, infinite, infinite))
     turn = lax.while_loop(goes_on, turned, turn)
-    return turn.y, jnp.all(are_done(turn))
-
-
-def _unit(x: Array) -> float:
-    return 2 * float(jnp.finfo(x.dtype).eps)
-
-
-def _change(y: Array, new: Array, start: Real[Array, ""]) -> Real[Array, ""]:
-    """By how many units of rounding an array changes, for what is as large as it is or was."""
-    whole = jnp.maximum(jnp.maximum(size(new), start), jnp.finfo(y.dtype).tiny)
-    return (size(new - y) / whole / _unit(y)).astype(jnp.float32)
+    return turn.new, jnp.all(are_done(turn))
