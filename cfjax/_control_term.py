@@ -1,7 +1,7 @@
 """`LieControlTerm`: frozen fields that are driven by a path, such as Brownian motion."""
 
 from collections.abc import Callable
-from typing import Any, NoReturn
+from typing import Any
 
 import diffrax
 import equinox as eqx
@@ -100,21 +100,3 @@ def paths(terms: PyTree[diffrax.AbstractTerm]) -> list[diffrax.AbstractPath]:
 def is_driven(terms: PyTree[diffrax.AbstractTerm]) -> bool:
     """Whether a path drives one of these terms, be it noise or not."""
     return bool(paths(terms))
-
-
-class _NoEstimate(eqx.Module):
-    """In place of the error of a part of the state: says why there is none if it is used."""
-
-    def _refuse(self, *args: Any) -> NoReturn:
-        raise TypeError(
-            "There is no error estimate where a path drives the equation: an embedded method sees "
-            "the same chord of the path. For adaptive steps write diffrax.HalfSolver(solver), with "
-            "a diffrax.VirtualBrownianTree and "
-            "diffrax.ClipStepSizeController(controller, store_rejected_steps=...)."
-        )
-
-    __truediv__ = __mul__ = __add__ = __sub__ = __abs__ = __array__ = __jax_array__ = _refuse
-
-
-def no_estimate(y: PyTree) -> PyTree:
-    return jtu.tree_map(lambda _: _NoEstimate(), y)

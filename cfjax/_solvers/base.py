@@ -15,7 +15,7 @@ from jax import lax
 from jax.core import Tracer
 from jaxtyping import Array, Bool, PyTree, Real
 
-from .._control_term import is_driven, no_estimate
+from .._control_term import is_driven
 from .._field import is_field
 from .._numerics.checks import Fault
 from .._term import product, velocity
@@ -155,12 +155,7 @@ class AbstractChartSolver(AbstractLieSolver):
         is_usual = isinstance(t0, Tracer) and not is_rewritten()
         step = _step_once if is_usual else AbstractChartSolver._step
         solver: Any = self.for_terms(terms)
-        y1, error, dense_info, solver_state, result = step(
-            solver, terms, t0, t1, y0, args, solver_state, made_jump
-        )
-        if solver is not self and isinstance(self, diffrax.AbstractAdaptiveSolver):
-            error = no_estimate(y0)
-        return y1, error, dense_info, solver_state, result
+        return step(solver, terms, t0, t1, y0, args, solver_state, made_jump)
 
     def _step(self, terms, t0, t1, y0, args, solver_state, made_jump):
         compensation = solver_state.compensation
