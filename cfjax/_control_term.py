@@ -12,6 +12,8 @@ from jaxtyping import PyTree
 from ._field import tangent
 from ._term import checked
 
+_INTERPOLATIONS = diffrax.AbstractGlobalInterpolation, diffrax.AbstractLocalInterpolation
+
 
 class LieControlTerm(diffrax.AbstractTerm):
     """The term `g(t, y, args) dx(t)` of an equation on a manifold that is driven by a path x.
@@ -58,6 +60,10 @@ class LieControlTerm(diffrax.AbstractTerm):
         return _Place.of(t, y, args)
 
     def contr(self, t0: Any, t1: Any, **kwargs: Any) -> PyTree:
+        if isinstance(self.control, _INTERPOLATIONS):
+            # diffrax subtracts their values as if each were one array.
+            start, end = self.control.evaluate(t0), self.control.evaluate(t1)
+            return jtu.tree_map(jnp.subtract, end, start)
         if not isinstance(self.control, diffrax.AbstractBrownianPath):
             return self.control.evaluate(t0, t1)
         # Brownian motion is drawn forwards in time.

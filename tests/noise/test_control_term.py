@@ -277,6 +277,30 @@ def test_a_smooth_path():
     close(back, Y0, atol=10 * errors[-1])
 
 
+@pytest.mark.parametrize("kind", ["linear", "cubic"])
+def test_a_smooth_path_of_several_parts(kind):
+    """diffrax subtracts values of its interpolations as if each were one array."""
+    times = jnp.linspace(0.0, 1.0, 5)
+    values = jnp.stack([jnp.sin(3 * times), times**2], 1)
+
+    def path_of(values):
+        if kind == "linear":
+            return diffrax.LinearInterpolation(times, values)
+        return diffrax.CubicInterpolation(
+            times, diffrax.backward_hermite_coefficients(times, values)
+        )
+
+    def of_parts(t, y, args, dx):
+        return noise(t, y, args, jnp.stack([dx["a"], dx["b"]]))
+
+    parts = path_of({"a": values[:, 0], "b": values[:, 1]})
+    whole = cfjax.LieControlTerm(noise, path_of(values))
+    # The path moves by up to 0.9 in a step, and so do the points.
+    expected = step(cfjax.CF4(), whole)
+    close(step(cfjax.CF4(), cfjax.LieControlTerm(of_parts, parts)), expected)
+    assert np.linalg.norm(expected - Y0) > 0.1
+
+
 # Precision and transformations
 
 
