@@ -3,6 +3,7 @@
 from collections.abc import Callable
 from typing import Any
 
+import equinox as eqx
 import jax
 import jax.numpy as jnp
 import jax.tree_util as jtu
@@ -26,7 +27,10 @@ def _depending(fun: Callable[[PyTree], tuple[PyTree, PyTree]], x: PyTree) -> lis
 
     Under `jax.vmap` over x alone, what does not depend on it has no axis of the batch. That sees
     through every operation, and takes shapes and dtypes of x for what they are. (A derivative would
-    not see comparisons.)
+    not see comparisons.) What has no rule for batches, such as a function of the host, may depend
+    on all that it gets: then the only part is None.
+
+    **Raises** what `fun(x)` itself raises.
     """
     found = []
 
@@ -49,5 +53,19 @@ def _depending(fun: Callable[[PyTree], tuple[PyTree, PyTree]], x: PyTree) -> lis
         many = jtu.tree_map(
             lambda x: jax.ShapeDtypeStruct((1, *jnp.shape(x)), jnp.result_type(x)), x
         )
-        jax.eval_shape(jax.vmap(look), many)
+        try:
+            jax.eval_shape(jax.vmap(look), many)
+        except Exception:
+            # What is wrong with the field itself, it says itself.
+            eqx.filter_eval_shape(fun, x)
+            return [("", None)]
     return found
+
+
+def unseen(name: str) -> str:
+    """What gives None as the part that depends on `name`."""
+    return (
+        f"The field gives {name} to a function of the host (jax.pure_callback without vmap_method, "
+        "or jax.experimental.io_callback), or to another operation that JAX has no rule for in a "
+        f"batch. What that returns counts as dependent on {name}"
+    )

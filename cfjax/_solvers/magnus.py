@@ -17,7 +17,7 @@ from .._term import product
 from .base import AbstractChartSolver, State, Step, check_choice
 from .chart import Chart
 from .dense import Path
-from .dependence import depending_on_state
+from .dependence import depending_on_state, unseen
 from .stages import can_roll, rolled_flows
 
 
@@ -38,8 +38,7 @@ class AbstractMagnus(AbstractChartSolver):
 
     **Raises** `TypeError` when the program is traced if the field depends on the state, including a
     field that is frozen at the state, such as `cfjax.LowRankSkew`, and a field that gives the state
-    to a function of the host that `jax.vmap` does not take; `ValueError` for another `estimate` or
-    `unroll`.
+    to a function of the host; `ValueError` for another `estimate` or `unroll`.
     """
 
     is_of_state: ClassVar[bool] = False
@@ -82,21 +81,8 @@ class AbstractMagnus(AbstractChartSolver):
         def field(y):
             return product(terms, terms.vf(t0, y, args), terms.contr(t0, t1))
 
-        name = type(self).__name__
-        try:
-            found = depending_on_state(field, y0)
-        except Exception as error:
-            # What is wrong with the field itself, it says itself.
-            eqx.filter_eval_shape(field, y0)
-            raise TypeError(
-                f"{name} takes fields that depend on t but not on y, and the field gives y to "
-                "an operation that jax.vmap does not take, such as a function of the host "
-                "(jax.pure_callback) without vmap_method. What it returns counts as dependent on "
-                "y: call it with t only, or use another method, for example "
-                "cfjax.CF4()."
-            ) from error
-        if found:
-            raise TypeError(_depends_on_state(name, *found[0]))
+        if found := depending_on_state(field, y0):
+            raise TypeError(_depends_on_state(type(self).__name__, *found[0]))
         return super().start(terms, t0, t1, y0, args)
 
     def step_in(self, chart):
@@ -131,6 +117,11 @@ def _num_shared(a: Product, b: Product) -> int:
 
 
 def _depends_on_state(solver: str, place: str, part: Any) -> str:
+    if part is None:
+        return (
+            f"{unseen('y')}, and {solver} takes fields that depend on t but not on y: call it with "
+            "t only, or use another method, for example cfjax.CF4()."
+        )
     name = type(part).__name__ if is_field(part) else "a translation"
     advice = "" if is_field(part) else " Return y' = A(t) y as cfjax.LeftMatrix(A(t))."
     return (

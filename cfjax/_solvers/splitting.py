@@ -25,7 +25,7 @@ from .chart import flow_at, moved
 from .compensation import at, no_compensation, with_sums, zeros
 from .compiled import by_turns, control_of, shared_end
 from .dense import part_of_step
-from .dependence import depending_on_time
+from .dependence import depending_on_time, unseen
 
 
 class _Replay(diffrax.AbstractLocalInterpolation):
@@ -89,11 +89,15 @@ class AbstractSplitting(AbstractLieSolver, diffrax.AbstractStratonovichSolver):
         self.for_terms(terms)
         control = terms.contr(t0, t1)
         last = terms.terms[-1]
-        if depending_on_time(lambda t: product(last, last.vf(t, y0, args), control[-1]), t0, y0):
+        found = depending_on_time(
+            lambda t: product(last, last.vf(t, y0, args), control[-1]), t0, y0
+        )
+        if found:
+            cause = f" {unseen('t')}." if found[0][1] is None else ""
             raise TypeError(
                 f"The last term of {type(self).__name__} must not depend on time, which passes "
                 "while it acts: take another one as the last, or add one at rest, with zeros for "
-                "each part."
+                f"each part.{cause}"
             )
 
         def at_start(y0: PyTree) -> tuple[list[PyTree], PyTree]:

@@ -184,6 +184,25 @@ def test_an_increment_may_be_a_pytree():
     close(found, step(solver, term_of(GIVEN)))
 
 
+def test_a_field_of_the_noise_may_call_the_host():
+    """What the host makes of the state counts as dependent on it."""
+
+    def on_host(t, y, args, dw):
+        axis = jax.pure_callback(np.flip, jax.ShapeDtypeStruct((3,), y.dtype), y)
+        return cfjax.Rotation(axis * dw[0])
+
+    def plain(t, y, args, dw):
+        return cfjax.Rotation(y[::-1] * dw[0])
+
+    found, expected = (
+        step(cfjax.WeakOrder2(), terms(cfjax.LieControlTerm(field, GIVEN)))
+        for field in (on_host, plain)
+    )
+    close(found, expected)
+    with pytest.raises(TypeError, match="needs a solver of order 4 where the noise's fields depe"):
+        step(cfjax.WeakOrder2(cfjax.CF3()), terms(cfjax.LieControlTerm(on_host, GIVEN)))
+
+
 # Linear spaces
 
 

@@ -196,6 +196,13 @@ def test_terms_that_a_splitting_refuses(no_shape_hook):
     fails(diffrax.MultiTerm(noise, *BODY), TypeError, "takes noise, or what else a path drives, in")
     fails(diffrax.MultiTerm(BODY[0], noise, BODY[1]), TypeError, "in its last term only: move it")
     fails(all_terms(axial, spherical, kick), TypeError, "last term of Strang must not depend on t")
+
+    def on_host(t, y, args):
+        strength = jax.pure_callback(np.sin, jax.ShapeDtypeStruct((), t.dtype), t)
+        return {"q": None, "m": strength * jnp.ones_like(y["m"])}
+
+    match = "must not depend on time.* The field gives t to a function of the host"
+    fails(all_terms(spherical, on_host), TypeError, match)
     # A last term that rests takes the time.
     rest = cfjax.LieTerm(lambda t, y, args: {"q": None, "m": None})
     ends = [solve(term, cfjax.Strang(), 2) for term in (diffrax.MultiTerm(*BODY, rest), TOP)]
