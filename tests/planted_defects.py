@@ -661,8 +661,8 @@ DEFECTS = [
     ),
     Defect(
         "_numerics/diagonalised.py",
-        "return eigenvalues, q / scale[:, None], q.conj().T * scale",
-        "return eigenvalues, q, q.conj().T",
+        "return eigenvalues, q / scale[:, None], q.conj().T * scale, condition",
+        "return eigenvalues, q, q.conj().T, condition",
         "the eigenvectors of the symmetric matrix for those of the given one",
         "numerics/test_diagonalised.py",
     ),

@@ -13,8 +13,14 @@ from jaxtyping import Array, Complex, Float, Inexact
 from .matmul import matmul
 from .transforms import DTYPES, AbstractTransform, checked
 
-# Of eigenvectors: a transform there and back loses that factor of precision.
-_MAX_CONDITION = 1e6
+
+def _most(dtype: Any) -> float:
+    """Below which condition number eigenvectors are taken, for points of this precision.
+
+    A transform there and back may lose that factor of precision, and mostly loses a tenth of it. So
+    half of the digits are left in float32, and ten digits in float64.
+    """
+    return min(1e6, float(np.finfo(dtype).eps) ** -0.5)
 
 
 def diagonalised(
@@ -65,29 +71,33 @@ def diagonalised(
     **Returns:** the eigenvalues, shape `(m,)`, in the precision of the matrix, and the transform.
 
     **Raises** `TypeError` for another dtype, or a matrix that is traced; `ValueError` for another
-    shape, entries that are not finite, or eigenvectors whose condition number is 1e6 or more. A
-    matrix without a basis of eigenvectors is such: use `cfjax.LinearAffine(a, b)`.
+    shape, entries that are not finite, or eigenvectors whose condition number is 1e6 or more, or
+    2.9e3 for a matrix in single precision, where rounding would be as large as 3e-4 of the result.
+    A matrix without a basis of eigenvectors is such: use `cfjax.LinearAffine(a, b)`. The transform
+    raises `ValueError` for points in single precision if the condition number is too large for
+    them.
 
     Source: Golub & Van Loan, Matrix Computations (4th ed., 2013), Sections 7.1, 7.2 and 8.1.
     """
     a = _known(matrix)
     precision = np.finfo(a.dtype).dtype
     wide = a.astype(np.result_type(a.dtype, np.float64))
-    eigenvalues, vectors, inverse = _by_symmetry(wide, float(np.finfo(precision).eps)) or _by_eig(
-        wide
-    )
+    found = _by_symmetry(wide, precision) or _by_eig(wide, precision)
+    eigenvalues, vectors, inverse, condition = found
     transform: AbstractTransform
     if np.iscomplexobj(a):
-        transform = ComplexEigenvectors(_Matrix(_parts(inverse)), _Matrix(_parts(vectors)))
+        to, back = _parts(inverse), _parts(vectors)
+        transform = ComplexEigenvectors(_Matrix(to), _Matrix(back), condition)
     elif np.iscomplexobj(vectors):
         # Of a pair of conjugate eigenvalues the first. The sum of both is twice its real part.
         kept = np.imag(eigenvalues) >= 0
         eigenvalues = eigenvalues[kept]
         back = np.where(np.imag(eigenvalues) > 0, 2, 1) * vectors[:, kept]
         real_back = np.concatenate([np.real(back), -np.imag(back)], axis=1)
-        transform = ConjugateEigenvectors(_Matrix(_parts(inverse[kept])), _Matrix(real_back))
+        to = _parts(inverse[kept])
+        transform = ConjugateEigenvectors(_Matrix(to), _Matrix(real_back), condition)
     else:
-        transform = RealEigenvectors(_Matrix(inverse), _Matrix(vectors))
+        transform = RealEigenvectors(_Matrix(inverse), _Matrix(vectors), condition)
     least = np.complex64 if np.iscomplexobj(eigenvalues) else np.float32
     return eigenvalues.astype(np.result_type(precision, least)), transform
 
@@ -128,9 +138,12 @@ class AbstractEigenvectors(AbstractTransform):
 
     to: _Matrix = eqx.field(static=True)
     back: _Matrix = eqx.field(static=True)
+    condition: float = eqx.field(static=True, repr=False)
 
     def _checked(self, x: Array, matrix: _Matrix) -> Array:
         x, length = checked(self, x), matrix.shape[1]
+        # That of the points may be lower than that of the matrix.
+        _check_condition("The matrix of cfjax.diagonalised", self.condition, x.dtype)
         if len(x) != length:
             raise ValueError(
                 f"The transform of cfjax.diagonalised, {self!r}, got length {len(x)} along its "
@@ -215,19 +228,30 @@ def _known(matrix: Any) -> np.ndarray:
     return a
 
 
-_Found = tuple[np.ndarray, np.ndarray, np.ndarray]
+def _check_condition(what: str, condition: float, dtype: Any) -> None:
+    if not condition < _most(dtype):
+        raise ValueError(
+            f"{what} must have eigenvectors of a condition number below {_most(dtype):.0e}, got "
+            f"{condition:.1e}, for points in {np.dtype(dtype)}. Use cfjax.LinearAffine(a, b), "
+            "which takes any matrix."
+        )
 
 
-def _by_symmetry(a: np.ndarray, eps: float) -> _Found | None:
-    """Eigenvalues, eigenvectors and their inverse if D a D^-1 is Hermitian but for rounding."""
+# The eigenvalues, the eigenvectors, their inverse and their condition number.
+_Found = tuple[np.ndarray, np.ndarray, np.ndarray, float]
+
+
+def _by_symmetry(a: np.ndarray, precision: Any) -> _Found | None:
+    """Those if D a D^-1 is Hermitian but for rounding in this precision."""
+    eps = np.finfo(precision).eps
     for scale in (np.ones(len(a)), _symmetrising(a)):
         with np.errstate(over="ignore", invalid="ignore", divide="ignore"):
             s = scale[:, None] * a / scale
             is_hermitian = np.abs(s - s.conj().T).max() <= 16 * eps * np.abs(s).max()
-            is_moderate = scale.max() / scale.min() < _MAX_CONDITION
-        if is_hermitian and is_moderate:
+            condition = float(scale.max() / scale.min())
+        if is_hermitian and condition < _most(precision):
             eigenvalues, q = np.linalg.eigh((s + s.conj().T) / 2)
-            return eigenvalues, q / scale[:, None], q.conj().T * scale
+            return eigenvalues, q / scale[:, None], q.conj().T * scale, condition
     return None
 
 
@@ -247,20 +271,15 @@ def _symmetrising(a: np.ndarray) -> Float[np.ndarray, " n"]:
     return scale
 
 
-def _by_eig(a: np.ndarray) -> _Found:
+def _by_eig(a: np.ndarray, precision: Any) -> _Found:
     eigenvalues, vectors = np.linalg.eig(a)
     if not (np.iscomplexobj(a) or np.imag(eigenvalues).any()):
         # Some versions of NumPy return complex arrays of them too.
         eigenvalues, vectors = np.real(eigenvalues), np.real(vectors)
     with np.errstate(divide="ignore"):
         condition = float(np.linalg.cond(vectors))
-    if not condition < _MAX_CONDITION:
-        raise ValueError(
-            "matrix must have eigenvectors of a condition number below "
-            f"{_MAX_CONDITION:.0e}, got {condition:.1e}. Use cfjax.LinearAffine(a, b), which "
-            "takes any matrix."
-        )
-    return eigenvalues, vectors, np.linalg.inv(vectors)
+    _check_condition("matrix", condition, precision)
+    return eigenvalues, vectors, np.linalg.inv(vectors), condition
 
 
 def _parts(a: np.ndarray) -> Float[np.ndarray, "rows columns"]:

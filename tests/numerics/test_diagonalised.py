@@ -260,6 +260,40 @@ def test_a_defective_matrix():
         cfjax.diagonalised(a)
 
 
+def sheared(n, spread):
+    """Eigenvalues from 0 to -spread, and eigenvectors that are the closer the smaller that is."""
+    return np.eye(n, k=1) - np.diag(np.linspace(0.0, spread, n))
+
+
+def flow_of(spectrum, transform, dtype):
+    """The matrix of the flow, with points of this dtype."""
+    field = cfjax.Affine(1.0, jnp.zeros(10, dtype), spectrum.astype(dtype), transform)
+    return jax.vmap(field.flow)(jnp.eye(10, dtype=dtype)).T
+
+
+def test_the_bound_on_the_condition_belongs_to_the_precision():
+    # Condition numbers of 700, and of 4e5, where float32 would be off by 3e-3 and more.
+    fair, poor = (sheared(10, spread).astype(np.float32) for spread in (3.0, 1.5))
+    exact = scipy.linalg.expm(fair.astype(float))
+    # A tenth of the condition number times a unit, twice for chance.
+    np.testing.assert_allclose(
+        flow_of(*cfjax.diagonalised(fair), np.float32), exact, rtol=0, atol=140 * 2.0**-23
+    )
+    with pytest.raises(ValueError, match=r"condition number below 3e\+03, got .* float32.*LinearA"):
+        cfjax.diagonalised(poor)
+    # float64 takes it, for points in float64 alone.
+    spectrum, transform = cfjax.diagonalised(poor.astype(float))
+    exact = scipy.linalg.expm(poor.astype(float))
+    np.testing.assert_allclose(
+        flow_of(spectrum, transform, np.float64), exact, rtol=0, atol=1e5 * EPS
+    )
+    with pytest.raises(ValueError, match=r"The matrix of .* below 3e\+03, got .* in float32"):
+        flow_of(spectrum, transform, np.float32)
+    # So of one that a diagonal scaling of condition 1e4 makes symmetric.
+    with pytest.raises(ValueError, match=r"condition number below 3e\+03, got .* in float32"):
+        cfjax.diagonalised((np.eye(5, k=1) + 100 * np.eye(5, k=-1)).astype(np.float32))
+
+
 @pytest.mark.parametrize(
     "call, error, message",
     [
