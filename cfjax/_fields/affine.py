@@ -11,7 +11,7 @@ from jaxtyping import Array, Inexact
 
 from .._arrays import Weight, describe, struct
 from .._field import AbstractAlgebraElement, combine
-from .._numerics.checks import needing
+from .._numerics.checks import differ, needing
 from .._numerics.phi import phi_1, phis
 from .._numerics.transforms import DTYPES, AbstractTransform, TensorTransform
 from .semilinear import AbstractSemilinearField
@@ -219,7 +219,7 @@ def _of_one_operator(fields: Sequence[Affine]) -> list[Array]:
         if other.spectrum is not first.spectrum:
             zero = eqx.error_if(
                 jnp.zeros(()),
-                jnp.any(other.spectrum != first.spectrum),
+                differ(other.spectrum, first.spectrum),
                 "Affine fields that are added must have one spectrum: it may not depend on time or "
                 "state, and the terms of a diffrax.MultiTerm must share it.",
             )

@@ -15,7 +15,7 @@ from jaxtyping import Array, Inexact, Real
 
 from .._arrays import Weight, describe, struct
 from .._field import AbstractFrozenField, combine
-from .._numerics.checks import needing
+from .._numerics.checks import differ, needing
 from .._numerics.expm_multiply import expm_minus_one_multiply, row_norm
 from .._numerics.matmul import by_columns, promoted
 from .._numerics.operators import (
@@ -378,7 +378,7 @@ def _of_the_same_operators(fields: Sequence[OperatorSum]) -> list[Array]:
         c = other.coefficients
         pairs = zip(*map(jtu.tree_leaves, operators), strict=True)
         # Most fields close over the same arrays, and need no check of their values.
-        different = [jnp.any(a != b) for a, b in pairs if a is not b]
+        different = [differ(a, b) for a, b in pairs if a is not b]
         if different:
             zero = eqx.error_if(
                 jnp.zeros(()),

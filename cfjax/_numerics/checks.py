@@ -71,6 +71,11 @@ def needing(zero: Real[Array, ""], tree: PyTree) -> PyTree:
     return jtu.tree_map(lambda x: jnp.where(zero == 0, x, zero.astype(x.dtype)), tree)
 
 
+def differ(a: Array, b: Array) -> Bool[Array, ""]:
+    """Whether arrays differ. NaN is as good as NaN: what is made of it says so itself."""
+    return ~jnp.all((a == b) | ((a != a) & (b != b)))
+
+
 checked_p = Primitive("cfjax_checked")
 checked_p.multiple_results = True
 

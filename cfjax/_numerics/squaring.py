@@ -47,7 +47,8 @@ def squarings(s: Int[Array, ""], dtype: np.dtype) -> tuple[Int[Array, ""], Real[
 
 
 # A condition that vmap batches becomes a select, which runs both branches. The maximum over the
-# batch is not batched, so a condition on it stays a real branch.
+# batch is not batched, so a condition on it stays a real branch. NaN of one member must not choose
+# for the others, and is NaN in every branch.
 @custom_vmap
 def max_over_batch(s: Array) -> Array:
     return s
@@ -56,7 +57,7 @@ def max_over_batch(s: Array) -> Array:
 @max_over_batch.def_vmap
 def _(axis_size: int, in_batched: list[bool], s: Array) -> tuple[Array, bool]:
     del axis_size, in_batched
-    return max_over_batch(jnp.max(s, initial=0)), False
+    return max_over_batch(jnp.max(s, initial=0, where=s == s)), False
 
 
 def squared(

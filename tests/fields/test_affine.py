@@ -774,3 +774,27 @@ def test_a_spectrum_that_changes_with_time_is_an_error(transform):
     term = cfjax.LieTerm(lambda t, y, args: Affine(1.0, y, -(1 + t) * jnp.arange(4.0), transform))
     with pytest.raises(eqx.EquinoxRuntimeError, match="must have one spectrum"):
         cfjax.integrate(term, cfjax.CF4(), 0.0, 1.0, jnp.ones(4), num_steps=2)
+
+
+@pytest.mark.parametrize(
+    "make",
+    [
+        lambda a, y: Affine(1.0, jnp.sin(y), -a * jnp.arange(3.0)),
+        lambda a, y: cfjax.OperatorSum(a[None], [(a * jnp.diag(jnp.arange(3.0)), 2.5)]),
+        # Its series has as many terms as the largest norm of the batch needs.
+        lambda a, y: cfjax.LinearAffine(-a * jnp.diag(jnp.arange(3.0)), jnp.sin(y)),
+    ],
+    ids=["Affine", "OperatorSum", "LinearAffine"],
+)
+def test_nan_in_an_operator_is_nan_of_that_member(make: Any):
+    """Neither an error about an operator that changes, nor another result of the others."""
+
+    def end(a):
+        term = cfjax.LieTerm(lambda t, y, args: make(args, y))
+        sol = cfjax.integrate(term, cfjax.CF4(), 0.0, 1.0, jnp.ones(3), a, num_steps=2, throw=False)
+        return sol.ys[-1]
+
+    ends = jax.jit(jax.vmap(end))
+    found = ends(jnp.asarray([1.0, jnp.nan, 0.5]))
+    assert np.isnan(found[1]).all()
+    np.testing.assert_array_equal(found[::2], ends(jnp.asarray([1.0, 1.0, 0.5]))[::2])
