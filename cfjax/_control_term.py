@@ -7,11 +7,24 @@ import diffrax
 import equinox as eqx
 import jax.numpy as jnp
 import jax.tree_util as jtu
-from jaxtyping import PyTree
+import numpy as np
+from jaxtyping import Array, PyTree
 
-from ._field import tangent
+from ._field import AbstractFrozenField, flow, is_field, tangent
+from ._numerics.checks import Fault
+from ._numerics.linearity import Linearity, linearity
 from ._term import checked
 
+_HAS_DRIFT = (
+    "The field of a cfjax.LieControlTerm must be linear in increment, and it is not zero where the "
+    "increment is zero. Return from it only what the increment causes, and move the rest, such as "
+    "a drift, to a term of its own: diffrax.MultiTerm(cfjax.LieTerm(drift), "
+    "cfjax.LieControlTerm(field, control))."
+)
+_IS_NOT_LINEAR = (
+    "The field of a cfjax.LieControlTerm must be linear in increment, and that of a sum of two "
+    "increments is not the sum of their fields. Coefficients may depend on t, y and args alone."
+)
 _INTERPOLATIONS = diffrax.AbstractGlobalInterpolation, diffrax.AbstractLocalInterpolation
 
 
@@ -36,10 +49,16 @@ class LieControlTerm(diffrax.AbstractTerm):
     increment of shape (n, m): one evaluation, whatever the numbers. The path's value is read once
     a step.
 
+    What the field causes without an increment, such as `-y` in `-y + increment`, belongs to a
+    `cfjax.LieTerm` beside this term, in a `diffrax.MultiTerm`.
+
     **Arguments:** `field`, a function; `control`, a `diffrax.AbstractPath`.
 
     **Raises** `TypeError` for arguments of other types. What `field` returns is checked as that of
-    a `cfjax.LieTerm`.
+    a `cfjax.LieTerm`. `ValueError` when the program is traced if it shows a field that is not zero
+    where the increment is, or has products of the increment with itself. If a program does not show
+    whether the field is linear, a method of cfjax compares its values at the start of a solve: a
+    runtime error if it is not.
     """
 
     field: Callable[[Any, Any, Any, Any], PyTree]
@@ -74,10 +93,108 @@ class LieControlTerm(diffrax.AbstractTerm):
 
     def prod(self, vf: "_Place", control: PyTree) -> PyTree:
         t, y, args = vf.all()
-        return checked(self.field(t, y, args, control), y)
+        field = checked(self.field(t, y, args, control), y)
+        self._linearity(vf, control)
+        return field
 
     def vf_prod(self, t: Any, y: PyTree, args: PyTree, control: PyTree) -> PyTree:
         return tangent(self.prod(self.vf(t, y, args), control), y)
+
+    def fault(self, fault: Fault, t: Any, y: PyTree, args: PyTree, control: PyTree) -> Fault:
+        """This, or that the field is not linear by its values, if its program does not show it.
+
+        The values are at a state to which the field leads, as a start is often special. `control`
+        is an increment, or its shapes and dtypes.
+
+        **Raises** `ValueError` if the program says that it is not linear.
+        """
+        kinds = self._linearity(_Place.of(t, y, args), control)
+        if all(kind.power <= 1 and kind.constant == "zero" for kind in kinds):
+            return fault
+        rng = np.random.default_rng(0)
+        drawn = lambda x: jnp.asarray(rng.normal(size=x.shape), x.dtype)  # noqa: E731
+        a, b = (jtu.tree_map(drawn, control) for _ in range(2))
+
+        def at(y: PyTree, increment: PyTree) -> PyTree:
+            return checked(self.field(t, y, args, increment), y)
+
+        def moved(y: PyTree, increment: PyTree) -> PyTree:
+            # Any point will do for a translation.
+            field = at(y, increment)
+            there = flow(field, y)
+            return jtu.tree_map(
+                lambda f, y: y if is_field(f) else y + drawn(y), field, there, is_leaf=is_field
+            )
+
+        # Away from the start, and what is frozen at one of them as it is at the other.
+        first = moved(y, a)
+        second = moved(first, b)
+
+        def arrays(k: float, n: float) -> list[Array]:
+            increment = jtu.tree_map(lambda a, b: k * a + n * b, a, b)
+            return _linear_in_field(at(first, increment), second)
+
+        is_off, has_drift = jnp.zeros((), bool), jnp.zeros((), bool)
+        for x0, xa, xb, x in zip(
+            *map(arrays, (0.0, 1.0, 0.0, 1.0), (0.0, 0.0, 1.0, 0.3)), strict=True
+        ):
+            largest = lambda x: jnp.max(jnp.abs(x), initial=0)  # noqa: E731
+            eps, size = float(jnp.finfo(x.dtype).eps), largest(xa) + largest(xb)
+            # Half of the digits. What is zero is so but for terms that cancel.
+            is_off |= largest(x - (xa + 0.3 * xb)) > np.sqrt(eps) * size
+            has_drift |= largest(x0) > 100 * eps * size
+        return fault.with_case(is_off, _IS_NOT_LINEAR).with_case(has_drift, _HAS_DRIFT)
+
+    def _linearity(self, place: "_Place", control: PyTree) -> list[Linearity]:
+        """How what the field returns depends on the increment, as far as its program shows."""
+
+        def arrays(control: PyTree, state: PyTree, args: PyTree) -> list[Array]:
+            t, y, point = state
+            t, y, args = eqx.tree_at(lambda place: place.arrays, place, (t, y, args)).all()
+            return _linear_in_field(checked(self.field(t, y, args, control), y), point)
+
+        t, y, args = place.arrays
+        found = linearity(arrays, control, (t, y, y), args)
+        for kind in found:
+            if kind.constant == "some":
+                raise ValueError(_HAS_DRIFT)
+            if kind.power == 2:
+                raise ValueError(_IS_NOT_LINEAR)
+        return found
+
+
+def _linear_in_field(field: PyTree, point: PyTree) -> list[Array]:
+    """What is linear in a field: its coordinates, or its velocity at any point.
+
+    A class that adds its arrays one by one has coordinates alone.
+    """
+    parts, treedef = jtu.tree_flatten(field, is_leaf=is_field)
+    found = []
+    for part, y in zip(parts, treedef.flatten_up_to(point), strict=True):
+        has_more = is_field(part) and not _adds_arrays(type(part))
+        linear = tangent(part, y) if has_more else part
+        found += jtu.tree_leaves(eqx.filter(linear, eqx.is_inexact_array))
+    return found
+
+
+def _adds_arrays(kind: Any) -> bool:
+    return kind.combine.__func__ is vars(AbstractFrozenField)["combine"].__func__
+
+
+def fault_of_increments(
+    fault: Fault,
+    terms: PyTree[diffrax.AbstractTerm],
+    t0: Any,
+    t1: Any,
+    y0: PyTree,
+    args: PyTree,
+) -> Fault:
+    """This, or that a term which a path drives is not linear in the increment."""
+    is_ours = lambda x: isinstance(x, LieControlTerm)  # noqa: E731
+    for term in filter(is_ours, jtu.tree_leaves(terms, is_leaf=is_ours)):
+        control = eqx.filter_eval_shape(term.contr, t0, t1)
+        fault = term.fault(fault, t0, y0, args, control)
+    return fault
 
 
 class _Place(eqx.Module):

@@ -13,7 +13,7 @@ import numpy as np
 from jax import lax
 from jaxtyping import PyTree
 
-from ._control_term import is_driven
+from ._control_term import LieControlTerm, fault_of_increments, is_driven
 from ._field import (
     AbstractAlgebraElement,
     AbstractFrozenField,
@@ -23,6 +23,7 @@ from ._field import (
     from_chart,
     to_chart,
 )
+from ._numerics.checks import Fault
 from ._term import checked_part, product
 
 # What is compared: the text of the promise, what was found, what is expected, and a size whose
@@ -86,7 +87,7 @@ def check_field(fields: Sequence[AbstractFrozenField], point: PyTree) -> None:
         _compare(name, _of_bracket(entered, start), unit)
 
 
-def check_terms(term: diffrax.MultiTerm, t: Any, y: PyTree, args: PyTree = None) -> None:
+def check_terms(term: diffrax.AbstractTerm, t: Any, y: PyTree, args: PyTree = None) -> None:
     """Checks numerically that the terms of a sum have exact flows, as `cfjax.Splitting` assumes.
 
     The frozen field of a term must not change along its own flow. Otherwise a splitting has order
@@ -96,19 +97,24 @@ def check_terms(term: diffrax.MultiTerm, t: Any, y: PyTree, args: PyTree = None)
 
     For each term the flow in one unit of time is compared with that in two halves, between which
     the field is evaluated again. The tolerance is half of the digits, relative to how far each
-    array of the state moves. Terms that a path drives, such as noise, are not checked.
+    array of the state moves. Terms that a path drives, such as noise, may change along their flow.
+    Of a `cfjax.LieControlTerm` it is checked that its field is linear in the increment.
 
-    **Arguments:** `term`, a `diffrax.MultiTerm`; `t`, `y` and `args` as the fields get them, with a
-    state that is not special, such as a random one.
+    **Arguments:** `term`, a `diffrax.MultiTerm`, or a `cfjax.LieControlTerm`; `t`, `y` and `args`
+    as the fields get them, with a state that is not special, such as a random one.
 
-    **Raises** `TypeError` if `term` is not a `diffrax.MultiTerm`; `ValueError` that names the first
-    term whose field changes along its flow, and by how much.
+    **Raises** `TypeError` if `term` is another term; `ValueError` that names the first term whose
+    field changes along its flow, and by how much, or is not linear in the increment.
     """
+    if isinstance(term, LieControlTerm):
+        _check_increments("term", term, t, jtu.tree_map(jnp.asarray, y), args)
+        return
     if not isinstance(term, diffrax.MultiTerm):
         raise TypeError(f"term must be a diffrax.MultiTerm, got {term!r}.")
     y = jtu.tree_map(jnp.asarray, y)
     for k, part in enumerate(term.terms):
         if is_driven(part):
+            _check_increments(f"terms[{k}]", part, t, y, args)
             continue
         whole = _carried(part, t, y, args, 1.0)
         halves = _carried(part, t, _carried(part, t, y, args, 0.5), args, 0.5)
@@ -124,6 +130,16 @@ def check_terms(term: diffrax.MultiTerm, t: Any, y: PyTree, args: PyTree = None)
                     f"one unit of time is off by {off:.1g}, where it moves y{jtu.keystr(path)} by "
                     f"{way:.1g}. Split it into terms that do not change what they depend on."
                 )
+
+
+def _check_increments(name: str, term: Any, t: Any, y: PyTree, args: PyTree) -> None:
+    try:
+        fault = fault_of_increments(Fault.none(), term, t, t + 1.0, y, args)
+        message = fault.messages[int(fault.number) - 1] if fault.number > 0 else None
+    except ValueError as error:
+        raise ValueError(f"{name}: {error}") from error
+    if message is not None:
+        raise ValueError(f"{name}: {message}")
 
 
 def _carried(term: Any, t: Any, y: PyTree, args: PyTree, time: float) -> PyTree:
@@ -142,7 +158,9 @@ def _check_arguments(fields: Any, point: PyTree) -> None:
     is_one_class = isinstance(fields[0], AbstractFrozenField) and len(set(map(type, fields))) == 1
     if not is_one_class:
         names = ", ".join(type(field).__name__ for field in fields)
-        raise TypeError(f"fields must be frozen fields of one class, got {names}.")
+        is_term = any(isinstance(field, diffrax.AbstractTerm) for field in fields)
+        advice = " For terms there is cfjax.check_terms." if is_term else ""
+        raise TypeError(f"fields must be frozen fields of one class, got {names}.{advice}")
     for path, leaf in jtu.tree_leaves_with_path(point):
         if not jnp.issubdtype(leaf.dtype, jnp.inexact):
             raise TypeError(

@@ -15,7 +15,7 @@ from jax import lax
 from jax.core import Tracer
 from jaxtyping import Array, Bool, PyTree, Real
 
-from .._control_term import is_driven
+from .._control_term import fault_of_increments, is_driven
 from .._field import is_field
 from .._numerics.checks import Fault
 from .._term import product, velocity
@@ -94,7 +94,9 @@ class AbstractLieSolver(diffrax.AbstractSolver):
         field, compensation = eqx.filter_eval_shape(at_start, y0)
         compensation = zeros(compensation, y0)
         first = terms.vf(t0, y0, args) if self.first_same_as_last else None
-        return State(compensation, first, None), fault_of_start(t0, t1, (field,), y0)
+        fault = fault_of_start(t0, t1, (field,), y0)
+        fault = fault_of_increments(fault, terms, t0, t1, y0, args)
+        return State(compensation, first, None), fault
 
     def for_terms(self, terms: PyTree[diffrax.AbstractTerm]) -> "AbstractLieSolver":
         """The same method for these terms: without its estimate where a path drives one of them.

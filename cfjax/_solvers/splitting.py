@@ -9,7 +9,7 @@ import jax.numpy as jnp
 import jax.tree_util as jtu
 from jaxtyping import Array, PyTree
 
-from .._control_term import is_driven
+from .._control_term import fault_of_increments, is_driven
 from .._field import Rest, combine, is_field
 from .._methods.splitting import BLANES_MOAN_4, BLANES_MOAN_6, STRANG, splitting_order
 from .._term import product
@@ -108,7 +108,9 @@ class AbstractSplitting(AbstractLieSolver, diffrax.AbstractStratonovichSolver):
         fields, compensation = eqx.filter_eval_shape(at_start, y0)
         compensation = zeros(compensation, y0)
         first = terms.terms[0].vf(t0, y0, args)
-        return State(compensation, first, None), fault_of_start(t0, t1, fields, y0)
+        fault = fault_of_start(t0, t1, fields, y0)
+        fault = fault_of_increments(fault, terms, t0, t1, y0, args)
+        return State(compensation, first, None), fault
 
     def step(self, terms, t0, t1, y0, args, solver_state, made_jump):
         parts, compensation = terms.terms, solver_state.compensation
