@@ -113,7 +113,13 @@ class LieControlTerm(diffrax.AbstractTerm):
             return fault
         rng = np.random.default_rng(0)
         drawn = lambda x: jnp.asarray(rng.normal(size=x.shape), x.dtype)  # noqa: E731
-        a, b = (jtu.tree_map(drawn, control) for _ in range(2))
+
+        def increment(sign: float) -> PyTree:
+            # The two on either side of zero, and far from it: neither rectified nor rounded alike.
+            of = lambda x: jnp.asarray(sign * rng.uniform(1, 2, x.shape), x.dtype)  # noqa: E731
+            return jtu.tree_map(of, control)
+
+        a, b = increment(1.0), increment(-1.0)
 
         def at(y: PyTree, increment: PyTree) -> PyTree:
             return checked(self.field(t, y, args, increment), y)
@@ -131,8 +137,8 @@ class LieControlTerm(diffrax.AbstractTerm):
         second = moved(first, b)
 
         def arrays(k: float, n: float) -> list[Array]:
-            increment = jtu.tree_map(lambda a, b: k * a + n * b, a, b)
-            return _linear_in_field(at(first, increment), second)
+            both = jtu.tree_map(lambda a, b: k * a + n * b, a, b)
+            return _linear_in_field(at(first, both), second)
 
         is_off, has_drift = jnp.zeros((), bool), jnp.zeros((), bool)
         for x0, xa, xb, x in zip(

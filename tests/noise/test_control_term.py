@@ -630,6 +630,7 @@ NOT_LINEAR: dict[str, Any] = {
     "product": lambda y, a, dw: cfjax.Rotation(dw * dw[0]),
     "sine": lambda y, a, dw: y * jnp.sin(dw),
     "sign": lambda y, a, dw: y * jnp.sign(dw),
+    "rectified": lambda y, a, dw: y * jnp.maximum(dw, 0.0),
     "apply": lambda y, a, dw: dw.at[0].apply(jnp.sin),
     "integers": lambda y, a, dw: dw.astype(int).astype(float),
 }
