@@ -75,10 +75,10 @@ def _iterated(
             eps = float(jnp.finfo(new.dtype).eps)
             tolerance = 2 * eps if rtol is None else rtol
             # Eigenvalues come in pairs of opposite signs, with which a change may be larger than
-            # the last one. So it is compared with the one before. What does not fall may be what
+            # the last one. So it is compared with the one before. What falls no more may be what
             # the rounding of the field leaves.
-            has_stalled = (turn.number >= 4) & (last >= before)
-            most = jnp.where(has_stalled, max(1e4 * eps, tolerance), tolerance)
+            has_ended = (turn.number >= 4) & (last >= before) | (turn.number >= max_steps)
+            most = jnp.where(has_ended, max(1e4 * eps, tolerance), tolerance)
             whole = jnp.maximum(size(new), own)
             return jnp.isfinite(last) & (last <= most.astype(own.dtype) * whole)
 
