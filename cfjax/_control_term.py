@@ -157,7 +157,7 @@ class LieControlTerm(diffrax.AbstractTerm):
         def arrays(control: PyTree, state: PyTree, args: PyTree) -> list[Array]:
             t, y, point = state
             t, y, args = eqx.tree_at(lambda place: place.arrays, place, (t, y, args)).all()
-            return _linear_in_field(checked(self.field(t, y, args, control), y), point)
+            return _linear_in_field(self.field(t, y, args, control), point)
 
         t, y, args = place.arrays
         found = linearity(arrays, control, (t, y, y), args)
@@ -174,12 +174,11 @@ def _linear_in_field(field: PyTree, point: PyTree) -> list[Array]:
 
     A class that adds its arrays one by one has coordinates alone.
     """
-    parts, treedef = jtu.tree_flatten(field, is_leaf=is_field)
+    parts, treedef = jtu.tree_flatten(field, is_leaf=lambda x: x is None or is_field(x))
     found = []
     for part, y in zip(parts, treedef.flatten_up_to(point), strict=True):
-        has_more = is_field(part) and not _adds_arrays(type(part))
-        linear = tangent(part, y) if has_more else part
-        found += jtu.tree_leaves(eqx.filter(linear, eqx.is_inexact_array))
+        linear = tangent(part, y) if is_field(part) and not _adds_arrays(type(part)) else part
+        found += [x for x in map(jnp.asarray, jtu.tree_leaves(linear)) if eqx.is_inexact_array(x)]
     return found
 
 

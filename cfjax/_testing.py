@@ -134,6 +134,7 @@ def check_terms(term: diffrax.AbstractTerm, t: Any, y: PyTree, args: PyTree = No
 
 def _check_increments(name: str, term: Any, t: Any, y: PyTree, args: PyTree) -> None:
     try:
+        eqx.filter_eval_shape(lambda: product(term, term.vf(t, y, args), term.contr(t, t + 1.0)))
         fault = fault_of_increments(Fault.none(), term, t, t + 1.0, y, args)
         message = fault.messages[int(fault.number) - 1] if fault.number > 0 else None
     except ValueError as error:
