@@ -640,8 +640,8 @@ DEFECTS = [
     ),
     Defect(
         "_numerics/stumpff.py",
-        "((c3 - c2) / 2, c4 - c3 / 2, (3 * c5 - c4) / 2)",
-        "((c3 - c2), c4 - c3 / 2, (3 * c5 - c4) / 2)",
+        "(k * c[k + 2] - c[k + 1]) / 2 * s_dot",
+        "(k * c[k + 2] - c[k + 1]) * s_dot",
         "a missing half in the derivative of a rotation",
         "numerics/test_stumpff.py fields/test_rotation.py",
     ),

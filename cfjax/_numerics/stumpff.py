@@ -45,7 +45,8 @@ def stumpff(n: int, s: Float[Array | np.ndarray, "*batch"]) -> Float[Array, "*ba
     s = jnp.asarray(s)
     if s.dtype not in (jnp.float32, jnp.float64):
         raise TypeError(f"s must be float32 or float64, got {s.dtype}.")
-    return _stumpff_to(max(n, 3), jnp.where(s >= 0, s, jnp.nan))[n]
+    s = jnp.where(s >= 0, s, jnp.nan)
+    return _together(*_stumpff_apart(max(n, 3), s))[n]
 
 
 # The square of a full turn.
@@ -98,21 +99,20 @@ class Exponential(NamedTuple):
         return lax.stop_gradient(near * (versine - versine * versine / 4) + (1 - near))
 
 
-@jax.custom_jvp
 def stumpff_1_to_3_apart(s: Float[Array, "*batch"]) -> Exponential:
-    return _apart(s)
+    return _stumpff_apart(3, s)[0]
 
 
-@stumpff_1_to_3_apart.defjvp
-def _(primals, tangents):
-    (s,), (s_dot,) = primals, tangents
-    _, _, c2, c3, c4, c5 = _stumpff_to(5, s)
-    slopes = [slope * s_dot for slope in ((c3 - c2) / 2, c4 - c3 / 2, (3 * c5 - c4) / 2)]
-    return stumpff_1_to_3_apart(s), Exponential(jnp.zeros_like(s), *slopes)
-
-
+@functools.partial(jax.custom_jvp, nondiff_argnums=(0,))
 @smooth
-def _apart(s: Float[Array, "*batch"]) -> Exponential:
+def _stumpff_apart(
+    n: int, s: Float[Array, "*batch"]
+) -> tuple[Exponential, tuple[Float[Array, "*batch"], ...]]:
+    """What an exponential takes, and `c_0` and `c_4` to `c_n`, of which derivatives take some too:
+    all at once, as otherwise a derivative would compute the first ones a second time.
+
+    Without branches and divisions, which a loop of small steps would feel.
+    """
     constants = _constants(s)
     turns, inverse = _turns(s, constants)
     near = jnp.where(turns == 0, 1, jnp.zeros_like(s))
@@ -126,7 +126,31 @@ def _apart(s: Float[Array, "*batch"]) -> Exponential:
     d2 = (square * z) * p2 + square * ((1 - near) / 2)
     # Without a full turn the inverse may be too large to be squared.
     c3 = (excess * inverse) * inverse - (scale * square) * p1
-    return Exponential(near, d1, d2, c3)
+    c = {2: near / 2 + d2, 3: c3}
+    # The recursion loses digits to cancellation for small s, the series for large s.
+    small = s < 16
+    for k in range(4, n + 1):
+        terms = [(-1) ** j / factorial(k + 2 * j) for j in range(18)]
+        series = polynomial(terms, jnp.where(small, s, 0))
+        recursion = (1 / factorial(k - 2) - c[k - 2]) * (inverse * inverse)
+        c[k] = jnp.where(small, series, recursion)
+    return Exponential(near, d1, d2, c3), (1 - s * c[2], *(c[k] for k in range(4, n + 1)))
+
+
+@_stumpff_apart.defjvp
+def _(n, primals, tangents):
+    (s,), (s_dot,) = primals, tangents
+    exponential, others = _stumpff_apart(n + 2, s)
+    c = _together(exponential, others)
+    slopes = [(k * c[k + 2] - c[k + 1]) / 2 * s_dot for k in range(n + 1)]
+    moved = Exponential(jnp.zeros_like(s), *slopes[1:4]), (slopes[0], *slopes[4:])
+    return (exponential, others[: n - 2]), moved
+
+
+def _together(exponential: Exponential, others: Sequence[Array]) -> list[Array]:
+    """All functions in their order."""
+    near, d1, d2, c3 = exponential
+    return [others[0], near + d1, near / 2 + d2, c3, *others[1:]]
 
 
 def dexpinv_times(s: Array, x: Vector, once: Vector, twice: Vector) -> Vector:
@@ -174,34 +198,6 @@ def _reciprocal(x: Float[Array, "*batch"]) -> Float[Array, "*batch"]:
 def _(primals, tangents):
     y = _reciprocal(*primals)
     return y, -(y * y) * tangents[0]
-
-
-@functools.partial(jax.custom_jvp, nondiff_argnums=(0,))
-@smooth
-def _stumpff_to(n: int, s: Float[Array, "*batch"]) -> tuple[Float[Array, "*batch"], ...]:
-    """`c_0` to `c_n`, for `n >= 3`, which a derivative of high order needs together.
-
-    Without branches and divisions, which a loop of small steps would feel.
-    """
-    near, d1, d2, c3 = _apart(s)
-    c2 = near / 2 + d2
-    c = [1 - s * c2, near + d1, c2, c3]
-    _, inverse = _turns(s, _constants(s))
-    # The recursion loses digits to cancellation for small s, the series for large s.
-    small = s < 16
-    for k in range(4, n + 1):
-        terms = [(-1) ** j / factorial(k + 2 * j) for j in range(18)]
-        series = polynomial(terms, jnp.where(small, s, 0))
-        recursion = (1 / factorial(k - 2) - c[k - 2]) * (inverse * inverse)
-        c.append(jnp.where(small, series, recursion))
-    return tuple(c)
-
-
-@_stumpff_to.defjvp
-def _(n, primals, tangents):
-    (s,), (s_dot,) = primals, tangents
-    c = _stumpff_to(n + 2, s)
-    return c[: n + 1], tuple((k * c[k + 2] - c[k + 1]) / 2 * s_dot for k in range(n + 1))
 
 
 class _Constants(NamedTuple):

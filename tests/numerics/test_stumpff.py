@@ -10,6 +10,7 @@ import pytest
 from problems import SQUARES_OF_ANGLES
 
 from cfjax import stumpff
+from cfjax._numerics.rotate import increment
 
 ORDERS = 3
 DTYPES = pytest.mark.parametrize("dtype", [np.float32, np.float64])
@@ -168,3 +169,18 @@ def test_an_angle_without_digits_is_nan(dtype):
     for big in (1.01 * limit, info.max / 2, np.inf, np.nan):
         for n in range(5):
             assert np.isnan(stumpff(n, jnp.asarray(big, dtype))), (n, big)
+
+
+def test_a_derivative_computes_each_function_once():
+    """In what is traced already: compilers find what is computed twice, after a while."""
+    x = jnp.asarray([0.3, 0.2, 0.1])
+
+    def tangent(a, v):
+        return jax.jvp(increment, (a, v), (v, a))[1]
+
+    def cotangents(a, v):
+        return jax.vjp(increment, a, v)[1](a)
+
+    for derivative in (increment, tangent, cotangents):
+        # By which angles are taken to less than half a turn.
+        assert str(jax.make_jaxpr(derivative)(x, x)).count(" = round") == 1
