@@ -2,6 +2,7 @@
 
 import functools
 import math
+import weakref
 from collections.abc import Callable, Sequence
 from typing import Any, NamedTuple
 
@@ -90,6 +91,31 @@ def is_as_it_was(program: ClosedJaxpr, kind: Kind, plain: Plain | None) -> bool:
     return kind.is_mapped or length > WHOLE[kind.place][min(kind.order, 2)]
 
 
+# Of the programs of a solve, which are differentiated one soon after the other.
+_KEPT = 32
+
+
+def _once_for_each_program(fun: Callable[..., Any]) -> Callable[..., Any]:
+    """`fun(program, *rest)`, computed once while one program after the other is differentiated.
+
+    No program is held that JAX has dropped, and of those that JAX keeps, which are thousands, what
+    is derived is kept for the last ones alone.
+    """
+    kept: weakref.WeakKeyDictionary[ClosedJaxpr, dict[Any, Any]] = weakref.WeakKeyDictionary()
+
+    @functools.wraps(fun)
+    def once(program: ClosedJaxpr, *rest: Any) -> Any:
+        found = kept.setdefault(program, {})
+        if rest not in found:
+            found[rest] = fun(program, *rest)
+        result = found[rest]
+        while len(kept) > _KEPT:
+            del kept[next(iter(kept))]
+        return result
+
+    return once
+
+
 def jvp_of(
     program: ClosedJaxpr, primals: Sequence[Any], tangents: Sequence[Any], moving: Sequence[int]
 ) -> tuple[list[Any], list[Any]]:
@@ -115,7 +141,7 @@ def _jvp(primals, tangents, *, program, kind, plain):
     return outs, out_tangents
 
 
-@functools.lru_cache(maxsize=256)
+@_once_for_each_program
 def _tangent(
     program: ClosedJaxpr, plain: Plain | None, moving: Sequence[int], smooth: Sequence[int]
 ) -> "_Linear":
@@ -156,7 +182,7 @@ def _transpose(cotangents, *operands, program, kind, plain):
     return replaced(results, transposed.gives, new)
 
 
-@functools.lru_cache(maxsize=256)
+@_once_for_each_program
 def _transposed(
     program: ClosedJaxpr, plain: Plain | None, linear: Sequence[int], coming: Sequence[int]
 ) -> "_Linear":
@@ -264,7 +290,7 @@ def _batch(operands, dims, *, program, kind, plain):
     return outs, out_dims
 
 
-@functools.lru_cache(maxsize=256)
+@_once_for_each_program
 def _batched(
     program: ClosedJaxpr, plain: Plain | None, dims: tuple[int | None, ...], size: int
 ) -> tuple[ClosedJaxpr, Plain | None, list[int | None]]:
