@@ -44,6 +44,16 @@ def jacobian(program: Program) -> Program:
     return lambda term, solver, y0: jax.jacfwd(lambda y: program(term, solver, y))(y0)
 
 
+def time_of_event(**options: Any) -> Program:
+    def last(term: Any, solver: Any, y0: Any) -> Any:
+        sol = diffrax.diffeqsolve(
+            term, solver, 0.0, T1, T1 / STEPS, y0, max_steps=256, **EVENT, **options
+        )
+        return jnp.asarray(sol.ts)[-1]
+
+    return last
+
+
 def fit(program: Program) -> Program:
     """The start that is nearest to data, by Levenberg and Marquardt's method."""
 
@@ -84,6 +94,7 @@ PROGRAMS: dict[str, tuple[Program, Program]] = {
     "event": both(solve(**EVENT)),
     "event, adaptive steps with output": both(solve(**EVENT, **CONTROL, **TIMES)),
     "gradient": both(gradient(solve())),
+    "gradient of an event's time, adaptive steps": both(gradient(time_of_event(**CONTROL))),
     "gradient, adaptive steps with output": both(gradient(solve(**CONTROL, **TIMES))),
     "Jacobian, adaptive steps with output": both(jacobian(solve(**CONTROL, **TIMES, **FORWARD))),
     "fit by least squares": both(fit(solve(**CONTROL, **TIMES, **FORWARD))),
@@ -95,7 +106,10 @@ PROGRAMS: dict[str, tuple[Program, Program]] = {
         gradient(solve(**ALL_TIMES)),
     ),
 }
-OF_STATE = tuple(name for name in PROGRAMS if name != "adaptive steps with output")
+OF_EVENTS = ("gradient of an event's time, adaptive steps",)
+OF_STATE = tuple(
+    name for name in PROGRAMS if name not in ("adaptive steps with output", *OF_EVENTS)
+)
 OF_EQUAL_STEPS = ("equal steps", "output at times", "`integrate`")
 OF_GRADIENTS = ("gradient", "`integrate`, gradient")
 OF_ADAPTIVE_STEPS = (
@@ -134,14 +148,16 @@ def spacecraft(t: Any, y: Any, args: Any) -> dict[str, Any]:
     return {"q": q, "m": jnp.cross(y["m"], omega)}
 
 
-def deterministic(field: Callable[..., Any], y0: Any) -> Scene:
+def deterministic(
+    field: Callable[..., Any], y0: Any, programs: tuple[str, ...] = OF_STATE
+) -> Scene:
     methods = {name: (cfjax.LieTerm(field), solver) for name, solver in METHODS.items()}
 
     def velocity(t: Any, y: Any, args: Any) -> Any:
         return cfjax.tangent(field(t, y, args), y)
 
     plain = diffrax.ODETerm(velocity), diffrax.Tsit5()
-    return Scene(methods, "Tsit5", plain, jax.tree.map(jnp.asarray, y0), OF_STATE)
+    return Scene(methods, "Tsit5", plain, jax.tree.map(jnp.asarray, y0), programs)
 
 
 def noisy() -> Scene:
@@ -214,7 +230,9 @@ SCENES: dict[str, Callable[[], Scene]] = {
         lambda t, y, args: rigid_body.field(t, y, rigid_body.inertia), rigid_body.y0
     ),
     "spacecraft": lambda: deterministic(
-        spacecraft, {"q": np.array([1.0, 0.0, 0.0, 0.0]), "m": np.array([0.05, 1.0, 0.0])}
+        spacecraft,
+        {"q": np.array([1.0, 0.0, 0.0, 0.0]), "m": np.array([0.05, 1.0, 0.0])},
+        OF_STATE + OF_EVENTS,
     ),
     "4 x 4 matrices": lambda: deterministic(skew, np.eye(4)),
     "noise": noisy,
