@@ -915,8 +915,8 @@ DEFECTS = [
     ),
     Defect(
         "_numerics/stumpff.py",
-        "part * c) for d, c in ((d1, -(near + d1)), (d2, c0)))",
-        "part * c) for d, c in ((d1, 0 * near), (d2, near)))",
+        "d1, d2 = d1 - part * c1, d2 + part * c0",
+        "d2 = d2 + part",
         "a length led back along the old quaternion instead of the turned one",
         "fields/test_many_steps.py",
     ),

@@ -76,27 +76,19 @@ class Exponential(NamedTuple):
         """`exp(A) x - x` from `A x`, for a unit quaternion or complex number x: `A^2 = -s`.
 
         To lead the length of x back to 1, this is `(1 - lead off / 2) exp(A) x - x`, where `off` is
-        what the squared length is off 1.
+        what the squared length is off 1, and lead is `1 - ((1 + c_0) / 2)^2` up to half a turn and
+        1 beyond. So the next length is off by no more than this one, whatever the angle, and the
+        correction is as small as the square of a small angle, as the rounding of an increment is.
         """
         near, d1, d2, _ = self
         d2 = s * d2
         if leads_back:
-            off = lax.stop_gradient(sum(a * a for a in x[1:]) + (x[0] * x[0] - 1))
-            c0 = 1 - (near * s / 2 + d2)
-            part = self.lead(s) * (off / 2)
-            d1, d2 = (d + lax.stop_gradient(part * c) for d, c in ((d1, -(near + d1)), (d2, c0)))
+            off = sum(a * a for a in x[1:]) + (x[0] * x[0] - 1)
+            versine = near * s / 2 + d2
+            lead = near * (versine - versine * versine / 4) + (1 - near)
+            c0, c1, part = lax.stop_gradient((1 - versine, near + d1, lead * (off / 2)))
+            d1, d2 = d1 - part * c1, d2 + part * c0
         return [near * (u - s / 2 * a) + (d1 * u - d2 * a) for a, u in zip(x, once, strict=True)]
-
-    def lead(self, s: Array) -> Array:
-        """Which part of what a length is off 1 a turn takes off.
-
-        It is `1 - ((1 + c_0) / 2)^2` up to half a turn, and 1 beyond. So the next length is off by
-        no more than this one, whatever the angle, and the correction is as small as the square of
-        a small angle, as the rounding of an increment is.
-        """
-        near, _, d2, _ = self
-        versine = near * s / 2 + s * d2
-        return lax.stop_gradient(near * (versine - versine * versine / 4) + (1 - near))
 
 
 def stumpff_1_to_3_apart(s: Float[Array, "*batch"]) -> Exponential:
