@@ -922,7 +922,7 @@ DEFECTS = [
     ),
     Defect(
         "_solvers/munthe_kaas.py",
-        "y1 = found.or_else(chart.from_start(end), jnp.nan)",
+        "y1 = found.or_nan(chart.from_start(end))",
         "y1 = chart.from_start(end)",
         "a step of more than a full turn that counts",
         "solvers/test_full_turns.py",

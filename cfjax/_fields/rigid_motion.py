@@ -76,10 +76,9 @@ class AbstractMotion(AbstractAlgebraElement):
         return self._with(self.numerics.dexpinv, other)
 
     def has_dexpinv(self) -> Bool[Array, ""]:
-        squares = self.omega * self.omega
         # In the plane omega is one number.
-        s = squares if squares.ndim < self.v.ndim else jnp.sum(squares, axis=-1)
-        return jnp.all(is_below_full_turn(s))
+        parts = [self.omega] if self.dimension == 2 else [self.omega[..., k] for k in range(3)]
+        return is_below_full_turn(sum(x * x for x in parts))
 
     def _with(self, fun: Any, other: Any) -> "AbstractMotion":
         check_other(self, other)

@@ -76,17 +76,16 @@ class Exponential(NamedTuple):
         """`exp(A) x - x` from `A x`, for a unit quaternion or complex number x: `A^2 = -s`.
 
         To lead the length of x back to 1, this is `(1 - lead off / 2) exp(A) x - x`, where `off` is
-        what the squared length is off 1, and lead is `1 - ((1 + c_0) / 2)^2` up to half a turn and
-        1 beyond. So the next length is off by no more than this one, whatever the angle, and the
-        correction is as small as the square of a small angle, as the rounding of an increment is.
+        what the squared length is off 1, and lead is `1 - c_0` up to half a turn and 1 beyond. So
+        the next length is off by no more than this one, whatever the angle, and the correction is
+        as small as the square of a small angle, as the rounding of an increment is.
         """
         near, d1, d2, _ = self
         d2 = s * d2
         if leads_back:
             off = sum(a * a for a in x[1:]) + (x[0] * x[0] - 1)
-            versine = near * s / 2 + d2
-            lead = near * (versine - versine * versine / 4) + (1 - near)
-            c0, c1, part = lax.stop_gradient((1 - versine, near + d1, lead * (off / 2)))
+            c0 = 1 - near * s / 2 - d2
+            c0, c1, part = lax.stop_gradient((c0, near + d1, (1 - near * c0) * (off / 2)))
             d1, d2 = d1 - part * c1, d2 + part * c0
         return [near * (u - s / 2 * a) + (d1 * u - d2 * a) for a, u in zip(x, once, strict=True)]
 
@@ -161,16 +160,16 @@ def cotangent_excess(s: Float[Array, "*batch"]) -> Float[Array, "*batch"]:
     It is `sum_k 2 / (4 pi^2 k^2 - s)`: a pole at a full turn, and a polynomial to rounding. From
     the full turn on it is 1/12, which is no value: see `is_below_full_turn`.
     """
-    s = jnp.where(is_below_full_turn(s), s, 0)
+    s = jnp.where(s < _FULL_TURN, s, 0)
     return 2 * _reciprocal(_FULL_TURN - s) + polynomial(_constants(s).excess, s)
 
 
-def is_below_full_turn(s: Float[Array, "*batch"]) -> Bool[Array, "*batch"]:
-    """Whether an angle, whose square is s, is so small that the exponential can be inverted.
+def is_below_full_turn(s: Float[Array, "*batch"]) -> Bool[Array, ""]:
+    """Whether all angles, whose squares are s, are so small that the exponential can be inverted.
 
     That is so up to the first pole, on the way from zero. False for NaN.
     """
-    return s < _FULL_TURN
+    return jnp.all(s < _FULL_TURN) if s.ndim else s < _FULL_TURN
 
 
 @jax.custom_jvp

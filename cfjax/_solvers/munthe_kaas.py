@@ -8,10 +8,9 @@ from typing import Any, ClassVar, Literal, NamedTuple
 
 import diffrax
 import equinox as eqx
-import jax
 import jax.numpy as jnp
 import jax.tree_util as jtu
-from jaxtyping import Array, Bool, PyTree
+from jaxtyping import Array, PyTree, Real
 
 from .._control_term import is_driven
 from .._field import (
@@ -27,6 +26,7 @@ from .._field import (
 from .._methods.continuous_extension import RungeKuttaExtension, runge_kutta_extension
 from .._methods.order_conditions import runge_kutta_order
 from .._methods.tableau import ContinuousExtension, Row
+from .._numerics.vectors import smooth
 from .base import AbstractChartSolver, Step, check_choice
 from .chart import Chart
 from .compiled import scalarised
@@ -85,7 +85,7 @@ class AbstractMuntheKaas(AbstractChartSolver, diffrax.AbstractStratonovichSolver
         elements = found.elements
         v = _combine_nonzero(self.b, elements)
         end = chart.flow(v, chart.start)
-        y1 = found.or_else(chart.from_start(end), jnp.nan)
+        y1 = found.or_nan(chart.from_start(end))
         error = None
         # All that follows is for error control and output within the step. The compiler leaves it
         # out where the caller asks for neither.
@@ -98,8 +98,8 @@ class AbstractMuntheKaas(AbstractChartSolver, diffrax.AbstractStratonovichSolver
             else:
                 embedded = chart.flow(combine((1.0, -1.0), (v, off)), chart.start)
                 error = chart.difference(end, embedded)
-            # So that the step is taken again, shorter.
-            error = found.or_else(error, jnp.inf)
+            # NaN is an infinite error to diffrax, so that the step is taken again, shorter.
+            error = found.or_nan(error)
         # All of them are results then, and XLA would compute the step anew for each.
         elements = chart.shared(elements)
         path = Path.of(self.continuous_extension, chart.without_sums(chart.start), elements)
@@ -107,25 +107,41 @@ class AbstractMuntheKaas(AbstractChartSolver, diffrax.AbstractStratonovichSolver
 
 
 class _Elements(NamedTuple):
-    """Elements of the algebra, and whether each `dexpinv` among them had a value; None is yes.
+    """Elements of the algebra, and zero, or NaN if some `dexpinv` among them had no value.
 
-    Where there was none the elements mean nothing, but they are finite: of a step that is not kept
-    the derivative must be zero, and that of NaN is NaN.
+    The elements then mean nothing, but they are finite: of a step that is not kept the derivative
+    must be zero, and that of NaN is NaN. None if nothing is known.
     """
 
     elements: list[PyTree]
-    has_value: Bool[Array, ""] | None = None
+    missing: Real[Array, ""] | None = None
 
-    def and_known(self, *has_value: Bool[Array, ""] | None) -> "_Elements":
-        known = [x for x in (self.has_value, *has_value) if x is not None]
-        return self._replace(has_value=functools.reduce(jnp.logical_and, known) if known else None)
+    def and_known(self, *missing: Real[Array, ""] | None) -> "_Elements":
+        known = [x for x in (self.missing, *missing) if x is not None]
+        return self._replace(missing=functools.reduce(jnp.add, known) if known else None)
 
-    def or_else(self, tree: PyTree, value: float) -> PyTree:
-        """The same arrays, or this value where something had none."""
-        has_value = self.has_value
-        if has_value is None:
+    def or_nan(self, tree: PyTree) -> PyTree:
+        """The same arrays, or NaN where something had no value."""
+        missing = self.missing
+        if missing is None:
             return tree
-        return jtu.tree_map(lambda x: jnp.where(has_value, x, value), tree)
+        return jtu.tree_map(lambda x: x + missing.astype(x.dtype), tree)
+
+
+def _missing(u: PyTree) -> Real[Array, ""] | None:
+    """Zero, or NaN if `dexpinv` at u has no value; None if nothing is known."""
+    leaves = jtu.tree_leaves(u)
+    if has_dexpinv(u) is None:
+        return None
+
+    # A number and not a predicate, as what compares would keep the divisions of the whole step.
+    @smooth
+    def number(*leaves: Array) -> Real[Array, ""]:
+        found: Any = has_dexpinv(jtu.tree_unflatten(jtu.tree_structure(u), leaves))
+        dtype = jnp.finfo(leaves[0].dtype).dtype
+        return jnp.where(found, jnp.zeros((), dtype), jnp.nan)
+
+    return number(*leaves)
 
 
 def _frozen(chart: Chart, c: float, u: PyTree) -> PyTree:
@@ -298,7 +314,7 @@ class RKMK(AbstractMuntheKaas, diffrax.AbstractAdaptiveSolver):
                 u = _combine_nonzero(row, elements)
                 here = chart.flow(u, chart.start)
             elements.append(dexpinv(u, chart.frozen_after(elements, c, here), self._degree))
-            found = found.and_known(has_dexpinv(u))
+            found = found.and_known(_missing(u))
         return found._replace(elements=elements)
 
     def extended(self, path: Any, field: Callable[[Any, PyTree], PyTree]):
@@ -311,7 +327,7 @@ class RKMK(AbstractMuntheKaas, diffrax.AbstractAdaptiveSolver):
         def later(start: PyTree) -> list[PyTree]:
             chart = Chart.at_path(field, start, elements)
             found = self._stages(elements[:n], rows, times, chart)
-            return found.or_else(found.elements[n:], jnp.nan)
+            return found.or_nan(found.elements[n:])
 
         elements = [*elements[:n], *scalarised(later, start, is_derived=False)]
         return Path.of(path.continuous_extension, start, elements)
@@ -330,17 +346,17 @@ class RKMK(AbstractMuntheKaas, diffrax.AbstractAdaptiveSolver):
         """These, and a stage for each row and time."""
 
         inverse = functools.partial(dexpinv, degree=self._degree)
-        made = rolled_elements(self.unroll, chart, known, rows, times, inverse)
+        made = rolled_elements(self.unroll, chart, known, rows, times, inverse, _missing)
         if made is not None:
-            return _Elements(made, _have_dexpinv(rows, made))
-        stages, have_dexpinv = list(known), []
+            return _Elements(*made)
+        stages, missing = list(known), []
         for c, row in zip(times, rows, strict=True):
             # Rows may be shorter than what is known.
             u = _combine_nonzero(row, stages) if any(row) else None
             field = _frozen(chart, c, u)
             stages.append(field if u is None else inverse(u, field))
-            have_dexpinv.append(None if u is None else has_dexpinv(u))
-        return _Elements(stages).and_known(*have_dexpinv)
+            missing.append(None if u is None else _missing(u))
+        return _Elements(stages).and_known(*missing)
 
 
 class RKMK5(RKMK):
@@ -382,15 +398,6 @@ class RKMK8(RKMK):
         unroll: bool | None = None,
     ):
         super().__init__(diffrax.Dopri8.tableau, estimate=estimate, unroll=unroll)
-
-
-def _have_dexpinv(rows: Sequence[Row], elements: list[PyTree]) -> Bool[Array, ""] | None:
-    """Whether combinations of elements, one for each row, all have a `dexpinv` with a value."""
-    if has_dexpinv(elements[0]) is None:
-        return None
-    weights = jnp.asarray([[*map(float, row), *[0.0] * (len(elements) - len(row))] for row in rows])
-    each: Any = jax.vmap(lambda row: has_dexpinv(combine(list(row), elements)))
-    return jnp.all(each(weights))
 
 
 @functools.lru_cache

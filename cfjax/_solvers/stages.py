@@ -202,8 +202,10 @@ def rolled_elements(
     rows: Sequence[Sequence[Any]],
     times: Sequence[float],
     element: Callable[[PyTree, PyTree], PyTree],
-) -> list[PyTree] | None:
-    """The known stages k, and for each row and time c the stage `element(u, f)`.
+    number: Callable[[PyTree], Real[Array, ""] | None],
+) -> tuple[list[PyTree], Real[Array, ""] | None] | None:
+    """The known stages k, and for each row and time c the stage `element(u, f)`; and the sum of the
+    `number` of each u, or None.
 
     Here `u = sum_j row[j] k[j]`, and f is the field at time c and the point where u leads from the
     start. None where the field allows no loop, where `unroll` asks for none, and where it does not
@@ -221,14 +223,19 @@ def rolled_elements(
     one = functools.partial(stage, times[0])
     is_long = len(rows) > limits.MANY and is_rewritten() and are_long(one, first, len(rows))
     if can_roll(unroll, first, first, is_long) and is_uniform(chart):
-        made = table(
-            lambda c, u: _like(first, stage(c, u)), known, _padded(rows, n), jnp.asarray(times)
-        )
+        none = None if number(first) is None else jnp.zeros_like(number(first))
+
+        def noted(c: Any, pair: tuple[PyTree, Any]) -> tuple[PyTree, Any]:
+            return _like(first, stage(c, pair[0])), number(pair[0])
+
+        pairs = [(k, none) for k in known]
+        made = table(noted, pairs, _padded(rows, n), jnp.asarray(times))
         if made is not None:
-            return made
+            elements, numbers = map(list, zip(*made, strict=True))
+            return elements, None if none is None else sum(numbers, none)
         fields = _Stacked.of(known, n)
-        made = _rolled_elements(chart, fields, len(known), rows, times, element)
-        return [*known, *made[len(known) :]]
+        made, total = _rolled_elements(chart, fields, len(known), rows, times, element, number)
+        return [*known, *made[len(known) :]], total
     if not _can_roll_in_room(unroll, chart, known, n):
         return None
     # A bracket takes time as the third power of the room: less for the first ones.
@@ -236,8 +243,8 @@ def rolled_elements(
     for few in (slice(half), slice(half, None)) if half else (slice(None),):
         m = len(known) + len(rows[few])
         fields = _InRoom.of(known, chart.start, m, m)
-        known = _rolled_elements(chart, fields, len(known), rows[few], times[few], element)
-    return list(known)
+        known, _ = _rolled_elements(chart, fields, len(known), rows[few], times[few], element)
+    return list(known), None
 
 
 def _rolled_elements(
@@ -247,21 +254,26 @@ def _rolled_elements(
     rows: Sequence[Sequence[Any]],
     times: Sequence[float],
     element: Callable[[PyTree, PyTree], PyTree],
-) -> list[PyTree]:
+    number: Callable[[PyTree], Real[Array, ""] | None] = lambda u: None,
+) -> tuple[list[PyTree], Real[Array, ""] | None]:
     n = num_known + len(rows)
 
-    def body(fields: Any, x: Any) -> Any:
-        k, row, c = x
+    def body(carry: Any, x: Any) -> Any:
+        (fields, total), (k, row, c) = carry, x
         combination = fields.combination(row)
         u = fields.field(combination)
         point = chart.flow(u, chart.start)
         new = fields.entered(chart.frozen_after([u], c, point))
         fields, new = fields.extended(new, fields.coordinates(point), k)
-        return fields.put(k, element(fields.field(combination), new)), None
+        u = fields.field(combination)
+        total = None if total is None else total + number(u)
+        return (fields.put(k, element(u, new)), total), None
 
     turns = jnp.arange(num_known, n), _padded(rows, n), jnp.asarray(times)
-    fields, _ = lax.scan(body, fields, turns)
-    return [fields.at(k) for k in range(n)]
+    # Of zero, which varies along the axes of a mesh as the known ones do.
+    zero = combine((0.0,), (fields.at(0),))
+    (fields, total), _ = lax.scan(body, (fields, number(zero)), turns)
+    return [fields.at(k) for k in range(n)], total
 
 
 class _Stacked(eqx.Module):

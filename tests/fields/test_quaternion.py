@@ -316,7 +316,7 @@ def test_an_increment_leads_back_to_length_one():
     angles, off = np.array([0.0, 1e-3, 1.0, 5.0, 9.0]), 1e-9
     found, slope = back(np.outer(angles, AXIS), np.tile((1 + off) * Q, (5, 1)))
     # All of it from an angle of 2 pi on, where q is -q.
-    part = np.where(angles < 2 * np.pi, 1 - ((1 + np.cos(angles / 2)) / 2) ** 2, 1)
+    part = np.where(angles < 2 * np.pi, 1 - np.cos(angles / 2), 1)
     ends = [to_numpy(exact(x * AXIS, generators("fixed", "wxyz"))[0]) @ Q for x in angles]
     # Along the turned quaternion: along the old one the length of a fast spin would run away.
     want = -off * part[:, None] * np.stack(ends)
