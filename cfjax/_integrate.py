@@ -133,7 +133,7 @@ def integrate(
     args = jtu.tree_map(lambda x: jnp.asarray(x) if isinstance(x, float | complex) else x, args)
     # In a program that somebody else compiles, an error is part of that. What else is traced, be it
     # an argument or what a field closes over, shows in the results.
-    is_compiled = isinstance(jnp.zeros(()), Tracer)
+    is_compiled = any(isinstance(x, Tracer) for x in (jnp.zeros(()), *jtu.tree_leaves((t0, y0))))
     solution, fault = equal_steps(
         term,
         solver,

@@ -78,7 +78,7 @@ class AbstractMotion(AbstractAlgebraElement):
     def has_dexpinv(self) -> Bool[Array, ""]:
         # In the plane omega is one number.
         parts = [self.omega] if self.dimension == 2 else [self.omega[..., k] for k in range(3)]
-        return is_below_full_turn(sum(x * x for x in parts))
+        return is_below_full_turn(jnp.asarray(sum(x * x for x in parts)))
 
     def _with(self, fun: Any, other: Any) -> "AbstractMotion":
         check_other(self, other)

@@ -67,7 +67,7 @@ class Rotation(AbstractAlgebraElement):
         return self._with(dexpinv, other)
 
     def has_dexpinv(self) -> Bool[Array, ""]:
-        return is_below_full_turn(sum(self.omega[..., k] ** 2 for k in range(3)))
+        return is_below_full_turn(jnp.asarray(sum(self.omega[..., k] ** 2 for k in range(3))))
 
     def _with(self, fun: Any, other: Any) -> "Rotation":
         check_other(self, other)

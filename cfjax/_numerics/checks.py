@@ -8,6 +8,7 @@ import equinox.internal as eqxi
 import jax
 import jax.numpy as jnp
 import jax.tree_util as jtu
+import numpy as np
 from jax import lax
 from jax.extend.core import Primitive
 from jax.interpreters import ad, batching, mlir
@@ -71,7 +72,7 @@ def needing(zero: Real[Array, ""], tree: PyTree) -> PyTree:
     return jtu.tree_map(lambda x: jnp.where(zero == 0, x, zero.astype(x.dtype)), tree)
 
 
-def differ(a: Array, b: Array) -> Bool[Array, ""]:
+def differ(a: Array | np.ndarray, b: Array | np.ndarray) -> Bool[Array, ""]:
     """Whether arrays differ. NaN is as good as NaN: what is made of it says so itself."""
     return ~jnp.all((a == b) | ((a != a) & (b != b)))
 

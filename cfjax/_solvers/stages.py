@@ -223,7 +223,8 @@ def rolled_elements(
     one = functools.partial(stage, times[0])
     is_long = len(rows) > limits.MANY and is_rewritten() and are_long(one, first, len(rows))
     if can_roll(unroll, first, first, is_long) and is_uniform(chart):
-        none = None if number(first) is None else jnp.zeros_like(number(first))
+        of_first = number(first)
+        none = None if of_first is None else jnp.zeros_like(of_first)
 
         def noted(c: Any, pair: tuple[PyTree, Any]) -> tuple[PyTree, Any]:
             return _like(first, stage(c, pair[0])), number(pair[0])
