@@ -301,10 +301,11 @@ def _raised(solution: diffrax.Solution, fault: Fault) -> diffrax.Solution:
     if jtu.tree_leaves(solution.ys):
         if number := int(fault.number):
             raise eqx.EquinoxRuntimeError(fault.messages[number - 1])
-        if solution.result == diffrax.RESULTS.nonfinite:
-            raise eqx.EquinoxRuntimeError(_BLOW_UP)
         if solution.result != diffrax.RESULTS.successful:
-            raise eqx.EquinoxRuntimeError(diffrax.RESULTS[solution.result])
+            is_blow_up = solution.result == diffrax.RESULTS.nonfinite
+            raise eqx.EquinoxRuntimeError(
+                _BLOW_UP if is_blow_up else diffrax.RESULTS[solution.result]
+            )
     return solution
 
 
