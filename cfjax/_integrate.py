@@ -147,7 +147,7 @@ def integrate(
         checkpoint_every,
         step_back,
         throw=throw and is_compiled,
-        throw_in_reverse=throw,
+        throw_in_reverse=throw and step_back,
     )
     if throw and not is_compiled:
         solution = _raised(solution, fault)
