@@ -59,7 +59,7 @@ DEFECTS = [
     ),
     Defect(
         "_integrate.py",
-        "throw_in_reverse=throw,",
+        "throw_in_reverse=throw and step_back,",
         "throw_in_reverse=throw and is_compiled,",
         "NaN for an error of the way back, in a gradient from Python",
         "test_step_back.py -k derivative",
