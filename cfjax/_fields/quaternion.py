@@ -11,8 +11,7 @@ from jaxtyping import Array, Bool, Float
 from .._arrays import describe
 from .._field import AbstractAlgebraElement
 from .._numerics.quaternion import Frame, Layout, check_choice, increment, times
-from .._numerics.rotate import cross_product, dexpinv
-from .._numerics.stumpff import is_below_full_turn
+from .._numerics.rotate import cross_product, dexpinv, has_dexpinv
 from .elementwise import check_point, each
 
 
@@ -76,7 +75,7 @@ class QuaternionRotation(AbstractAlgebraElement):
         return self._with(dexpinv, other)
 
     def has_dexpinv(self) -> Bool[Array, ""]:
-        return is_below_full_turn(jnp.asarray(sum(self.omega[..., k] ** 2 for k in range(3))))
+        return has_dexpinv(self.omega)
 
     def _with(self, fun: Any, other: Any) -> "QuaternionRotation":
         kinds = jtu.tree_structure(self), jtu.tree_structure(other)

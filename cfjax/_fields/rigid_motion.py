@@ -11,7 +11,6 @@ from jaxtyping import Array, Bool, Float, Real
 from .._field import AbstractAlgebraElement
 from .._numerics import planar_motion, rigid_motion
 from .._numerics.matmul import matmul
-from .._numerics.stumpff import is_below_full_turn
 from .elementwise import check_other, check_point, each
 
 Frame = Literal["body", "fixed"]
@@ -34,7 +33,7 @@ class AbstractMotion(AbstractAlgebraElement):
     # Where a pose in one vector has the entries of the number, then those of the position.
     layouts: ClassVar[dict[str, tuple[int, ...]]]
     conventions: ClassVar[str]
-    # The module with its tangent, increment, bracket and dexpinv.
+    # The module with its tangent, increment, bracket, dexpinv and has_dexpinv.
     numerics: ClassVar[Any]
 
     def __check_init__(self):
@@ -76,9 +75,7 @@ class AbstractMotion(AbstractAlgebraElement):
         return self._with(self.numerics.dexpinv, other)
 
     def has_dexpinv(self) -> Bool[Array, ""]:
-        # In the plane omega is one number.
-        parts = [self.omega] if self.dimension == 2 else [self.omega[..., k] for k in range(3)]
-        return is_below_full_turn(jnp.asarray(sum(x * x for x in parts)))
+        return self.numerics.has_dexpinv(self.omega)
 
     def _with(self, fun: Any, other: Any) -> "AbstractMotion":
         check_other(self, other)

@@ -7,8 +7,7 @@ import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float
 
 from .._field import AbstractAlgebraElement
-from .._numerics.rotate import cross_product, dexpinv, increment, mean, rotate
-from .._numerics.stumpff import is_below_full_turn
+from .._numerics.rotate import cross_product, dexpinv, has_dexpinv, increment, mean, rotate
 from .elementwise import check_other, check_point, each
 
 
@@ -67,7 +66,7 @@ class Rotation(AbstractAlgebraElement):
         return self._with(dexpinv, other)
 
     def has_dexpinv(self) -> Bool[Array, ""]:
-        return is_below_full_turn(jnp.asarray(sum(self.omega[..., k] ** 2 for k in range(3))))
+        return has_dexpinv(self.omega)
 
     def _with(self, fun: Any, other: Any) -> "Rotation":
         check_other(self, other)

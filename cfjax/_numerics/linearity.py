@@ -33,10 +33,9 @@ _NOT_KNOWN = Linearity(3, "unknown")
 _SUMS = frozenset(("add", "add_any", "sub"))
 # Linear in all operands together.
 _LINEAR = frozenset(
-    "all_gather broadcast_in_dim cfjax_checked cfjax_pack cfjax_unpack complex concatenate conj "
-    "convert_element_type copy copy_p cumsum fft imag name neg optimization_barrier pad pbroadcast "
-    "ppermute psum psum_invariant pvary real reduce_sum reduce_window_sum reshape rev "
-    "sharding_constraint slice split squeeze stack tile transpose unstack".split()
+    "broadcast_in_dim cfjax_pack cfjax_unpack complex concatenate conj convert_element_type copy "
+    "cumsum imag neg pad real reduce_sum reshape rev slice split squeeze stack tile transpose "
+    "unstack".split()
 )
 # In those beside indices and predicates.
 _LINEAR_IN_PART = {
@@ -49,11 +48,9 @@ _LINEAR_IN_PART = {
     "select_n": slice(1, None),
 }
 # In each of two operands.
-_PRODUCTS = frozenset(("conv_general_dilated", "dot_general", "mul"))
+_PRODUCTS = frozenset(("dot_general", "mul"))
 # Those that add entries, which may cancel.
-_CONTRACTIONS = frozenset(
-    "conv_general_dilated cumsum dot_general psum reduce_sum reduce_window_sum".split()
-)
+_CONTRACTIONS = frozenset(("cumsum", "dot_general", "reduce_sum"))
 # In one of two operands: which.
 _LINEAR_IN_ONE = {"div": 0, "triangular_solve": 1}
 # Operations that call a program, and under which parameter.
@@ -62,15 +59,10 @@ _CALLS = {
     "cfjax_operation": "program",
     "checkpoint": "jaxpr",
     "closed_call": "call_jaxpr",
-    "core_call": "call_jaxpr",
     "custom_jvp_call": "call_jaxpr",
     "custom_vjp_call": "call_jaxpr",
-    "custom_vjp_call_jaxpr": "fun_jaxpr",
-    "custom_vmap_call": "call",
     "jit": "jaxpr",
     "pjit": "jaxpr",
-    "remat": "jaxpr",
-    "remat2": "jaxpr",
 }
 
 
@@ -123,8 +115,6 @@ def _of_operation(eqn: JaxprEqn, operands: list[Linearity]) -> list[Linearity]:
     inner: Any = eqn.params.get(_CALLS.get(name, ""))
     if inner is not None:
         found = _of_inner(inner, operands)
-    elif name in _CONTROL:
-        found = _CONTROL[name](eqn, operands)
     else:
         found = [_of_simple(eqn, name, operands)] * number
     return found if len(found) == number else [_without_rule(operands)] * number
@@ -193,58 +183,3 @@ def _joined(a: Linearity, b: Linearity) -> Linearity:
 def _of_inner(inner: Any, operands: Sequence[Linearity]) -> list[Linearity]:
     is_closed = hasattr(inner, "consts")
     return _of_program(inner, operands) if is_closed else _of_jaxpr(inner, operands)
-
-
-def _of_cond(eqn: JaxprEqn, operands: list[Linearity]) -> list[Linearity]:
-    index, *rest = operands
-    if index.power > 0:
-        return [_NOT_KNOWN] * len(eqn.outvars)
-    first, *others = (_of_inner(branch, rest) for branch in eqn.params["branches"])
-    for other in others:
-        first = [*map(_joined, first, other)]
-    return first
-
-
-def _of_loop(
-    body: Callable[[Sequence[Linearity]], list[Linearity]], carry: Sequence[Linearity]
-) -> list[Linearity]:
-    """What a carry is after any number of turns. What is known only ever falls."""
-    while (new := [*map(_joined, carry, body(carry))]) != list(carry):
-        carry = new
-    return list(carry)
-
-
-def _of_scan(eqn: JaxprEqn, operands: list[Linearity]) -> list[Linearity]:
-    n, m = eqn.params["num_consts"], eqn.params["num_carry"]
-    consts, carry, xs = operands[:n], operands[n : n + m], operands[n + m :]
-
-    def body(carry: Sequence[Linearity]) -> list[Linearity]:
-        return _of_inner(eqn.params["jaxpr"], [*consts, *carry, *xs])
-
-    carry = _of_loop(lambda carry: body(carry)[:m], carry)
-    return [*carry, *body(carry)[m:]]
-
-
-def _of_while(eqn: JaxprEqn, operands: list[Linearity]) -> list[Linearity]:
-    n, m = eqn.params["cond_nconsts"], eqn.params["body_nconsts"]
-    of_cond, of_body, carry = operands[:n], operands[n : n + m], operands[n + m :]
-    carry = _of_loop(lambda carry: _of_inner(eqn.params["body_jaxpr"], [*of_body, *carry]), carry)
-    (goes_on,) = _of_inner(eqn.params["cond_jaxpr"], [*of_cond, *carry])
-    return carry if goes_on.power == 0 else [_NOT_KNOWN] * len(carry)
-
-
-def _of_solve(eqn: JaxprEqn, operands: list[Linearity]) -> list[Linearity]:
-    """`lax.custom_linear_solve`, linear in what follows the constants of its functions."""
-    n = sum(eqn.params["const_lengths"])
-    if any(x.power > 0 for x in operands[:n]):
-        return [_NOT_KNOWN] * len(eqn.outvars)
-    whole = _may_cancel(functools.reduce(_joined, operands[n:]))
-    return [whole] * len(eqn.outvars)
-
-
-_CONTROL = {
-    "cond": _of_cond,
-    "custom_linear_solve": _of_solve,
-    "scan": _of_scan,
-    "while": _of_while,
-}

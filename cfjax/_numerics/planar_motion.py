@@ -11,9 +11,9 @@ from typing import Any
 
 import jax
 import jax.numpy as jnp
-from jaxtyping import Array, Float
+from jaxtyping import Array, Bool, Float
 
-from .stumpff import dexpinv_times, stumpff_1_to_3_apart
+from .stumpff import dexpinv_times, is_below_full_turn, stumpff_1_to_3_apart
 from .vectors import Vector, entries, pack, placed, plus
 
 
@@ -72,6 +72,11 @@ def dexpinv(
     # Of two motions the bracket has no rotation: a translation, u, which the first one turns.
     u = _bracket(w1, v1, w2, v2)
     return w2, pack(dexpinv_times(w1 * w1, entries(v2), u, _times_i(w1, u)), sums=True)
+
+
+def has_dexpinv(w: Float[Array, "*batch"]) -> Bool[Array, ""]:
+    """Whether `dexpinv` has a value at all of these, whatever the velocity is."""
+    return is_below_full_turn(w * w)
 
 
 def _moved(

@@ -83,6 +83,10 @@ def dexpinv(
     return jax.jvp(rotate.dexpinv, (w1, w2), (v1, v2))
 
 
+# Whatever the velocity is.
+has_dexpinv = rotate.has_dexpinv
+
+
 def _moved(
     w: Vector,
     v: Vector,

@@ -1,9 +1,9 @@
 """Rotation of vectors in space by the exponential of a cross product."""
 
 import jax
-from jaxtyping import Array, Float
+from jaxtyping import Array, Bool, Float
 
-from .stumpff import dexpinv_times, stumpff, stumpff_1_to_3_apart
+from .stumpff import dexpinv_times, is_below_full_turn, stumpff, stumpff_1_to_3_apart
 from .vectors import cross, dot, entries, pack
 
 
@@ -47,3 +47,9 @@ def dexpinv(a: Float[Array, "3"], x: Float[Array, "3"]) -> Float[Array, "3"]:
     axis, xs = entries(a), entries(x)
     once = cross(axis, xs)
     return pack(dexpinv_times(dot(axis, axis), xs, once, cross(axis, once)), sums=True)
+
+
+def has_dexpinv(a: Float[Array, "*batch 3"]) -> Bool[Array, ""]:
+    """Whether `dexpinv` has a value at all of these."""
+    axis = [a[..., k] for k in range(3)]
+    return is_below_full_turn(dot(axis, axis))

@@ -128,20 +128,15 @@ class _Elements(NamedTuple):
         return jtu.tree_map(lambda x: x + missing.astype(x.dtype), tree)
 
 
+# A number and not a predicate: what compares would keep the divisions of the whole step.
+@smooth
 def _missing(u: PyTree) -> Real[Array, ""] | None:
     """Zero, or NaN if `dexpinv` at u has no value; None if nothing is known."""
-    leaves = jtu.tree_leaves(u)
-    if has_dexpinv(u) is None:
+    found = has_dexpinv(u)
+    if found is None:
         return None
-
-    # A number and not a predicate, as what compares would keep the divisions of the whole step.
-    @smooth
-    def number(*leaves: Array) -> Real[Array, ""]:
-        found: Any = has_dexpinv(jtu.tree_unflatten(jtu.tree_structure(u), leaves))
-        dtype = jnp.finfo(leaves[0].dtype).dtype
-        return jnp.where(found, jnp.zeros((), dtype), jnp.nan)
-
-    return number(*leaves)
+    dtype = jnp.finfo(jtu.tree_leaves(u)[0].dtype).dtype
+    return jnp.where(found, jnp.zeros((), dtype), jnp.nan)
 
 
 def _frozen(chart: Chart, c: float, u: PyTree) -> PyTree:
