@@ -25,13 +25,13 @@ def _loss(scene, num_steps):
 def test_only_where_the_whole_step_is_too_long(rewritten):
     """A body of three numbers is scalarised as a whole, which is three times as fast."""
     for scene, size, is_loop in (
-        (spacecraft, 9, True),
-        (heavy_top, 9, True),
+        (spacecraft, 10, True),
+        (heavy_top, 10, True),
         (rigid_body, 3, False),
     ):
         loss, *start = _loss(scene, 3)
         program = str(jax.make_jaxpr(loss)(*start))
-        # The weights of 12 stages, and the numbers of all elements.
+        # The weights of 12 stages, and the numbers of all elements: one says whether it has a value.
         assert ("f64[12,13]" in program) == (f"f64[13,{size}]" in program) == is_loop
         assert "cfjax_operation" in program
 
