@@ -31,7 +31,7 @@ def test_only_where_the_whole_step_is_too_long(rewritten):
     ):
         loss, *start = _loss(scene, 3)
         program = str(jax.make_jaxpr(loss)(*start))
-        # The weights of 12 stages, and the numbers of all elements: one says whether it has a value.
+        # The weights of 12 stages, and the numbers of all elements and of whether each is one.
         assert ("f64[12,13]" in program) == (f"f64[13,{size}]" in program) == is_loop
         assert "cfjax_operation" in program
 
