@@ -95,7 +95,7 @@ def is_as_it_was(program: ClosedJaxpr, kind: Kind, plain: Plain | None) -> bool:
 _KEPT = 32
 
 
-def _once_for_each_program(fun: Callable[..., Any]) -> Callable[..., Any]:
+def once_for_each_program(fun: Callable[..., Any]) -> Callable[..., Any]:
     """`fun(program, *rest)`, computed once while one program after the other is differentiated.
 
     No program is held that JAX has dropped, and of those that JAX keeps, which are thousands, what
@@ -141,7 +141,7 @@ def _jvp(primals, tangents, *, program, kind, plain):
     return outs, out_tangents
 
 
-@_once_for_each_program
+@once_for_each_program
 def _tangent(
     program: ClosedJaxpr, plain: Plain | None, moving: Sequence[int], smooth: Sequence[int]
 ) -> "_Linear":
@@ -182,7 +182,7 @@ def _transpose(cotangents, *operands, program, kind, plain):
     return replaced(results, transposed.gives, new)
 
 
-@_once_for_each_program
+@once_for_each_program
 def _transposed(
     program: ClosedJaxpr, plain: Plain | None, linear: Sequence[int], coming: Sequence[int]
 ) -> "_Linear":
@@ -290,7 +290,7 @@ def _batch(operands, dims, *, program, kind, plain):
     return outs, out_dims
 
 
-@_once_for_each_program
+@once_for_each_program
 def _batched(
     program: ClosedJaxpr, plain: Plain | None, dims: tuple[int | None, ...], size: int
 ) -> tuple[ClosedJaxpr, Plain | None, list[int | None]]:

@@ -110,7 +110,7 @@ def operation(
 
         before = Plain(of_plain_leaves, structs(code.invars))
     if is_pair and not is_batch:
-        # Along leading axes a copy of the program (`_in_two`) would take much memory.
+        # Along leading axes a copy of the program (`in_two`) would take much memory.
         kind = kind._replace(first=sum(is_smooth[:num_first]))
     new = operation_p.bind(*operands, program=program, kind=kind, plain=before)
     return jtu.tree_unflatten(out_structure, replaced(outs, smooth, new))
@@ -144,7 +144,7 @@ def _run(*operands, program, kind, plain):
     if is_as_it_was(program, kind, plain):
         return jaxpr_as_fun(plain.program)(*operands)
     if kind.is_batch and not kind.order and kind.first < len(program.jaxpr.outvars):
-        return _in_two(program, int(kind.first), operands)
+        return in_two(program, int(kind.first), operands)
     order = min(kind.order, 2)
     most = WHOLE[kind.place][order]
     if kind.is_batch:
@@ -156,13 +156,13 @@ def _run(*operands, program, kind, plain):
 
     def run(group: ClosedJaxpr, values: Sequence[Any], is_last: bool) -> Sequence[Any]:
         outs = _once(group, values)
-        return outs if is_last else _together(outs)
+        return outs if is_last else together(outs)
 
     # With the operands materialised, so that no other operation shares what is computed from them.
-    return by_parts(program, ends, run, *_together(operands))
+    return by_parts(program, ends, run, *together(operands))
 
 
-def _in_two(program: ClosedJaxpr, first: int, operands: Sequence[Any]) -> list[Any]:
+def in_two(program: ClosedJaxpr, first: int, operands: Sequence[Any]) -> list[Any]:
     """The first results, and all others from a copy of the program.
 
     XLA would compute what leads to each of the others anew. The copy is in parts, each with few
@@ -173,8 +173,8 @@ def _in_two(program: ClosedJaxpr, first: int, operands: Sequence[Any]) -> list[A
     rest, rest_takes = narrowed(flattened(program, CALLS, is_once=True), given[first:])
     rest = _not_materialised(rest)
     # So that the copy is not seen to be one.
-    inputs = _together([operands[k] for k in rest_takes])
-    run = lambda part, values, is_last: _together(jaxpr_as_fun(part)(*values))  # noqa: E731
+    inputs = together([operands[k] for k in rest_takes])
+    run = lambda part, values, is_last: together(jaxpr_as_fun(part)(*values))  # noqa: E731
     outs = by_parts(rest, _ends_of_few(rest.jaxpr), run, *inputs)
     return [*_once(main, [operands[k] for k in main_takes]), *outs]
 
@@ -231,7 +231,7 @@ def _once(program: ClosedJaxpr, operands: Sequence[Any]) -> list[Any]:
     return called(flattened(program, CALLS, is_once=True), operands)
 
 
-def _together(values: Sequence[Any]) -> list[Any]:
+def together(values: Sequence[Any]) -> list[Any]:
     """The same, but for integers materialised together."""
     smooth = [k for k, x in enumerate(values) if is_inexact(x)]
     new = materialised([values[k] for k in smooth], in_batches=True) if smooth else []

@@ -56,7 +56,10 @@ from .understood import MOVES, REDUCTIONS, is_in_place, is_readable
 # as long to compile.
 SHORT = FUNCTION // 2
 
-_CALLS = frozenset(("jit", "pjit"))
+# Calls that are scalarised as a part of the program.
+_CALLS = {"jit": "jaxpr", "pjit": "jaxpr"}
+# Where nothing is differentiated any more, rules for that are not needed either.
+_LAST_CALLS = _CALLS | {"custom_jvp_call": "call_jaxpr"}
 
 
 def split(tree: PyTree, rows: bool = False) -> PyTree:
@@ -93,7 +96,7 @@ def _whole(x: Any) -> Any:
 def are_long(fun: Callable[[PyTree], PyTree], y: PyTree, times: int) -> bool:
     """Whether so many of `fun(y)` are too long to be scalarised."""
     code = without_dead_code(jax.make_jaxpr(fun)(y).jaxpr)
-    return times * _operations(code) > MAX_OPERATIONS
+    return times * operations(code) > MAX_OPERATIONS
 
 
 class Program(NamedTuple):
@@ -110,7 +113,7 @@ class Program(NamedTuple):
     rows: bool
 
 
-class _Declined(Exception):
+class Declined(Exception):
     """A program has something that is not to be scalarised."""
 
 
@@ -136,7 +139,8 @@ class Reading(NamedTuple):
         def apart(y: PyTree, parameters: PyTree) -> PyTree:
             first, moving = filled(consts, parameters), jtu.tree_leaves(y, is_leaf=_is_apart)
             fixed = [True] * len(first) + [False] * len(moving)
-            form = _Form(self.rows, self.length > FUNCTION, has_reciprocals(self.code, fixed))
+            is_long = self.length > FUNCTION
+            form = _Form(self.rows, is_long, has_reciprocals(self.code, fixed), _CALLS)
             outs, _ = _evaluate(self.code, (*first, *moving), fixed, form)
             # What is known before the program runs may come out as NumPy's.
             outs = [x if _is_apart(x) else jnp.asarray(x) for x in outs]
@@ -144,7 +148,7 @@ class Reading(NamedTuple):
 
         try:
             made, out = jax.make_jaxpr(apart, return_shape=True)(*shapes)
-        except _Declined:
+        except Declined:
             return None
         except Exception as error:
             return unread(error)
@@ -163,7 +167,7 @@ def read(fun: Callable[[PyTree], PyTree], y: PyTree, place: Place) -> Reading | 
         jaxpr, shape = jax.make_jaxpr(fun, return_shape=True)(y)
     try:
         code = without_dead_code(jaxpr.jaxpr)
-        length = _operations(code)
+        length = operations(code)
         if jaxpr.effects or not is_readable(code) or length > MAX_OPERATIONS:
             return None
     except Exception as error:
@@ -213,6 +217,20 @@ def traced(
     return Program(run, plain, parameters, rows)
 
 
+def on_numbers(program: ClosedJaxpr, fixed: Sequence[bool], operands: Sequence[Any]) -> list[Any]:
+    """The results of a program that is not differentiated any more, apart.
+
+    It is evaluated on single numbers; `fixed` are operands that are the same in every step.
+    """
+    jaxpr, consts = program.jaxpr, program.consts
+    flags = [*[True] * len(consts), *fixed]
+    is_long = operations(jaxpr) > FUNCTION
+    form = _Form(False, is_long, has_reciprocals(jaxpr, flags), _LAST_CALLS)
+    outs, _ = _evaluate(jaxpr, (*consts, *split(list(operands))), flags, form)
+    # What is known before the program runs may come out as NumPy's.
+    return [x if _is_apart(x) else jnp.asarray(x) for x in outs]
+
+
 def run_split(made: ClosedJaxpr, out: PyTree, y: PyTree, parameters: PyTree) -> PyTree:
     """What a scalarised program with such results makes of what is split."""
     outs = called(made, jtu.tree_leaves((y, parameters)))
@@ -232,10 +250,10 @@ def closed_over(
 
     The first program is to be scalarised. It has indices as NumPy's arrays.
     """
-    unknown = {id(x): x for x in consts if _constant(x) is None}
+    unknown = {id(x): x for x in consts if known_constant(x) is None}
     unknown |= {id(x): x for more in others for x in more if isinstance(x, Tracer)}
     number = {key: _Parameter(k) for k, key in enumerate(unknown)}
-    first = [number[id(x)] if id(x) in number else _constant(x) for x in consts]
+    first = [number[id(x)] if id(x) in number else known_constant(x) for x in consts]
     rest = [[number.get(id(x), x) for x in more] for more in others]
     return list(map(jnp.asarray, unknown.values())), first, *rest
 
@@ -245,7 +263,7 @@ def filled(consts: Sequence[Any], parameters: Sequence[Any]) -> list[Any]:
     return [parameters[x.number] if isinstance(x, _Parameter) else x for x in consts]
 
 
-def _constant(x: Any) -> np.ndarray | None:
+def known_constant(x: Any) -> np.ndarray | None:
     """An array of indices that is known now."""
     if isinstance(x, Tracer) or not isinstance(x, jax.Array | np.ndarray | np.generic):
         return None
@@ -271,7 +289,7 @@ def _has_rows(y: PyTree, max_entries: int) -> bool:
     )
 
 
-def _operations(jaxpr: Jaxpr) -> int:
+def operations(jaxpr: Jaxpr) -> int:
     """About how many operations on single numbers or whole arrays there will be."""
     return sum(map(_operations_of, jaxpr.eqns))
 
@@ -279,7 +297,7 @@ def _operations(jaxpr: Jaxpr) -> int:
 def _operations_of(eqn: JaxprEqn) -> int:
     name = eqn.primitive.name
     if name in _CALLS:
-        return _operations(eqn.params["jaxpr"].jaxpr)
+        return operations(eqn.params["jaxpr"].jaxpr)
     if name in MOVES:
         return 0
     terms = 1
@@ -305,12 +323,13 @@ class _Form(NamedTuple):
     """How a program is scalarised.
 
     Whether arrays have leading axes, the program is long, and products with reciprocals take the
-    place of divisions by what is fixed.
+    place of divisions by what is fixed; which calls are a part of it, and under which parameter.
     """
 
     rows: bool
     is_long: bool
     has_reciprocals: bool
+    calls: dict[str, str]
 
 
 def _evaluate(
@@ -340,8 +359,8 @@ def _evaluate(
         values = [read(v) for v in eqn.invars]
         fixed = [is_fixed(v) for v in eqn.invars]
         outs_fixed = [all(fixed)] * len(eqn.outvars)
-        if eqn.primitive.name in _CALLS:
-            inner = eqn.params["jaxpr"]
+        if eqn.primitive.name in form.calls:
+            inner = eqn.params[form.calls[eqn.primitive.name]]
             constants = [True] * len(inner.consts)
             outs, outs_fixed = _evaluate(
                 inner.jaxpr, (*inner.consts, *values), (*constants, *fixed), form
@@ -372,7 +391,7 @@ def _results(
     """The results of one operation: scalarised, if there is a rule for it."""
     outs = _apart(jaxpr, eqn, values, fixed, form)
     if outs is None and is_in_place(eqn):
-        raise _Declined
+        raise Declined
     if outs is None:
         outs = map(split, evaluate(jaxpr, eqn, list(map(_whole, values))))
     return list(outs)

@@ -26,6 +26,7 @@ from .program import (
     split_like,
     traced,
 )
+from .step import step
 from .scope import in_equal_steps, is_everywhere, rewriting, where
 from .struct_of_arrays import StructOfArrays
 
@@ -56,6 +57,8 @@ def scalarised(
         outs = _in_batches(fun, y, reading, is_pair)
         if outs is not None:
             return outs
+    if is_usual and not reading.rows:
+        return step(reading, y, is_pair)
     program = traced(fun, y, reading, "step", is_derived)
     if program is None:
         return fun(y)

@@ -1,0 +1,307 @@
+"""A step as one operation, which is scalarised where it is lowered.
+
+The operation holds its program as it was traced: of whole arrays, and of one member of a batch.
+Its derivatives, transposes and batches are JAX's own, of that program, and are the same operation
+again. So where it is lowered all is known that decides how it is compiled: how long this very
+program is, and what it is a batch of.
+"""
+
+from collections.abc import Callable, Sequence
+from typing import Any, NamedTuple
+
+import jax
+import jax.numpy as jnp
+import jax.tree_util as jtu
+from jax import lax
+from jax.core import ShapedArray
+from jax.extend.core import ClosedJaxpr, Primitive, jaxpr_as_fun
+from jax.interpreters import ad, batching, mlir
+from jaxtyping import PyTree
+
+from .derivatives import once_for_each_program
+from .jaxprs import CALLS, altered, called, flattened, is_inexact, program_of, reached, replaced
+from .limits import FUNCTION, MAX_ENTRIES, MAX_OPERATIONS, MAX_RESULTS_IN_BATCHES
+from .materialise import materialised
+from .operation import in_two, together
+from .program import Declined, Reading, join, known_constant, on_numbers, operations
+from .scope import unread
+
+# `levels` are the axes of each `vmap` around it, the innermost first. `fixed` says which operands
+# the step closes over, `first` how many of its results are mostly used alone, and `of` what it is a
+# derivative of.
+step_p = Primitive("cfjax_step")
+step_p.multiple_results = True
+
+
+class Of(NamedTuple):
+    """What a program is a derivative of: results of another along some of its operands.
+
+    It is linear in its last `linear` operands. A transpose has no `program` of its own.
+    """
+
+    linear: int
+    program: ClosedJaxpr | None = None
+    moving: tuple[int, ...] = ()
+    smooth: tuple[int, ...] = ()
+
+
+def step(reading: Reading, y: PyTree, is_pair: bool) -> PyTree:
+    """What the function that has been read makes of `y`, as one operation.
+
+    With `is_pair` it returns a pair, of which mostly the first part alone is used. Reverse mode
+    keeps `y` and what the function closes over, and computes the step again.
+    """
+    pairs = list(zip(reading.code.constvars, reading.consts, strict=True))
+    known = [(v, x) for v, x in pairs if known_constant(x) is not None]
+    given = [(v, x) for v, x in pairs if known_constant(x) is None]
+    code = altered(
+        reading.code,
+        constvars=[v for v, _ in known],
+        invars=[*(v for v, _ in given), *reading.code.invars],
+    )
+    operands = [jnp.asarray(x) for x in (*(x for _, x in given), *jtu.tree_leaves(y))]
+    structure = jtu.tree_structure(reading.shape)
+    outs = step_p.bind(
+        *operands,
+        program=ClosedJaxpr(code, [x for _, x in known]),
+        levels=(),
+        fixed=tuple(k < len(given) for k in range(len(operands))),
+        first=len(jtu.tree_leaves(reading.shape[0])) if is_pair else structure.num_leaves,
+        of=None,
+    )
+    return jtu.tree_unflatten(structure, outs)
+
+
+@step_p.def_abstract_eval
+def _(*operands, program, levels, **_):
+    sizes = _sizes(operands, levels)
+    return [ShapedArray((*sizes, *aval.shape), aval.dtype) for aval in program.out_avals]
+
+
+def _sizes(operands: Sequence[Any], levels: Sequence[Any]) -> list[int]:
+    """How many members each batch has, the outermost first."""
+    shapes, sizes = [list(x.shape) for x in operands], []
+    for axes in reversed(levels):
+        given = zip(shapes, axes, strict=True)
+        sizes.append([shape.pop(0) for shape, axis in given if axis is not None][0])
+    return sizes
+
+
+def _jvp(primals, tangents, *, program, levels, fixed, first, of):
+    outs = step_p.bind(*primals, program=program, levels=levels, fixed=fixed, first=first, of=of)
+    ways: list[Any] = [ad.Zero(jax.typeof(x).to_tangent_aval()) for x in outs]
+    given = enumerate(zip(primals, tangents, strict=True))
+    moving = tuple(k for k, (x, way) in given if type(way) is not ad.Zero and is_inexact(x))
+    are_reached = reached(program.jaxpr, [k in moving for k in range(len(primals))])
+    smooth = tuple(k for k, x in enumerate(outs) if is_inexact(x) and are_reached[k])
+    if not (moving and smooth):
+        return outs, ways
+    new = step_p.bind(
+        *primals,
+        *(tangents[k] for k in moving),
+        program=_tangent(program, moving, smooth),
+        levels=tuple((*axes, *(axes[k] for k in moving)) for axes in levels),
+        fixed=(*fixed, *[False] * len(moving)),
+        first=len(smooth),
+        of=Of(len(moving), program, moving, smooth),
+    )
+    return outs, replaced(ways, smooth, new)
+
+
+def _some(
+    program: ClosedJaxpr, values: Sequence[Any], places: Sequence[int], gives: Sequence[int]
+) -> Callable[..., list[Any]]:
+    """Some results as a function of some operands."""
+    fun = jaxpr_as_fun(program)
+
+    def some(*xs: Any) -> list[Any]:
+        outs = fun(*replaced(values, places, xs))
+        return [outs[k] for k in gives]
+
+    return some
+
+
+@once_for_each_program
+def _tangent(
+    program: ClosedJaxpr, moving: tuple[int, ...], smooth: tuple[int, ...]
+) -> ClosedJaxpr:
+    n, avals = len(program.in_avals), program.in_avals
+
+    def tangent(*xs):
+        fun = _some(program, xs[:n], moving, smooth)
+        return jax.jvp(fun, [xs[k] for k in moving], list(xs[n:]))[1]
+
+    return program_of(tangent, *avals, *(avals[k] for k in moving))
+
+
+def _transpose(cotangents, *operands, program, levels, fixed, of, **_):
+    unknown = tuple(k for k, x in enumerate(operands) if ad.is_undefined_primal(x))
+    coming = tuple(k for k, x in enumerate(cotangents) if type(x) is not ad.Zero)
+    results: list[Any] = [None] * len(operands)
+    if not coming:
+        return results
+    rest = [k for k in range(len(operands)) if k not in unknown]
+    first = len(operands) - of.linear if of is not None and of.program is not None else None
+    if first is not None and unknown[0] >= first:
+        # By `vjp` of what this is the derivative of: a loop in it has values in its carry, and is
+        # not linear.
+        back = _backward(
+            of.program,
+            tuple(of.moving[k - first] for k in unknown),
+            tuple(of.smooth[k] for k in coming),
+        )
+        # The other directions have no part in it.
+        rest = [k for k in rest if k < first]
+    else:
+        back = _transposed(program, unknown, coming)
+    outs = step_p.bind(
+        *(operands[k] for k in rest),
+        *(cotangents[k] for k in coming),
+        program=back,
+        levels=tuple((*(axes[k] for k in rest), *[0] * len(coming)) for axes in levels),
+        fixed=(*(fixed[k] for k in rest), *[False] * len(coming)),
+        first=len(unknown),
+        of=Of(len(coming)),
+    )
+    for k, x in zip(unknown, outs, strict=True):
+        # What all members share gets the sum of their derivatives.
+        shared = tuple(n for n, axes in enumerate(reversed(levels)) if axes[k] is None)
+        results[k] = jnp.sum(x, shared) if shared else x
+    return results
+
+
+@once_for_each_program
+def _backward(
+    program: ClosedJaxpr, moving: tuple[int, ...], smooth: tuple[int, ...]
+) -> ClosedJaxpr:
+    n, avals = len(program.in_avals), program.in_avals
+
+    def backward(*xs):
+        fun = _some(program, xs[:n], moving, smooth)
+        return jax.vjp(fun, *(xs[k] for k in moving))[1](list(xs[n:]))
+
+    return program_of(backward, *avals, *(program.out_avals[k] for k in smooth))
+
+
+@once_for_each_program
+def _transposed(
+    program: ClosedJaxpr, unknown: tuple[int, ...], coming: tuple[int, ...]
+) -> ClosedJaxpr:
+    avals = program.in_avals
+    rest = [k for k in range(len(avals)) if k not in unknown]
+
+    def transposed(*xs):
+        known = replaced(avals, rest, xs[: len(rest)])
+        fun = _some(program, known, unknown, coming)
+        return jax.linear_transpose(fun, *(avals[k] for k in unknown))(list(xs[len(rest) :]))
+
+    return program_of(transposed, *(avals[k] for k in rest), *(program.out_avals[k] for k in coming))
+
+
+def _batch(operands, dims, *, program, levels, **params):
+    given = zip(operands, dims, strict=True)
+    moved = [x if d is None else jnp.moveaxis(x, d, 0) for x, d in given]
+    axes = tuple(None if d is None else 0 for d in dims)
+    outs = step_p.bind(*moved, program=program, levels=(*levels, axes), **params)
+    # What the batch does not reach is in no batch.
+    are_reached = reached(program.jaxpr, [d is not None for d in dims])
+    outs = [x if is_one else _one_of(x) for x, is_one in zip(outs, are_reached, strict=True)]
+    return outs, [0 if is_one else None for is_one in are_reached]
+
+
+def _one_of(xs):
+    """One of the members of a batch, which are all the same."""
+    return xs[0] if xs.shape[0] else jnp.zeros(xs.shape[1:], xs.dtype)
+
+
+@step_p.def_impl
+def _run(*operands, program, levels, fixed, first, of):
+    length = operations(program.jaxpr)
+    if length > MAX_OPERATIONS:
+        return _as_traced(operands, program, levels)
+    for k, size in enumerate(reversed(_sizes(operands, levels))):
+        moves = [axis is not None for axis in levels[k]]
+        is_linear = of is not None and not any(moves[: len(moves) - of.linear])
+        if is_linear and size <= MAX_ENTRIES["step"]:
+            params = dict(program=program, fixed=fixed, first=first, of=of)
+            return _one_by_one(operands, levels, k, params)
+    if levels and length > FUNCTION:
+        operands = _without_single_numbers(operands, levels)
+    outs = _flat(operands, program, levels, fixed, first)
+    return _as_traced(operands, program, levels) if outs is None else outs
+
+
+def _one_by_one(operands, levels, k, params):
+    """One member of a batch after the other, as of the few directions of a Jacobian.
+
+    In a program for all of them single numbers meet arrays, and XLA would compute the former anew
+    for every use.
+    """
+    rest = [*levels[:k], *levels[k + 1 :]]
+    moving = [n for n, axis in enumerate(levels[k]) if axis is not None]
+    # What is outside of this batch comes first.
+    places = [sum(axes[n] is not None for axes in levels[k + 1 :]) for n in moving]
+    given = zip(moving, places, strict=True)
+    outs = lax.map(
+        lambda some: step_p.bind(*replaced(operands, moving, some), levels=tuple(rest), **params),
+        [jnp.moveaxis(operands[n], place, 0) for n, place in given],
+    )
+    return [jnp.moveaxis(x, 0, len(levels) - 1 - k) for x in outs]
+
+
+def _flat(operands, program, levels, fixed, first) -> list[Any] | None:
+    """The results, computed on single numbers; None if the program declines."""
+    n = len(program.out_avals)
+
+    def on_one(*operands):
+        outs = on_numbers(program, fixed, operands)
+        # More results are left to XLA, which drops what nobody uses.
+        is_few = len(jtu.tree_leaves(outs)) <= MAX_RESULTS_IN_BATCHES
+        return join(_materialised(outs) if is_few else outs)
+
+    try:
+        made = jax.make_jaxpr(_in_batches(on_one, levels))(*operands)
+        code = flattened(made, CALLS, is_once=True)
+    except Declined:
+        return None
+    except Exception as error:
+        return unread(error)
+    if levels and first < n:
+        return in_two(code, first, operands)
+    return called(code, operands)
+
+
+def _as_traced(operands, program, levels) -> list[Any]:
+    if levels:
+        operands = _without_single_numbers(operands, levels)
+    # A literal comes out as NumPy's.
+    return list(map(jnp.asarray, _in_batches(jaxpr_as_fun(program), levels)(*operands)))
+
+
+def _in_batches(fun: Callable[..., Any], levels: Sequence[Any]) -> Callable[..., Any]:
+    for axes in levels:
+        fun = jax.vmap(fun, in_axes=axes)
+    return fun
+
+
+def _materialised(tree: PyTree) -> PyTree:
+    """The same, its numbers materialised together."""
+    leaves, structure = jtu.tree_flatten(tree)
+    return structure.unflatten(together(leaves))
+
+
+def _without_single_numbers(operands: Sequence[Any], levels: Sequence[Any]) -> list[Any]:
+    """The operands, materialised where they have no batch axis, as the time of a step.
+
+    XLA would compute them anew in each of its functions for a batch.
+    """
+    single = [k for k in range(len(operands)) if all(axes[k] is None for axes in levels)]
+    return replaced(operands, single, together([operands[k] for k in single]))
+
+
+ad.primitive_jvps[step_p] = _jvp
+ad.primitive_transposes[step_p] = _transpose
+batching.primitive_batchers[step_p] = _batch
+mlir.register_lowering(step_p, mlir.lower_fun(_run, multiple_results=True))
+# Where newer versions of JAX put types of their own within, they take them out first.
+step_p.to_lojax = _run
