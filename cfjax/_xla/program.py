@@ -220,13 +220,13 @@ def traced(
 def on_numbers(program: ClosedJaxpr, fixed: Sequence[bool], operands: Sequence[Any]) -> list[Any]:
     """The results of a program that is not differentiated any more, apart.
 
-    It is evaluated on single numbers; `fixed` are operands that are the same in every step.
+    So are its operands. `fixed` says which of them are the same in every step.
     """
     jaxpr, consts = program.jaxpr, program.consts
     flags = [*[True] * len(consts), *fixed]
     is_long = operations(jaxpr) > FUNCTION
     form = _Form(False, is_long, has_reciprocals(jaxpr, flags), _LAST_CALLS)
-    outs, _ = _evaluate(jaxpr, (*consts, *split(list(operands))), flags, form)
+    outs, _ = _evaluate(jaxpr, (*consts, *operands), flags, form)
     # What is known before the program runs may come out as NumPy's.
     return [x if _is_apart(x) else jnp.asarray(x) for x in outs]
 

@@ -26,8 +26,8 @@ from .program import (
     split_like,
     traced,
 )
-from .step import step
 from .scope import in_equal_steps, is_everywhere, rewriting, where
+from .step import step
 from .struct_of_arrays import StructOfArrays
 
 

@@ -21,28 +21,23 @@ from jaxtyping import PyTree
 from .derivatives import once_for_each_program
 from .jaxprs import CALLS, altered, called, flattened, is_inexact, program_of, reached, replaced
 from .limits import FUNCTION, MAX_ENTRIES, MAX_OPERATIONS, MAX_RESULTS_IN_BATCHES
-from .materialise import materialised
 from .operation import in_two, together
-from .program import Declined, Reading, join, known_constant, on_numbers, operations
+from .program import Declined, Reading, join, known_constant, on_numbers, operations, split
 from .scope import unread
 
 # `levels` are the axes of each `vmap` around it, the innermost first. `fixed` says which operands
-# the step closes over, `first` how many of its results are mostly used alone, and `of` what it is a
-# derivative of.
+# the step closes over, and `first` how many of its results are mostly used alone. A derivative is
+# linear in its last operands, `linear` of them, and a tangent knows what it is the tangent `of`.
 step_p = Primitive("cfjax_step")
 step_p.multiple_results = True
 
 
 class Of(NamedTuple):
-    """What a program is a derivative of: results of another along some of its operands.
+    """What a program is the tangent of: some results of another along some of its operands."""
 
-    It is linear in its last `linear` operands. A transpose has no `program` of its own.
-    """
-
-    linear: int
-    program: ClosedJaxpr | None = None
-    moving: tuple[int, ...] = ()
-    smooth: tuple[int, ...] = ()
+    program: ClosedJaxpr
+    moving: tuple[int, ...]
+    smooth: tuple[int, ...]
 
 
 def step(reading: Reading, y: PyTree, is_pair: bool) -> PyTree:
@@ -67,6 +62,7 @@ def step(reading: Reading, y: PyTree, is_pair: bool) -> PyTree:
         levels=(),
         fixed=tuple(k < len(given) for k in range(len(operands))),
         first=len(jtu.tree_leaves(reading.shape[0])) if is_pair else structure.num_leaves,
+        linear=0,
         of=None,
     )
     return jtu.tree_unflatten(structure, outs)
@@ -83,12 +79,13 @@ def _sizes(operands: Sequence[Any], levels: Sequence[Any]) -> list[int]:
     shapes, sizes = [list(x.shape) for x in operands], []
     for axes in reversed(levels):
         given = zip(shapes, axes, strict=True)
-        sizes.append([shape.pop(0) for shape, axis in given if axis is not None][0])
+        firsts = [shape.pop(0) for shape, axis in given if axis is not None]
+        sizes.append(firsts[0])
     return sizes
 
 
-def _jvp(primals, tangents, *, program, levels, fixed, first, of):
-    outs = step_p.bind(*primals, program=program, levels=levels, fixed=fixed, first=first, of=of)
+def _jvp(primals, tangents, *, program, levels, fixed, **params):
+    outs = step_p.bind(*primals, program=program, levels=levels, fixed=fixed, **params)
     ways: list[Any] = [ad.Zero(jax.typeof(x).to_tangent_aval()) for x in outs]
     given = enumerate(zip(primals, tangents, strict=True))
     moving = tuple(k for k, (x, way) in given if type(way) is not ad.Zero and is_inexact(x))
@@ -103,7 +100,8 @@ def _jvp(primals, tangents, *, program, levels, fixed, first, of):
         levels=tuple((*axes, *(axes[k] for k in moving)) for axes in levels),
         fixed=(*fixed, *[False] * len(moving)),
         first=len(smooth),
-        of=Of(len(moving), program, moving, smooth),
+        linear=len(moving),
+        of=Of(program, moving, smooth),
     )
     return outs, replaced(ways, smooth, new)
 
@@ -122,9 +120,7 @@ def _some(
 
 
 @once_for_each_program
-def _tangent(
-    program: ClosedJaxpr, moving: tuple[int, ...], smooth: tuple[int, ...]
-) -> ClosedJaxpr:
+def _tangent(program: ClosedJaxpr, moving: tuple[int, ...], smooth: tuple[int, ...]) -> ClosedJaxpr:
     n, avals = len(program.in_avals), program.in_avals
 
     def tangent(*xs):
@@ -134,15 +130,15 @@ def _tangent(
     return program_of(tangent, *avals, *(avals[k] for k in moving))
 
 
-def _transpose(cotangents, *operands, program, levels, fixed, of, **_):
+def _transpose(cotangents, *operands, program, levels, fixed, linear, of, **_):
     unknown = tuple(k for k, x in enumerate(operands) if ad.is_undefined_primal(x))
     coming = tuple(k for k, x in enumerate(cotangents) if type(x) is not ad.Zero)
     results: list[Any] = [None] * len(operands)
     if not coming:
         return results
     rest = [k for k in range(len(operands)) if k not in unknown]
-    first = len(operands) - of.linear if of is not None and of.program is not None else None
-    if first is not None and unknown[0] >= first:
+    first = len(operands) - linear
+    if of is not None and unknown[0] >= first:
         # By `vjp` of what this is the derivative of: a loop in it has values in its carry, and is
         # not linear.
         back = _backward(
@@ -161,7 +157,8 @@ def _transpose(cotangents, *operands, program, levels, fixed, of, **_):
         levels=tuple((*(axes[k] for k in rest), *[0] * len(coming)) for axes in levels),
         fixed=(*(fixed[k] for k in rest), *[False] * len(coming)),
         first=len(unknown),
-        of=Of(len(coming)),
+        linear=len(coming),
+        of=None,
     )
     for k, x in zip(unknown, outs, strict=True):
         # What all members share gets the sum of their derivatives.
@@ -195,7 +192,8 @@ def _transposed(
         fun = _some(program, known, unknown, coming)
         return jax.linear_transpose(fun, *(avals[k] for k in unknown))(list(xs[len(rest) :]))
 
-    return program_of(transposed, *(avals[k] for k in rest), *(program.out_avals[k] for k in coming))
+    cotangents = (program.out_avals[k] for k in coming)
+    return program_of(transposed, *(avals[k] for k in rest), *cotangents)
 
 
 def _batch(operands, dims, *, program, levels, **params):
@@ -215,19 +213,19 @@ def _one_of(xs):
 
 
 @step_p.def_impl
-def _run(*operands, program, levels, fixed, first, of):
+def _run(*operands, program, levels, fixed, first, linear, of):
     length = operations(program.jaxpr)
     if length > MAX_OPERATIONS:
         return _as_traced(operands, program, levels)
     for k, size in enumerate(reversed(_sizes(operands, levels))):
         moves = [axis is not None for axis in levels[k]]
-        is_linear = of is not None and not any(moves[: len(moves) - of.linear])
+        is_linear = linear and not any(moves[: len(moves) - linear])
         if is_linear and size <= MAX_ENTRIES["step"]:
-            params = dict(program=program, fixed=fixed, first=first, of=of)
+            params = dict(program=program, fixed=fixed, first=first, linear=linear, of=of)
             return _one_by_one(operands, levels, k, params)
     if levels and length > FUNCTION:
         operands = _without_single_numbers(operands, levels)
-    outs = _flat(operands, program, levels, fixed, first)
+    outs = _flat(operands, program, levels, fixed, first, linear)
     return _as_traced(operands, program, levels) if outs is None else outs
 
 
@@ -249,26 +247,36 @@ def _one_by_one(operands, levels, k, params):
     return [jnp.moveaxis(x, 0, len(levels) - 1 - k) for x in outs]
 
 
-def _flat(operands, program, levels, fixed, first) -> list[Any] | None:
+def _flat(operands, program, levels, fixed, first, linear) -> list[Any] | None:
     """The results, computed on single numbers; None if the program declines."""
-    n = len(program.out_avals)
 
-    def on_one(*operands):
-        outs = on_numbers(program, fixed, operands)
-        # More results are left to XLA, which drops what nobody uses.
-        is_few = len(jtu.tree_leaves(outs)) <= MAX_RESULTS_IN_BATCHES
-        return join(_materialised(outs) if is_few else outs)
+    def on_one(*given):
+        outs = on_numbers(program, fixed, given)
+        # What needs several results of a derivative would compute it anew for each. Values, and
+        # more results, are left to XLA, which drops what nobody uses.
+        leaves, structure = jtu.tree_flatten(outs)
+        is_few = len(leaves) <= MAX_RESULTS_IN_BATCHES
+        return structure.unflatten(together(leaves) if linear and is_few else leaves)
 
+    def apart(k: int) -> Any:
+        axes = [(axes[k],) for axes in levels if axes[k] is not None]
+        return _in_batches(split, axes)(operands[k])
+
+    given = [apart(k) for k in range(len(operands))]
     try:
-        made = jax.make_jaxpr(_in_batches(on_one, levels))(*operands)
+        made, out = jax.make_jaxpr(_in_batches(on_one, levels), return_shape=True)(*given)
         code = flattened(made, CALLS, is_once=True)
     except Declined:
         return None
     except Exception as error:
         return unread(error)
-    if levels and first < n:
-        return in_two(code, first, operands)
-    return called(code, operands)
+    leaves = jtu.tree_leaves(given)
+    if levels and first < len(out):
+        new = in_two(code, len(jtu.tree_leaves(out[:first])), leaves)
+    else:
+        new = called(code, leaves)
+    outs = jtu.tree_unflatten(jtu.tree_structure(out), new)
+    return [_in_batches(join, [(0,)] * len(levels))(x) for x in outs]
 
 
 def _as_traced(operands, program, levels) -> list[Any]:
@@ -282,12 +290,6 @@ def _in_batches(fun: Callable[..., Any], levels: Sequence[Any]) -> Callable[...,
     for axes in levels:
         fun = jax.vmap(fun, in_axes=axes)
     return fun
-
-
-def _materialised(tree: PyTree) -> PyTree:
-    """The same, its numbers materialised together."""
-    leaves, structure = jtu.tree_flatten(tree)
-    return structure.unflatten(together(leaves))
 
 
 def _without_single_numbers(operands: Sequence[Any], levels: Sequence[Any]) -> list[Any]:

@@ -21,7 +21,8 @@ calls: Counter[str] = Counter()
 
 _CALLS = {"jit": "jaxpr", "pjit": "jaxpr", "closed_call": "call_jaxpr", "core_call": "call_jaxpr",
           "custom_jvp_call": "call_jaxpr", "custom_vjp_call": "call_jaxpr", "checkpoint": "jaxpr",
-          "remat2": "jaxpr", "cfjax_operation": "program", "custom_lin": "call_jaxpr"}  # fmt: skip
+          "remat2": "jaxpr", "cfjax_call": "program", "cfjax_operation": "program",
+          "custom_lin": "call_jaxpr"}  # fmt: skip
 
 
 def run(fun: Callable[..., Any], *args: Any) -> Any:
@@ -31,6 +32,39 @@ def run(fun: Callable[..., Any], *args: Any) -> Any:
     with np.errstate(all="ignore"):
         outs = evaluate(closed.jaxpr, closed.consts, *leaves)
     return jax.tree_util.tree_unflatten(jax.tree_util.tree_structure(out), outs)
+
+
+def num_rewritten() -> int:
+    """How many programs have been met that are rewritten."""
+    return calls["cfjax_operation"] + calls["cfjax_step"]
+
+
+def lowered(fun: Callable[..., Any], *args: Any) -> ClosedJaxpr:
+    """The program of `fun(*args)`, each step in it as it is compiled."""
+    closed = jax.make_jaxpr(fun)(*args)
+
+    def again(program: ClosedJaxpr, *values: Any) -> list[Any]:
+        jaxpr = program.jaxpr
+        variables = *jaxpr.constvars, *jaxpr.invars
+        env: dict[Any, Any] = dict(zip(variables, (*program.consts, *values), strict=True))
+
+        def read(v: Any) -> Any:
+            aval: Any = v.aval
+            return jnp.asarray(v.val, aval.dtype) if isinstance(v, Literal) else env[v]
+
+        for eqn in jaxpr.eqns:
+            given = list(map(read, eqn.invars))
+            if eqn.primitive.name == "cfjax_step":
+                outs = eqn.primitive.impl(*given, **eqn.params)
+            elif eqn.primitive.name in ("jit", "pjit"):
+                outs = again(eqn.params["jaxpr"], *given)
+            else:
+                outs = eqn.primitive.bind(*given, **eqn.params)
+                outs = outs if eqn.primitive.multiple_results else [outs]
+            env.update(zip(eqn.outvars, outs, strict=True))
+        return list(map(read, jaxpr.outvars))
+
+    return jax.make_jaxpr(lambda *leaves: again(closed, *leaves))(*jax.tree.leaves(args))
 
 
 def array(x: Any) -> Any:
@@ -69,6 +103,10 @@ def _apply(jaxpr: Jaxpr, eqn: Any, values: list[Any]) -> Sequence[Any]:
         if isinstance(inner, ClosedJaxpr):
             return evaluate(inner.jaxpr, inner.consts, *values)
         return evaluate(inner, (), *values)
+    if name == "cfjax_step":
+        # What it is lowered to.
+        made = jax.make_jaxpr(lambda *xs: eqn.primitive.impl(*xs, **params))(*values)
+        return evaluate(made.jaxpr, made.consts, *values)
     if name in _CONTROL:
         return _CONTROL[name](values, params)
     if any(not isinstance(x, np.ndarray) for x in values) or any(
