@@ -16,6 +16,7 @@ from jax.extend.core import ClosedJaxpr, Jaxpr, JaxprEqn, Literal, jaxprs_in_par
 from jaxtyping import PyTree
 
 from .._xla.jaxprs import parameters
+from .._xla.step import step_p, whole
 
 
 def count_flops(fun: Callable[..., PyTree], *args: PyTree) -> int:
@@ -132,6 +133,8 @@ def _inlined(
 ) -> list[Hashable] | None:
     """The results of an equation that stands for a program of its own, if it is known which."""
     kind, params = eqn.primitive.name, eqn.params
+    if eqn.primitive is step_p:
+        return _flatten(whole(eqn), operands, program)
     if kind in _CALLS:
         return _flatten(params[_CALLS[kind]], operands, program)
     if kind == "custom_linear_solve":

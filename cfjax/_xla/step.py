@@ -14,12 +14,22 @@ import jax.numpy as jnp
 import jax.tree_util as jtu
 from jax import lax
 from jax.core import ShapedArray
-from jax.extend.core import ClosedJaxpr, Primitive, jaxpr_as_fun
+from jax.extend.core import ClosedJaxpr, JaxprEqn, Primitive, jaxpr_as_fun
 from jax.interpreters import ad, batching, mlir
 from jaxtyping import PyTree
 
 from .derivatives import once_for_each_program
-from .jaxprs import CALLS, altered, called, flattened, is_inexact, program_of, reached, replaced
+from .jaxprs import (
+    CALLS,
+    altered,
+    called,
+    flattened,
+    is_inexact,
+    program_of,
+    reached,
+    replaced,
+    structs,
+)
 from .limits import FUNCTION, MAX_ENTRIES, MAX_OPERATIONS, MAX_RESULTS_IN_BATCHES
 from .operation import in_two, together
 from .program import Declined, Reading, join, known_constant, on_numbers, operations, split
@@ -277,6 +287,13 @@ def _flat(operands, program, levels, fixed, first, linear) -> list[Any] | None:
         new = called(code, leaves)
     outs = jtu.tree_unflatten(jtu.tree_structure(out), new)
     return [_in_batches(join, [(0,)] * len(levels))(x) for x in outs]
+
+
+def whole(eqn: JaxprEqn) -> ClosedJaxpr:
+    """The program of an operation as it was traced, of all members of a batch."""
+    program, levels = eqn.params["program"], eqn.params["levels"]
+    fun = _in_batches(jaxpr_as_fun(program), levels)
+    return program_of(fun, *structs(eqn.invars)) if levels else program
 
 
 def _as_traced(operands, program, levels) -> list[Any]:

@@ -292,3 +292,17 @@ def test_transforms_of_a_step_of_affine_fields(solver, transforms):
 
     matrix = jnp.asarray(np.linalg.qr(np.random.default_rng(0).standard_normal((8, 8)))[0])
     assert flops(Product(matrix)) - flops(Reversed()) == transforms * 2 * 8**2
+
+
+def test_a_batch_of_steps_counts_each():
+    """A step is one operation, whose program is of one member."""
+    solver, term = cfjax.CF4(), cfjax.LieTerm(lambda t, y, args: cfjax.Rotation(-y / args))
+    y0, inertia = jnp.array([0.9, 0.4, 0.1]), jnp.arange(1.0, 4.0)
+    state = eqx.filter_jit(solver.init)(term, 0.0, 0.1, y0, inertia)
+
+    def step(t0, y0, inertia):
+        return solver.step(term, t0, t0 + 0.1, y0, inertia, state, False)[0]
+
+    one = count_flops(step, 0.0, y0, inertia)
+    batch = jax.vmap(step, (0, 0, None))
+    assert count_flops(batch, jnp.zeros(7), jnp.tile(y0, (7, 1)), inertia) == 7 * one
