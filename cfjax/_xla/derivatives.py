@@ -23,7 +23,7 @@ from .jaxprs import (
     replaced,
     structs,
 )
-from .limits import FUNCTION, MAX_ENTRIES, WHOLE
+from .limits import FORWARD, FUNCTION, MAX_ENTRIES, WHOLE
 from .materialise import materialised
 from .scope import Place
 
@@ -88,7 +88,7 @@ def is_as_it_was(program: ClosedJaxpr, kind: Kind, plain: Plain | None) -> bool:
     if plain is None or kind.place != "loop" or not is_forward:
         return False
     length = sum(map(num_operations, program.jaxpr.eqns))
-    return kind.is_mapped or length > WHOLE[kind.place][min(kind.order, 2)]
+    return kind.is_mapped or length > min(FORWARD, WHOLE[kind.place][min(kind.order, 2)])
 
 
 # Of the programs of a solve, which are differentiated one soon after the other.

@@ -47,6 +47,9 @@ WHOLE = {
     "step": (math.inf, 7 * FUNCTION // 4, 3 * FUNCTION // 2),
 }
 WHOLE_IN_BATCHES = (math.inf, 9 * FUNCTION // 4, 3 * FUNCTION // 2)
+# Of one direction in our own loop, which is that of the step as it was if it is longer. It takes
+# three times as long to compile, and saves a tenth of a second in 10 000 steps. (compile)
+FORWARD = 9 * FUNCTION // 4
 
 # Of the numbers of a point. If a loop over stages is differentiated, it keeps the points of all
 # stages for each of its turns, which is too much memory for larger ones; and unrolled, XLA keeps
