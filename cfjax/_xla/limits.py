@@ -47,8 +47,8 @@ WHOLE = {
     "step": (math.inf, 7 * FUNCTION // 4, 3 * FUNCTION // 2),
 }
 WHOLE_IN_BATCHES = (math.inf, 9 * FUNCTION // 4, 3 * FUNCTION // 2)
-# Of one direction in our own loop, which is that of the step as it was if it is longer. It takes
-# three times as long to compile, and saves a tenth of a second in 10 000 steps. (compile)
+# Of a derivative in forward mode in our own loop, outside of batches. A longer one is that of the
+# step as it was: with `CF54` on a rigid body that has 3096 instructions, and this 11 563. (compile)
 FORWARD = 9 * FUNCTION // 4
 
 # Of the numbers of a point. If a loop over stages is differentiated, it keeps the points of all

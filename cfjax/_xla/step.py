@@ -56,9 +56,9 @@ def step(reading: Reading, y: PyTree, is_pair: bool) -> PyTree:
     With `is_pair` it returns a pair, of which mostly the first part alone is used. Reverse mode
     keeps `y` and what the function closes over, and computes the step again.
     """
-    pairs = list(zip(reading.code.constvars, reading.consts, strict=True))
-    known = [(v, x) for v, x in pairs if known_constant(x) is not None]
-    given = [(v, x) for v, x in pairs if known_constant(x) is None]
+    known, given = [], []
+    for pair in zip(reading.code.constvars, reading.consts, strict=True):
+        (given if known_constant(pair[1]) is None else known).append(pair)
     code = altered(
         reading.code,
         constvars=[v for v, _ in known],
