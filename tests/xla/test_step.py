@@ -180,6 +180,16 @@ def test_what_is_linear_is_transposed():
     check(found, xs[:, ::-1] @ jax.jacfwd(linear)(X, SCALE))
 
 
+def test_a_derivative_in_two_operands_is_transposed_in_one():
+    """The other direction is known, and adds what the transpose leaves out."""
+
+    def along(fun, direction):
+        return jax.jvp(lambda x, s: fun(x, s)["x"], (X, SCALE), (X, direction))[1]
+
+    (found,) = jax.linear_transpose(lambda s: along(rewritten, s), SCALE)(X[::-1])
+    check(found, jax.jacfwd(lambda s: as_it_is(X, s)["x"])(SCALE) @ X[::-1])
+
+
 def test_reverse_mode_keeps_the_operands_alone():
     _, back = jax.vjp(lambda x: rewritten(x, SCALE)["x"], X)
     # And 1 / 3 for each k as constants of the program.
