@@ -26,7 +26,7 @@ from ._numerics.checks import Fault, error_if, needing
 from ._numerics.squaring import max_over_batch
 from ._solvers.base import is_finite, result_of
 from ._step_back import repeat_and_undo
-from ._xla import invariants_first, limits, repeat, within_equal_steps
+from ._xla import invariants_first, limits, repeat
 
 _NOT_FINITE = "y0 must be finite, got an entry that is not."
 _BLOW_UP = (
@@ -234,9 +234,8 @@ def equal_steps(
         if step_back:
             back = lambda carry: step(carry, -1)  # noqa: E731
             # What a function closes over becomes an argument, which has a derivative.
-            with within_equal_steps():
-                there = eqx.filter_closure_convert(forward, carry)
-                back = eqx.filter_closure_convert(back, carry)
+            there = eqx.filter_closure_convert(forward, carry)
+            back = eqx.filter_closure_convert(back, carry)
             several = lambda step, carry, number: repeat(step, carry, number, order=0)[0]  # noqa: E731
             return repeat_and_undo(several, there, back, carry, number, throw_in_reverse)
         # XLA would scalarise a loop of one turn, and compute the step anew for each of its uses.

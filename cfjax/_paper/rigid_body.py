@@ -5,7 +5,7 @@ Section 3.1.
 """
 
 from collections.abc import Mapping, Sequence
-from typing import NamedTuple
+from typing import Any, NamedTuple, cast
 
 import diffrax
 import jax
@@ -108,7 +108,7 @@ def trajectory(method: diffrax.AbstractSolver) -> Trajectory:
 
 def flops_of_step(method: diffrax.AbstractSolver) -> int:
     """Floating-point operations of one step, evaluations of the field included."""
-    method = without_estimate(method)
+    method = cast(Any, without_estimate(method)).unrolled()
 
     def step(t0, t1, y, inertia):
         state = method.init(_TERM, t0, t1, y, inertia)

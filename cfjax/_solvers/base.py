@@ -2,6 +2,7 @@
 
 import abc
 import copy
+import functools
 from collections.abc import Callable, Sequence
 from typing import Any, ClassVar
 
@@ -21,7 +22,14 @@ from .._numerics.checks import Fault
 from .._term import product, velocity
 from .chart import Chart
 from .compensation import added, at, no_compensation, zeros
-from .compiled import control_of, is_rewritten, materialised_in_rows, scalarised, shared_end
+from .compiled import (
+    computed_again,
+    control_of,
+    is_rewritten,
+    materialised_in_rows,
+    scalarised,
+    shared_end,
+)
 from .dense import AbstractPath, Interpolation
 
 
@@ -183,10 +191,10 @@ class AbstractChartSolver(AbstractLieSolver):
                 end, error = shared_end(compensation, end, error, is_followed=first is not None)
             if first is None:
                 last = None
-            elif is_rewritten() and self.is_of_state:
-                # From the end alone. That is one evaluation more, but XLA would otherwise compute
-                # the step for each entry of the field.
-                last = evaluate(1.0, at(y0, end, compensation))
+            elif self.is_of_state:
+                # From the end alone, which is one evaluation more.
+                there = functools.partial(evaluate, 1.0, at(y0, end, compensation))
+                last = computed_again(values[-1], there)
             else:
                 last = values[-1]
             return (end, last, error), step.path

@@ -8,21 +8,26 @@ from collections.abc import Callable, Sequence
 from typing import Any
 
 import diffrax
+import jax
 import jax.numpy as jnp
 import jax.tree_util as jtu
+import numpy as np
 from jax import lax
 from jaxtyping import PyTree
 
 from .._control_term import is_driven
 from .._xla import are_long as are_long
+from .._xla import chosen as chosen
+from .._xla import computed_again as computed_again
 from .._xla import invariant as invariant
 from .._xla import is_rewritten as is_rewritten
+from .._xla import is_unrolled as is_unrolled
 from .._xla import limits as limits
 from .._xla import materialised_if_long as materialised_if_long
 from .._xla import materialised_in_rows as materialised_in_rows
 from .._xla import materialised_together as materialised_together
+from .._xla import over_stages as over_stages
 from .._xla import scalarised as scalarised
-from .._xla import table as table
 from .compensation import with_sums
 
 
@@ -41,10 +46,10 @@ def by_turns(
 ) -> tuple[PyTree, list[PyTree]]:
     """What `jax.lax.scan` makes of some turns, with the outputs of each; most in one loop.
 
-    A step that is rewritten for XLA must not have a loop within. So two turns are unrolled there;
-    more would be too long, and then each turn is rewritten instead.
+    A loop of steps that is rewritten as a whole must have no loop within. So two turns are unrolled
+    there; more would be too long, and then each turn is rewritten instead.
     """
-    if len(turns) == 1 or (len(turns) == 2 and is_rewritten()):
+    if len(turns) == 1 or (len(turns) == 2 and is_unrolled()):
         outputs = []
         for turn in turns:
             carry, output = body(carry, turn)
@@ -54,8 +59,10 @@ def by_turns(
     def once(carry: PyTree, turn: Any) -> Any:
         return scalarised(lambda carry: body(carry, turn), carry)
 
-    many = jtu.tree_map(lambda *xs: jnp.asarray(xs), *turns)
-    carry, stacked = lax.scan(once, carry, many)
+    # What is known stays known, so that the loop can be unrolled.
+    is_known = lambda xs: not any(isinstance(x, jax.Array) for x in xs)  # noqa: E731
+    many = jtu.tree_map(lambda *xs: (np if is_known(xs) else jnp).asarray(xs), *turns)
+    carry, stacked = over_stages(once, carry, many)
     return carry, [jtu.tree_map(lambda x: x[k], stacked) for k in range(len(turns))]  # noqa: B023
 
 

@@ -145,7 +145,7 @@ class Path(AbstractPath):
             # There may be no field at the end of the step, where it has no weight.
             rows = powers.swapaxes(0, 1)[..., : len(fields)].astype(theta.dtype)
             weights = functools.partial(_polynomials, theta=theta)
-            return rolled_flows(jnp.asarray(rows), fields, point, carried, weights)
+            return rolled_flows(rows, fields, point, carried, weights)
 
         weights = _polynomials(powers, theta)
 

@@ -4,7 +4,7 @@ from typing import Any, ClassVar, Literal
 
 import diffrax
 import equinox as eqx
-import jax.numpy as jnp
+import numpy as np
 from jaxtyping import PyTree
 
 from .._control_term import is_driven
@@ -104,7 +104,7 @@ class AbstractMagnus(AbstractChartSolver):
     def _flows(self, rows: Product, chart: Chart, point: PyTree) -> PyTree:
         weights = [list(map(float, row)) for row in rows]
         if len(weights) > 1 and can_roll(self.unroll, chart.fields[0], point):
-            return rolled_flows(jnp.asarray(weights), chart.fields, point, chart.flow)
+            return rolled_flows(np.array(weights), chart.fields, point, chart.flow)
         for row in weights:
             used = [(a, f) for a, f in zip(row, chart.fields, strict=True) if a != 0]
             point = chart.flow(combine(*zip(*used, strict=True)), point)

@@ -8,6 +8,7 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 import jax.tree_util as jtu
+import numpy as np
 from jax import lax
 from jaxtyping import Array, PyTree, Real
 
@@ -18,22 +19,22 @@ from .._methods.tableau import Product, Row
 from .._numerics.matmul import matmul
 from .._numerics.vectors import pack
 from .chart import Chart
-from .compiled import are_long, is_rewritten, limits, scalarised, table
+from .compiled import are_long, chosen, is_unrolled, limits, over_stages, scalarised
 
 
 def can_roll(unroll: bool | None, field: PyTree, point: PyTree, is_long: bool = False) -> bool:
     """Whether flows of combinations of such fields may be one loop, and where `unroll` is None
     whether that pays.
 
-    Fields must combine in the usual way and have no chart of their own. A step that is rewritten
-    for XLA is faster unrolled, if it is not too long for that, and so are fields of far more
-    numbers than the point has.
+    Fields must combine in the usual way and have no chart of their own. Fields of far more numbers
+    than the point has are faster unrolled. So is a step within a loop that is rewritten for XLA as
+    a whole, and on leading axes, if it is not too long for that.
     """
     parts = jtu.tree_leaves(field, is_leaf=is_field)
     is_possible = any(map(is_field, parts)) and _is_plain(field)
     if unroll is not None:
         return is_possible and not unroll
-    pays = is_long or not is_rewritten()
+    pays = is_long or not is_unrolled()
     return is_possible and pays and _size(field) <= max(limits.MAX_SIZE, 4 * _size(point))
 
 
@@ -47,7 +48,7 @@ def _can_roll_in_room(
     first = known[-1]
     if unroll or not is_field(first) or type(first).room is AbstractFrozenField.room:
         return False
-    pays = unroll is False or (not is_rewritten() and _size(chart.start) <= limits.LARGE)
+    pays = unroll is False or (not is_unrolled() and _size(chart.start) <= limits.LARGE)
     if not pays or any(x.span is not first.span for x in known):
         return False
     room = first.room(chart.start, num_stages)
@@ -94,7 +95,7 @@ def _is_plain_part(field: AbstractFrozenField) -> bool:
 
 
 def rolled_flows(
-    rows: Real[Array, "flows ..."],
+    rows: Real[np.ndarray, "flows *powers stages"],
     fields: Sequence[PyTree],
     point: PyTree,
     flow: Callable[[PyTree, PyTree], PyTree],
@@ -102,26 +103,39 @@ def rolled_flows(
 ) -> PyTree:
     """Where flows of combinations of the fields lead, that of the first row first.
 
-    A combination has the `weights` of its row, which are of the first fields.
+    A combination has the `weights` of its row, which are of the first fields, and zero where all
+    of the row is.
     """
     fields = fields[: rows.shape[-1]]
-    # XLA computes what leads to each of the arrays that `jnp.stack` gets for itself.
-    stacked = _Stacked(jtu.tree_map(lambda *leaves: pack(leaves), *fields))
 
-    def body(point: PyTree, row: Array) -> Any:
-        def moved(point: PyTree) -> PyTree:
-            if is_rewritten():
-                # As numbers: in a batch XLA would take each of them out of its place in one array.
-                combination = combine(list(weights(row)), fields)
-            else:
-                combination = stacked.combination(weights(row))
-            return flow(combination, point)
+    def moved(point: PyTree) -> PyTree:
+        # XLA computes what leads to each of the arrays that `jnp.stack` gets for itself.
+        stacked = _Stacked(jtu.tree_map(lambda *leaves: pack(leaves), *fields))
 
-        return scalarised(moved, point, is_alone=True), None
+        def body(point: PyTree, turn: Any) -> Any:
+            row, is_used = turn
+            return flow(stacked.combination(_Row(weights(row), is_used)), point), None
+
+        return over_stages(body, point, (rows, rows.any(axis=tuple(range(1, rows.ndim - 1)))))[0]
 
     # A weak type would be lost on the way.
-    start = jtu.tree_map(lambda x: jnp.asarray(x, jnp.result_type(x)), point)
-    return lax.scan(body, start, rows)[0]
+    return scalarised(moved, jtu.tree_map(lambda x: jnp.asarray(x, jnp.result_type(x)), point))
+
+
+class _Row(NamedTuple):
+    """The weights of a combination, and which of them are not zero.
+
+    Where the loop over stages is unrolled, the others are left out.
+    """
+
+    weights: Any
+    are_used: Any
+
+    @classmethod
+    def of(cls, rows: Sequence[Sequence[Any]], n: int) -> "_Row":
+        """Rows of n weights, of which the last may be missing."""
+        padded = np.array([[*map(float, row), *[0.0] * (n - len(row))] for row in rows])
+        return cls(padded, padded != 0)
 
 
 class _Flow(NamedTuple):
@@ -149,8 +163,9 @@ def _flows(products: Sequence[Product], stages: Sequence[Product], times: Row) -
         stage = evaluated.get(product, len(times))
         c = float(times[stage]) if product in evaluated else 0.0
         flows.append(_Flow(place[product[:-1]], product[-1], target, stage, c))
-    turns = _Flow(*zip(*flows, strict=True))
-    return _Flow(*map(jnp.asarray, turns._replace(row=_padded(turns.row, len(times)))))
+    source, weights, target, stage, c = zip(*flows, strict=True)
+    rows = _Row.of(weights, len(times))
+    return _Flow(np.asarray(source), rows, *map(np.asarray, (target, stage, c)))
 
 
 def rolled(
@@ -178,7 +193,7 @@ def rolled(
         points, fields = carry
         field = fields.field(fields.combination(x.row))
         point = chart.flow(field, fields.point(_at(points, x.source)))
-        new = lax.cond(
+        new = chosen(
             x.stage < num_stages,
             lambda: fields.entered(chart.frozen_after([field], x.c, point)),
             lambda: fields.kept(x.stage),
@@ -189,7 +204,7 @@ def rolled(
 
     start = fields.coordinates(chart.start)
     carry = _stack(start, len(products)), fields
-    (points, fields), _ = lax.scan(body, carry, _flows(products, stages, times))
+    (points, fields), _ = over_stages(body, carry, _flows(products, stages, times))
     chart.start = fields.point(start)
     chart.fields[:] = [fields.at(k) for k in range(num_stages)]
     return {rows: fields.point(_at(points, k)) for k, rows in enumerate(products) if k}
@@ -221,19 +236,8 @@ def rolled_elements(
     # Before all of them are traced, only to find that they are too long together. Few are mostly
     # short enough; to look costs a trace of one more.
     one = functools.partial(stage, times[0])
-    is_long = len(rows) > limits.MANY and is_rewritten() and are_long(one, first, len(rows))
+    is_long = len(rows) > limits.MANY and is_unrolled() and are_long(one, first, len(rows))
     if can_roll(unroll, first, first, is_long) and is_uniform(chart):
-        of_first = number(first)
-        none = None if of_first is None else jnp.zeros_like(of_first)
-
-        def noted(c: Any, pair: tuple[PyTree, Any]) -> tuple[PyTree, Any]:
-            return _like(first, stage(c, pair[0])), number(pair[0])
-
-        pairs = [(k, none) for k in known]
-        made = table(noted, pairs, _padded(rows, n), jnp.asarray(times))
-        if made is not None:
-            elements, numbers = map(list, zip(*made, strict=True))
-            return elements, None if none is None else sum(numbers, none)
         fields = _Stacked.of(known, n)
         made, total = _rolled_elements(chart, fields, len(known), rows, times, element, number)
         return [*known, *made[len(known) :]], total
@@ -270,10 +274,10 @@ def _rolled_elements(
         total = None if total is None else total + number(u)
         return (fields.put(k, element(u, new)), total), None
 
-    turns = jnp.arange(num_known, n), _padded(rows, n), jnp.asarray(times)
+    turns = np.arange(num_known, n), _Row.of(rows, n), np.asarray(times, float)
     # Of zero, which varies along the axes of a mesh as the known ones do.
     zero = combine((0.0,), (fields.at(0),))
-    (fields, total), _ = lax.scan(body, (fields, number(zero)), turns)
+    (fields, total), _ = over_stages(body, (fields, number(zero)), turns)
     return [fields.at(k) for k in range(n)], total
 
 
@@ -292,7 +296,7 @@ class _Stacked(eqx.Module):
             fields = fields.put(k, field)
         return fields
 
-    def combination(self, row: Real[Array, " k"]) -> PyTree:
+    def combination(self, row: "_Row") -> PyTree:
         """That of the first fields, as many as the row has entries."""
         return jtu.tree_map(lambda f: _combination(row, f), self.stacked)
 
@@ -344,7 +348,7 @@ class _InRoom(eqx.Module):
         ks = [room.coordinates(field, point)[0] for field in known]
         return cls(room, jnp.zeros((n, *ks[0].shape), ks[0].dtype).at[: len(ks)].set(jnp.stack(ks)))
 
-    def combination(self, row: Real[Array, " k"]) -> Array:
+    def combination(self, row: "_Row") -> Array:
         return _combination(row, self.ks)
 
     def field(self, combination: Array) -> Any:
@@ -373,10 +377,6 @@ class _InRoom(eqx.Module):
         return _InRoom(room, self.ks), room.field(new)
 
 
-def _padded(rows: Sequence[Sequence[Any]], n: int) -> Array:
-    return jnp.asarray([[*map(float, row), *[0.0] * (n - len(row))] for row in rows])
-
-
 def _is_like(a: PyTree, b: PyTree) -> bool:
     return jtu.tree_structure(a) == jtu.tree_structure(b) and _types(a) == _types(b)
 
@@ -400,15 +400,19 @@ def _stack(tree: PyTree, n: int) -> PyTree:
     return jtu.tree_map(lambda x: lax.pad(x[None], jnp.zeros((), x.dtype), pad(x)), tree)
 
 
-def _combination(row: Array, fields: Array) -> Array:
-    fields = fields[: len(row)]
+def _combination(row: _Row, fields: Array) -> Array:
+    weights, are_used = row
+    fields = fields[: len(weights)]
     if jnp.size(fields[0]) > limits.LARGE:
         if jnp.iscomplexobj(fields):
             return lax.complex(_combination(row, fields.real), _combination(row, fields.imag))
-        product = matmul(row.astype(fields.dtype), fields.reshape(len(row), -1))
+        product = matmul(weights.astype(fields.dtype), fields.reshape(len(weights), -1))
         return product.reshape(fields.shape[1:])
-    weights = row.astype(fields.dtype).reshape(-1, *[1] * (fields.ndim - 1))
-    return jnp.sum(weights * fields, axis=0)
+    each = len(weights), *[1] * (fields.ndim - 1)
+    terms = weights.astype(fields.dtype).reshape(each) * fields
+    # Where the loop is unrolled, those that are zero are not there.
+    terms = jnp.where(are_used.reshape(each), terms, jnp.zeros((), terms.dtype))
+    return jnp.sum(terms, axis=0)
 
 
 def _at(tree: PyTree, k: Any) -> PyTree:

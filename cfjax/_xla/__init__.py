@@ -1,8 +1,9 @@
 """All that reads and rewrites programs, so that XLA makes fast code of them.
 
-- `scalarised`, `repeat`: a step, and many equal ones, on single numbers. `within_equal_steps`: for
-  a step that is traced before the loop.
-- `table`: the stages of a long step, each scalarised; `are_long`: whether they make one.
+- `scalarised`, `repeat`: a step, and many equal ones, on single numbers.
+- `over_stages`, `chosen`: a loop over the stages of a method, and a choice within it, which are
+  part of what is scalarised; `computed_again`: a value that is computed twice there. `are_long`,
+  `is_unrolled`: whether stages are no loop, as within `repeat`.
 - `materialised_if_long`, `materialised_together`, `materialised_in_rows`: values that several
   results need, computed once.
 - `invariant`: a mark of values that may be the same in every turn of a loop; `invariants_first`: a
@@ -25,12 +26,14 @@ from .materialise import materialised as materialised
 from .materialise import materialised_if_long as materialised_if_long
 from .materialise import materialised_in_rows as materialised_in_rows
 from .materialise import materialised_together as materialised_together
+from .over_stages import chosen as chosen
+from .over_stages import computed_again as computed_again
+from .over_stages import over_stages as over_stages
 from .pack import pack as pack
 from .pack import unpack as unpack
 from .program import are_long as are_long
 from .scalarise import scalarised as scalarised
 from .scope import is_rewritten as is_rewritten
+from .scope import is_unrolled as is_unrolled
 from .scope import rewriting as rewriting
-from .scope import within_equal_steps as within_equal_steps
 from .smooth import smooth as smooth
-from .table import table as table

@@ -21,12 +21,16 @@ from .struct_of_arrays import (
     common,
     conformed,
     is_inexact,
+    known,
     spread,
     struct_of_arrays,
 )
 
 
 def elementwise(call: Call) -> StructOfArrays | None:
+    which = known(call.values[0])
+    if call.eqn.primitive.name == "select_n" and which is not None and not call.is_large:
+        return _chosen(call, which)
     if not call.shape:
         return None  # Of numbers.
     values = [x if np.shape(x) == () else struct_of_arrays(x) for x in call.values]
@@ -52,6 +56,13 @@ def elementwise(call: Call) -> StructOfArrays | None:
         return made[key][0]
 
     return StructOfArrays(map(entry, *columns), call.shape, is_short)
+
+
+def _chosen(call: Call, which: np.ndarray) -> StructOfArrays:
+    """What is chosen, if it is known now, as of the weights of a stage that are zero."""
+    cases = [struct_of_arrays(x).entries for x in call.values[1:]]
+    places = np.broadcast_to(which, call.shape).astype(int)
+    return StructOfArrays([cases[n][k] for k, n in enumerate(places.flat)], call.shape)
 
 
 def reduced(call: Call) -> StructOfArrays | None:

@@ -37,6 +37,15 @@ FUNCTION = 2000
 # Of the operations of a step on single numbers. The time to compile grows with them, and more so in
 # derivatives. (compile, chain)
 MAX_OPERATIONS = 2 * FUNCTION
+# Of the operations of a step that is compiled as one program of single numbers, with loops over
+# stages unrolled, and functions with a derivative of their own opened. Longer values of one system
+# gain nothing (compile), longer derivatives and values of a batch take too long to compile
+# (gradients, batch).
+FLAT_VALUES = FUNCTION
+FLAT_DERIVATIVES = 2 * FUNCTION
+FLAT_BATCHES = 9 * FUNCTION // 2
+# Of these what is longer is cut where a method says.
+FLAT_WHOLE = 2 * FUNCTION
 # What two functions need, XLA computes in both. In long programs it then computes single operations
 # exponentially often: in values never as measured, in first derivatives from some 8000 operations
 # on, counted as they are written, within diffrax's loop from 4000, in batches from 5000, and in

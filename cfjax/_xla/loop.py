@@ -1,6 +1,5 @@
 """Many equal steps in one loop, which XLA turns into one function; so it does its derivative."""
 
-import contextlib
 from collections.abc import Callable, Sequence
 from typing import Any, NamedTuple
 
@@ -15,7 +14,6 @@ from .limits import MAX_ENTRIES
 from .operation import operation
 from .pack import pack, unpack
 from .program import join, split, split_like, trace
-from .scope import within_equal_steps
 
 
 def repeat(
@@ -41,8 +39,7 @@ def repeat(
     """
     program = trace(step, carry, "loop")
     if program is None:
-        with within_equal_steps() if order else contextlib.nullcontext():
-            return _loop(jax.checkpoint(step), carry, num_steps, keep)
+        return _loop(jax.checkpoint(step), carry, num_steps, keep)
     leaves, structure = jtu.tree_flatten(carry)
     leaves = list(map(jnp.asarray, leaves))
 

@@ -9,10 +9,11 @@ import jax.numpy as jnp
 import jax.tree_util as jtu
 import numpy as np
 from jax.experimental.xla_metadata import set_xla_metadata
-from jax.extend.core import Primitive
+from jax.extend.core import ClosedJaxpr, Jaxpr, Literal, Primitive
 from jax.interpreters import ad, batching, mlir
 from jaxtyping import Array, PyTree
 
+from .jaxprs import altered, replaced, without_dead_code
 from .limits import MAX_RESULTS, MAX_RESULTS_IN_BATCHES, MAX_SIZE
 from .pack import pack, sharding, unpack
 from .scope import has_rows, is_on, is_short, where
@@ -85,12 +86,43 @@ def _once(tree: PyTree, **options: bool) -> PyTree:
     if not where():
         return tree
     leaves, structure = jtu.tree_flatten(tree)
-    pieces = [unpack(x) if is_short(x) else [] for x in leaves]
-    new = iter(materialised([entry for entries in pieces for entry in entries], **options))
-    return structure.unflatten(
-        pack([next(new) for _ in entries]) if entries else x
-        for x, entries in zip(leaves, pieces, strict=True)
-    )
+    places = [k for k, x in enumerate(leaves) if is_short(x)]
+    new = materialised([leaves[k] for k in places], **options) if places else []
+    return structure.unflatten(replaced(leaves, places, new))
+
+
+def not_materialised(program: ClosedJaxpr) -> ClosedJaxpr:
+    """The program in which everything that is materialised is as it was."""
+    return ClosedJaxpr(_not_materialised(program.jaxpr), program.consts)
+
+
+def _not_materialised(jaxpr: Jaxpr) -> Jaxpr:
+    same: dict[Any, Any] = {}
+
+    def read(v: Any) -> Any:
+        return v if isinstance(v, Literal) else same.get(v, v)
+
+    eqns = []
+    for eqn in jaxpr.eqns:
+        invars = list(map(read, eqn.invars))
+        if eqn.primitive is materialised_p:
+            same.update(zip(eqn.outvars, invars, strict=True))
+            continue
+        params = {name: _within(value) for name, value in eqn.params.items()}
+        eqns.append(eqn.replace(invars=invars, params=params))
+    outvars = list(map(read, jaxpr.outvars))
+    return without_dead_code(altered(jaxpr, eqns=eqns, outvars=outvars))
+
+
+def _within(value: Any) -> Any:
+    """A parameter, whose programs are without what is materialised."""
+    if isinstance(value, ClosedJaxpr):
+        return not_materialised(value)
+    if isinstance(value, Jaxpr):
+        return _not_materialised(value)
+    if isinstance(value, tuple) and any(isinstance(x, ClosedJaxpr) for x in value):
+        return tuple(map(_within, value))
+    return value
 
 
 materialised_p = Primitive("cfjax_materialised")
@@ -156,9 +188,14 @@ def _materialised_jvp(entries, tangents, *, now, **params):
 
 
 def _materialised_transpose(cotangents, *entries, **params):
-    if all(type(cotangent) is ad.Zero for cotangent in cotangents):
-        return [None] * len(entries)
-    return materialised_p.bind(*map(ad.instantiate_zeros, cotangents), **params)
+    coming = [k for k, cotangent in enumerate(cotangents) if type(cotangent) is not ad.Zero]
+    outs: list[Any] = [None] * len(entries)
+    if coming:
+        # Of zeros all that comes before would be computed, too.
+        outs = replaced(
+            outs, coming, materialised_p.bind(*(cotangents[k] for k in coming), **params)
+        )
+    return outs
 
 
 def _materialised_batch(entries, dims, **params):

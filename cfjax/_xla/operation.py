@@ -20,7 +20,7 @@ import jax.numpy as jnp
 import jax.tree_util as jtu
 import numpy as np
 from jax.core import Tracer
-from jax.extend.core import ClosedJaxpr, Jaxpr, Literal, jaxpr_as_fun
+from jax.extend.core import ClosedJaxpr, Jaxpr, jaxpr_as_fun
 from jax.interpreters import mlir
 from jaxtyping import PyTree
 
@@ -43,7 +43,7 @@ from .jaxprs import (
     without_dead_code,
 )
 from .limits import FUNCTION, MAX_RESULTS_IN_BATCHES, WHOLE, WHOLE_IN_BATCHES
-from .materialise import materialised, materialised_p
+from .materialise import materialised, not_materialised
 from .scope import Place
 
 _GROUP = FUNCTION // 2
@@ -171,30 +171,12 @@ def in_two(program: ClosedJaxpr, first: int, operands: Sequence[Any]) -> list[An
     given = range(len(program.jaxpr.outvars))
     main, main_takes = narrowed(program, given[:first])
     rest, rest_takes = narrowed(flattened(program, CALLS, is_once=True), given[first:])
-    rest = _not_materialised(rest)
+    rest = not_materialised(rest)
     # So that the copy is not seen to be one.
     inputs = together([operands[k] for k in rest_takes])
     run = lambda part, values, is_last: together(jaxpr_as_fun(part)(*values))  # noqa: E731
     outs = by_parts(rest, _ends_of_few(rest.jaxpr), run, *inputs)
     return [*_once(main, [operands[k] for k in main_takes]), *outs]
-
-
-def _not_materialised(program: ClosedJaxpr) -> ClosedJaxpr:
-    """The program in which everything that is materialised is as it was."""
-    same: dict[Any, Any] = {}
-
-    def read(v: Any) -> Any:
-        return v if isinstance(v, Literal) else same.get(v, v)
-
-    eqns = []
-    for eqn in program.jaxpr.eqns:
-        invars = list(map(read, eqn.invars))
-        if eqn.primitive is materialised_p:
-            same.update(zip(eqn.outvars, invars, strict=True))
-        else:
-            eqns.append(eqn.replace(invars=invars))
-    outvars = list(map(read, program.jaxpr.outvars))
-    return ClosedJaxpr(altered(program.jaxpr, eqns=eqns, outvars=outvars), program.consts)
 
 
 def _ends_of_few(jaxpr: Jaxpr) -> list[int]:

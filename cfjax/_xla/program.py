@@ -6,7 +6,6 @@ every small array as its entries. In a state with leading axes, many short vecto
 are arrays of these axes.
 """
 
-import contextlib
 import math
 from collections.abc import Callable, Sequence
 from typing import Any, NamedTuple
@@ -27,8 +26,17 @@ from jax.extend.core import (
 from jaxtyping import Array, PyTree
 
 from .jaxprs import called, evaluate, without_constants, without_dead_code
-from .limits import FUNCTION, MAX_ENTRIES, MAX_LENGTH, MAX_OPERATIONS, MAX_SIZE
+from .limits import (
+    FLAT_BATCHES,
+    FLAT_WHOLE,
+    FUNCTION,
+    MAX_ENTRIES,
+    MAX_LENGTH,
+    MAX_OPERATIONS,
+    MAX_SIZE,
+)
 from .materialise import materialised, materialised_p
+from .over_stages import Loop, on_numbers_p
 from .rules import on_entries
 from .scope import (
     Place,
@@ -46,15 +54,15 @@ from .struct_of_arrays import (
     apart_like,
     is_inexact,
     is_small,
+    is_whole,
+    known,
     literal,
     struct_of_arrays,
 )
 from .understood import MOVES, REDUCTIONS, is_in_place, is_readable
 
-# What is longer and stands alone, not in a loop of equal steps, is scalarised in batches only, and
-# its derivatives are left to JAX: a gradient through diffrax's loop would take two to three times
-# as long to compile.
-SHORT = FUNCTION // 2
+# What is longer is read once more, with its stages in a loop.
+_SHORT = FUNCTION // 2
 
 # Calls that are scalarised as a part of the program.
 _CALLS = {"jit": "jaxpr", "pjit": "jaxpr"}
@@ -167,12 +175,21 @@ def read(fun: Callable[[PyTree], PyTree], y: PyTree, place: Place) -> Reading | 
         jaxpr, shape = jax.make_jaxpr(fun, return_shape=True)(y)
     try:
         code = without_dead_code(jaxpr.jaxpr)
-        length = operations(code)
-        if jaxpr.effects or not is_readable(code) or length > MAX_OPERATIONS:
+        if jaxpr.effects or not is_readable(code):
+            return None
+        num_operations = operations(code)
+        if place == "loop" or rows:
+            is_short = num_operations <= MAX_OPERATIONS
+        else:
+            # All of it, or each turn of a loop over stages.
+            scans = (eqn for eqn in code.eqns if eqn.primitive.name == "scan")
+            loops = [eqn.params["jaxpr"].jaxpr for eqn in scans]
+            is_short = min(map(length, (code, *loops))) <= FLAT_BATCHES
+        if not is_short:
             return None
     except Exception as error:
         return unread(error)
-    return Reading(code, jaxpr.consts, shape, rows, length)
+    return Reading(code, jaxpr.consts, shape, rows, num_operations)
 
 
 def trace(fun: Callable[[PyTree], PyTree], y: PyTree, place: Place) -> Program | None:
@@ -186,17 +203,13 @@ def traced(
     y: PyTree,
     reading: Reading,
     place: Place,
-    is_derived: bool = True,
 ) -> Program | None:
-    """`fun`, which has been read, as a program that is scalarised; None if that cannot be done.
-
-    Unless `is_derived`, what it was before may have loops whose turns are scalarised.
-    """
+    """`fun`, which has been read, as a program that is scalarised; None if that cannot be done."""
     structure, rows = jtu.tree_structure(reading.shape), reading.rows
     before = ClosedJaxpr(reading.code, reading.consts)
-    if place == "loop" or reading.length > SHORT or not is_derived:
+    if place == "loop" or reading.length > _SHORT:
         # Where a step is not scalarised its stages may be one loop.
-        with rewriting(False) if is_derived else contextlib.nullcontext():
+        with rewriting(False):
             rolled, shape = jax.make_jaxpr(fun, return_shape=True)(y)
         before = rolled if jtu.tree_structure(shape) == structure else before
     parameters, consts, first = closed_over(reading.consts, before.consts)
@@ -222,9 +235,9 @@ def on_numbers(program: ClosedJaxpr, fixed: Sequence[bool], operands: Sequence[A
 
     So are its operands. `fixed` says which of them are the same in every step.
     """
-    jaxpr, consts = program.jaxpr, program.consts
+    jaxpr, consts = program.jaxpr, list(map(_constant, program.consts))
     flags = [*[True] * len(consts), *fixed]
-    is_long = operations(jaxpr) > FUNCTION
+    is_long = length(jaxpr) > FLAT_WHOLE
     form = _Form(False, is_long, has_reciprocals(jaxpr, flags), _LAST_CALLS)
     outs, _ = _evaluate(jaxpr, (*consts, *operands), flags, form)
     # What is known before the program runs may come out as NumPy's.
@@ -294,6 +307,25 @@ def operations(jaxpr: Jaxpr) -> int:
     return sum(map(_operations_of, jaxpr.eqns))
 
 
+def length(jaxpr: Jaxpr) -> float:
+    """About how many operations on single numbers there will be, where nothing is left whole.
+
+    Loops over stages are unrolled, and functions with a derivative of their own are opened.
+    """
+    return sum(map(_length_of, jaxpr.eqns))
+
+
+def _length_of(eqn: JaxprEqn) -> float:
+    name = eqn.primitive.name
+    if name in _LAST_CALLS:
+        return length(eqn.params[_LAST_CALLS[name]].jaxpr)
+    if name == "scan":
+        return eqn.params["length"] * length(eqn.params["jaxpr"].jaxpr)
+    if name == "cond":
+        return max(length(branch.jaxpr) for branch in eqn.params["branches"])
+    return math.inf if name == "while" else _operations_of(eqn)
+
+
 def _operations_of(eqn: JaxprEqn) -> int:
     name = eqn.primitive.name
     if name in _CALLS:
@@ -350,7 +382,8 @@ def _evaluate(
 
     variables = (*jaxpr.constvars, *jaxpr.invars)
     for variable, value, is_one in zip(variables, values, fixed, strict=True):
-        env[variable] = struct_of_arrays(value) if is_small(value) else value
+        is_known = isinstance(value, np.ndarray) and value.ndim > 0
+        env[variable] = struct_of_arrays(value) if is_known or is_small(value) else value
         if not is_one:
             loose.add(variable)
     # Each reciprocal once.
@@ -359,12 +392,22 @@ def _evaluate(
         values = [read(v) for v in eqn.invars]
         fixed = [is_fixed(v) for v in eqn.invars]
         outs_fixed = [all(fixed)] * len(eqn.outvars)
-        if eqn.primitive.name in form.calls:
-            inner = eqn.params[form.calls[eqn.primitive.name]]
-            constants = [True] * len(inner.consts)
-            outs, outs_fixed = _evaluate(
-                inner.jaxpr, (*inner.consts, *values), (*constants, *fixed), form
-            )
+        name = eqn.primitive.name
+        if name in form.calls:
+            inner = eqn.params[form.calls[name]]
+            outs, outs_fixed = _evaluate_inner(inner, values, fixed, form)
+        elif eqn.primitive is on_numbers_p:
+            outs = [np.asarray(True)]
+        elif name == "scan":
+            outs, outs_fixed = _unrolled(Loop.of(eqn), values, fixed, form)
+        elif name == "cond":
+            which = known(values[0])
+            if which is None:
+                raise Declined
+            # As XLA does with a number that is none of a branch.
+            branches = eqn.params["branches"]
+            branch = branches[min(max(int(which), 0), len(branches) - 1)]
+            outs, outs_fixed = _evaluate_inner(branch, values[1:], fixed[1:], form)
         elif form.has_reciprocals and by_fixed(eqn, fixed):
             x, divisor = values
             if id(divisor) not in divisors:
@@ -379,6 +422,68 @@ def _evaluate(
         env.update(zip(eqn.outvars, outs, strict=True))
         loose.update(v for v, is_one in zip(eqn.outvars, outs_fixed, strict=True) if not is_one)
     return [read(v) for v in jaxpr.outvars], [is_fixed(v) for v in jaxpr.outvars]
+
+
+def _evaluate_inner(
+    program: ClosedJaxpr, values: Sequence[Any], fixed: Sequence[bool], form: _Form
+) -> tuple[list[Any], list[bool]]:
+    consts = list(map(_constant, program.consts))
+    return _evaluate(program.jaxpr, (*consts, *values), (*[True] * len(consts), *fixed), form)
+
+
+def _unrolled(
+    loop: Loop, values: Sequence[Any], fixed: Sequence[bool], form: _Form
+) -> tuple[list[Any], list[bool]]:
+    """The results of a loop, one turn after the other."""
+    n, m = loop.num_constants, loop.num_constants + loop.num_carried
+    carry, carried_fixed = list(values[n:m]), list(fixed[n:m])
+    # What is fixed in the first turn need not be so in the next.
+    carried_fixed = [False] * len(carry)
+    rows: dict[int, list[Any]] = {}
+    num_rows = len(loop.body.jaxpr.outvars) - loop.num_carried
+    rows_fixed = [True] * num_rows
+    for k in loop.turns:
+        turn = [_entry(x, k) for x in values[m:]]
+        flags = [*fixed[:n], *carried_fixed, *fixed[m:]]
+        outs, outs_fixed = _evaluate_inner(loop.body, [*values[:n], *carry, *turn], flags, form)
+        carry, rows[k] = outs[: m - n], outs[m - n :]
+        rows_fixed = [a and b for a, b in zip(rows_fixed, outs_fixed[m - n :], strict=True)]
+    stacks = [_stacked([rows[k][j] for k in range(loop.length)]) for j in range(num_rows)]
+    return [*carry, *stacks], [*carried_fixed, *rows_fixed]
+
+
+def _entry(x: Any, k: int) -> Any:
+    """Entry k along the first axis."""
+    if not _is_apart(x):
+        return x[k]
+    places = x.places[k]
+    return x.at(places, x.shape[1:]) if x.shape[1:] else x.entries[int(places)]
+
+
+def _stacked(rows: Sequence[Any]) -> Any:
+    """Rows along a new first axis."""
+    if any(map(is_whole, rows)):
+        return jnp.stack(list(map(_whole, rows)))
+    parts = list(map(struct_of_arrays, rows))
+    return StructOfArrays([e for x in parts for e in x.entries], (len(parts), *parts[0].shape))
+
+
+def _constant(x: Any) -> Any:
+    """What a program closes over: known, if it is no array of JAX's."""
+    if isinstance(x, jax.Array):
+        found = known_constant(x)
+        return x if found is None else found
+    if not is_numeric(x) or np.size(x) > _MAX_KNOWN:
+        return x
+    x = np.asarray(x)
+    if not is_inexact(x):
+        return x
+    # As JAX's, which may overflow.
+    return StructOfArrays(list(map(jnp.asarray, x.flat)), x.shape) if x.ndim else jnp.asarray(x)
+
+
+# As of the weights of a method of 16 stages.
+_MAX_KNOWN = 4 * MAX_SIZE
 
 
 # As a version of JAX has them.

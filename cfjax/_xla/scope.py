@@ -24,8 +24,7 @@ def rewriting(on: bool | None) -> contextlib.AbstractContextManager:
     - None, the default: rewrites short steps, such as those of `CF4`, everywhere, and long ones,
       such as those of `CF54` and `RKMK8`, in batches and in `cfjax.integrate`. For one system in
       `diffrax.diffeqsolve` these would take longer to compile than 10 000 steps save.
-    - True: rewrites long steps everywhere, and their first derivatives too. This is for solves of
-      very many steps, and for gradients of batches that are computed many times.
+    - True: rewrites long steps everywhere, for solves of very many steps.
     - False: XLA gets every program as it was traced, for debugging and for programs that run a few
       times.
 
@@ -48,7 +47,7 @@ def is_on() -> bool:
 
 
 def is_everywhere() -> bool:
-    """Whether also what does not pay within 10 000 steps is scalarised."""
+    """Whether also what rarely pays is scalarised."""
     return _on.value is True
 
 
@@ -76,7 +75,6 @@ class _Around(NamedTuple):
 
     place: Place | None = None
     has_rows: bool = False
-    in_equal_steps: bool = False
 
 
 # JAX traces anew where it changes, so that a function that is jitted, or cached otherwise, is
@@ -92,16 +90,6 @@ def within(place: Place, rows: bool) -> contextlib.AbstractContextManager:
     return _around(_around.value._replace(place=place, has_rows=rows))
 
 
-def within_equal_steps() -> contextlib.AbstractContextManager:
-    """The time in which a step is traced that a loop makes, but not scalarised as a whole."""
-    return _around(_around.value._replace(in_equal_steps=True))
-
-
-def in_equal_steps() -> bool:
-    """Whether a loop of equal steps is around here."""
-    return _around.value.in_equal_steps
-
-
 def where() -> Place | None:
     """What is scalarised around here: one step, or a loop of many."""
     return _around.value.place
@@ -115,6 +103,11 @@ def has_rows() -> bool:
 def is_rewritten() -> bool:
     """Whether this is part of a program that is scalarised."""
     return where() is not None
+
+
+def is_unrolled() -> bool:
+    """Whether this is part of a program that must have no loop within."""
+    return where() == "loop" or has_rows()
 
 
 def is_short(x: Any) -> bool:

@@ -17,6 +17,7 @@ from jax import lax
 from jax.extend.core import Jaxpr, JaxprEqn, Literal
 from jaxtyping import Array, PyTree
 
+from .over_stages import Loop
 from .understood import is_understood
 
 _SCOPE = "cfjax_smooth"
@@ -100,18 +101,13 @@ def _follow(jaxpr: Jaxpr, is_fixed: dict[Any, bool], inexact: set[Any], is_smoot
     for eqn in jaxpr.eqns:
         fixed = [isinstance(v, Literal) or is_fixed[v] for v in eqn.invars]
         reached = [not isinstance(v, Literal) and v in inexact for v in eqn.invars]
-        name = eqn.primitive.name
         within = is_smooth or _SCOPE in str(getattr(eqn.source_info, "name_stack", ""))
         is_fixed.update((v, all(fixed)) for v in eqn.outvars)
-        if name in _CALLS:
-            inner: Any = eqn.params[_CALLS[name]].jaxpr
-            known = dict(zip(inner.invars, fixed, strict=True))
-            known.update((v, True) for v in inner.constvars)
-            some = {v for v, is_one in zip(inner.invars, reached, strict=True) if is_one}
-            _follow(inner, known, some, within)
-            for v, out in zip(eqn.outvars, inner.outvars, strict=True):
-                is_fixed[v] = isinstance(out, Literal) or known[out]
-                if not isinstance(out, Literal) and out in some:
+        inside = _inside(eqn, fixed, reached, within)
+        if inside is not None:
+            for v, (is_one, is_inexact) in zip(eqn.outvars, inside, strict=True):
+                is_fixed[v] = is_one
+                if is_inexact:
                     inexact.add(v)
         elif any(reached):
             if not within and not _is_smooth(eqn, reached):
@@ -119,6 +115,49 @@ def _follow(jaxpr: Jaxpr, is_fixed: dict[Any, bool], inexact: set[Any], is_smoot
             inexact.update(eqn.outvars)
         elif by_fixed(eqn, fixed):
             inexact.update(eqn.outvars)
+
+
+def _inside(
+    eqn: JaxprEqn, fixed: list[bool], reached: list[bool], is_smooth: bool
+) -> Sequence[tuple[bool, bool]] | None:
+    """Of each result of an operation with programs within, whether it is fixed, and whether its
+    last bits may differ. None for other operations.
+    """
+    name = eqn.primitive.name
+    if name in _CALLS:
+        return _results(eqn.params[_CALLS[name]].jaxpr, fixed, reached, is_smooth)
+    if name == "cond":
+        if reached[0]:
+            raise _NotSmooth
+        given = fixed[1:], reached[1:], is_smooth
+        some = [_results(branch.jaxpr, *given) for branch in eqn.params["branches"]]
+        return [
+            (all(is_one for is_one, _ in each), any(is_inexact for _, is_inexact in each))
+            for each in zip(*some, strict=True)
+        ]
+    if name != "scan":
+        return None
+    loop = Loop.of(eqn)
+    n, m = loop.num_constants, loop.num_carried
+    fixed = [is_one and not n <= k < n + m for k, is_one in enumerate(fixed)]
+    while True:
+        results = _results(loop.body.jaxpr, fixed, reached, is_smooth)
+        carried = [a or b for a, (_, b) in zip(reached[n : n + m], results[:m], strict=True)]
+        if carried == reached[n : n + m]:
+            return [*((False, is_inexact) for is_inexact in carried), *results[m:]]
+        reached = [*reached[:n], *carried, *reached[n + m :]]
+
+
+def _results(
+    jaxpr: Jaxpr, fixed: Sequence[bool], reached: Sequence[bool], is_smooth: bool
+) -> list[tuple[bool, bool]]:
+    known = dict(zip(jaxpr.invars, fixed, strict=True))
+    known.update((v, True) for v in jaxpr.constvars)
+    some = {v for v, is_one in zip(jaxpr.invars, reached, strict=True) if is_one}
+    _follow(jaxpr, known, some, is_smooth)
+    return [
+        (True, False) if isinstance(v, Literal) else (known[v], v in some) for v in jaxpr.outvars
+    ]
 
 
 def _is_smooth(eqn: JaxprEqn, reached: Sequence[bool]) -> bool:

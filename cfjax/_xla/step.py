@@ -30,14 +30,25 @@ from .jaxprs import (
     replaced,
     structs,
 )
-from .limits import FUNCTION, MAX_ENTRIES, MAX_OPERATIONS, MAX_RESULTS_IN_BATCHES
+from .limits import (
+    FLAT_BATCHES,
+    FLAT_DERIVATIVES,
+    FLAT_VALUES,
+    FLAT_WHOLE,
+    MAX_ENTRIES,
+    MAX_RESULTS_IN_BATCHES,
+)
+from .materialise import not_materialised
 from .operation import in_two, together
-from .program import Declined, Reading, join, known_constant, on_numbers, operations, split
-from .scope import unread
+from .program import Declined, Reading, join, known_constant, length, on_numbers, split
+from .scope import is_everywhere, unread
+from .turns import by_turns
 
 # `levels` are the axes of each `vmap` around it, the innermost first. `fixed` says which operands
 # the step closes over, and `first` how many of its results are mostly used alone. A derivative is
 # linear in its last operands, `linear` of them, and a tangent knows what it is the tangent `of`.
+# With `once` its results are materialised together, as what needs several of them would compute it
+# anew for each. `everywhere` says that values of one system are scalarised as those of a batch.
 step_p = Primitive("cfjax_step")
 step_p.multiple_results = True
 
@@ -58,7 +69,8 @@ def step(reading: Reading, y: PyTree, is_pair: bool) -> PyTree:
     """
     known, given = [], []
     for pair in zip(reading.code.constvars, reading.consts, strict=True):
-        (given if known_constant(pair[1]) is None else known).append(pair)
+        is_known = not isinstance(pair[1], jax.Array) or known_constant(pair[1]) is not None
+        (known if is_known else given).append(pair)
     code = altered(
         reading.code,
         constvars=[v for v, _ in known],
@@ -73,6 +85,8 @@ def step(reading: Reading, y: PyTree, is_pair: bool) -> PyTree:
         fixed=tuple(k < len(given) for k in range(len(operands))),
         first=len(jtu.tree_leaves(reading.shape[0])) if is_pair else structure.num_leaves,
         linear=0,
+        once=False,
+        everywhere=is_everywhere(),
         of=None,
     )
     return jtu.tree_unflatten(structure, outs)
@@ -94,8 +108,9 @@ def _sizes(operands: Sequence[Any], levels: Sequence[Any]) -> list[int]:
     return sizes
 
 
-def _jvp(primals, tangents, *, program, levels, fixed, **params):
-    outs = step_p.bind(*primals, program=program, levels=levels, fixed=fixed, **params)
+def _jvp(primals, tangents, *, program, levels, fixed, everywhere, **params):
+    params = params | dict(levels=levels, fixed=fixed, everywhere=everywhere)
+    outs = step_p.bind(*primals, program=program, **params)
     ways: list[Any] = [ad.Zero(jax.typeof(x).to_tangent_aval()) for x in outs]
     given = enumerate(zip(primals, tangents, strict=True))
     moving = tuple(k for k, (x, way) in given if type(way) is not ad.Zero and is_inexact(x))
@@ -111,6 +126,8 @@ def _jvp(primals, tangents, *, program, levels, fixed, **params):
         fixed=(*fixed, *[False] * len(moving)),
         first=len(smooth),
         linear=len(moving),
+        once=True,
+        everywhere=everywhere,
         of=Of(program, moving, smooth),
     )
     return outs, replaced(ways, smooth, new)
@@ -140,7 +157,7 @@ def _tangent(program: ClosedJaxpr, moving: tuple[int, ...], smooth: tuple[int, .
     return program_of(tangent, *avals, *(avals[k] for k in moving))
 
 
-def _transpose(cotangents, *operands, program, levels, fixed, linear, of, **_):
+def _transpose(cotangents, *operands, program, levels, fixed, linear, everywhere, of, **_):
     unknown = tuple(k for k, x in enumerate(operands) if ad.is_undefined_primal(x))
     coming = tuple(k for k, x in enumerate(cotangents) if type(x) is not ad.Zero)
     results: list[Any] = [None] * len(operands)
@@ -168,6 +185,8 @@ def _transpose(cotangents, *operands, program, levels, fixed, linear, of, **_):
         fixed=(*(fixed[k] for k in rest), *[False] * len(coming)),
         first=len(unknown),
         linear=len(coming),
+        once=True,
+        everywhere=everywhere,
         of=None,
     )
     for k, x in zip(unknown, outs, strict=True):
@@ -223,20 +242,23 @@ def _one_of(xs):
 
 
 @step_p.def_impl
-def _run(*operands, program, levels, fixed, first, linear, of):
-    length = operations(program.jaxpr)
-    if length > MAX_OPERATIONS:
-        return _as_traced(operands, program, levels)
+def _run(*operands, program, levels, fixed, first, linear, once, everywhere, of):
+    num_operations = length(program.jaxpr)
+    is_common = levels or everywhere
+    most = FLAT_DERIVATIVES if linear else FLAT_BATCHES if is_common else FLAT_VALUES
+    if num_operations > most:
+        return _as_traced(operands, program, levels, fixed)
     for k, size in enumerate(reversed(_sizes(operands, levels))):
         moves = [axis is not None for axis in levels[k]]
         is_linear = linear and not any(moves[: len(moves) - linear])
         if is_linear and size <= MAX_ENTRIES["step"]:
-            params = dict(program=program, fixed=fixed, first=first, linear=linear, of=of)
+            params = dict(fixed=fixed, first=first, linear=linear, once=once)
+            params.update(program=program, everywhere=everywhere, of=of)
             return _one_by_one(operands, levels, k, params)
-    if levels and length > FUNCTION:
+    if levels and num_operations > FLAT_WHOLE:
         operands = _without_single_numbers(operands, levels)
-    outs = _flat(operands, program, levels, fixed, first, linear)
-    return _as_traced(operands, program, levels) if outs is None else outs
+    outs = _flat(operands, program, levels, fixed, first, once)
+    return _as_traced(operands, program, levels, fixed) if outs is None else outs
 
 
 def _one_by_one(operands, levels, k, params):
@@ -257,16 +279,15 @@ def _one_by_one(operands, levels, k, params):
     return [jnp.moveaxis(x, 0, len(levels) - 1 - k) for x in outs]
 
 
-def _flat(operands, program, levels, fixed, first, linear) -> list[Any] | None:
+def _flat(operands, program, levels, fixed, first, once) -> list[Any] | None:
     """The results, computed on single numbers; None if the program declines."""
 
     def on_one(*given):
         outs = on_numbers(program, fixed, given)
-        # What needs several results of a derivative would compute it anew for each. Values, and
-        # more results, are left to XLA, which drops what nobody uses.
+        # More results are left to XLA, which drops what nobody uses.
         leaves, structure = jtu.tree_flatten(outs)
         is_few = len(leaves) <= MAX_RESULTS_IN_BATCHES
-        return structure.unflatten(together(leaves) if linear and is_few else leaves)
+        return structure.unflatten(together(leaves) if once and is_few else leaves)
 
     def apart(k: int) -> Any:
         axes = [(axes[k],) for axes in levels if axes[k] is not None]
@@ -296,11 +317,19 @@ def whole(eqn: JaxprEqn) -> ClosedJaxpr:
     return program_of(fun, *structs(eqn.invars)) if levels else program
 
 
-def _as_traced(operands, program, levels) -> list[Any]:
+def _as_traced(operands, program, levels, fixed) -> list[Any]:
     if levels:
         operands = _without_single_numbers(operands, levels)
+    fun = jaxpr_as_fun(by_turns(not_materialised(program), fixed, _turn))
     # A literal comes out as NumPy's.
-    return list(map(jnp.asarray, _in_batches(jaxpr_as_fun(program), levels)(*operands)))
+    return list(map(jnp.asarray, _in_batches(fun, levels)(*operands)))
+
+
+def _turn(operands: Sequence[Any], program: ClosedJaxpr, fixed: Sequence[bool]) -> Sequence[Any]:
+    """A turn of a loop as an operation."""
+    first = len(program.out_avals)
+    params = dict(levels=(), first=first, linear=0, once=True, everywhere=False, of=None)
+    return step_p.bind(*operands, program=program, fixed=tuple(fixed), **params)
 
 
 def _in_batches(fun: Callable[..., Any], levels: Sequence[Any]) -> Callable[..., Any]:

@@ -86,6 +86,9 @@ def is_in_place(eqn: JaxprEqn) -> bool:
 
 _CONTROL = frozenset(("cond", "scan", "while"))
 
+# The name of loops over stages (`stages.py`), and of choices within them.
+STAGES = "cfjax_stages"
+
 # The name of marks (`invariant.py`).
 INVARIANT = "cfjax_invariant"
 
@@ -98,21 +101,29 @@ def is_invariant(eqn: JaxprEqn) -> bool:
 def is_readable(jaxpr: Jaxpr) -> bool:
     """Whether a program can be scalarised.
 
-    - It has no branches and loops, as in the exponential of a matrix. They would stay whole, and
-      what is around them, scalarised, XLA would compute anew for each of the entries that go in.
+    - It has no branches and loops, as in the exponential of a matrix, but for those over the stages
+      of a method. They would stay whole, and what is around them, scalarised, XLA would compute
+      anew for each of the entries that go in.
     - It has no function with a rule for reverse mode only.
     - It has no marked values, as of a step with functions of an operator. It would be long.
     - It is on one device, as far as the types of its values say, in no `jax.shard_map`.
     - It says nothing to the compiler about some of its operations.
     """
     return all(
-        eqn.primitive.name not in _CONTROL
+        (eqn.primitive.name not in _CONTROL or _is_of_stages(eqn))
         and "custom_vjp" not in eqn.primitive.name
         and not _has_advice(eqn)
         and not is_invariant(eqn)
         and all(_is_on_one_device(v.aval) for v in (*eqn.invars, *eqn.outvars))
         and all(map(is_readable, jaxprs_in_params(eqn.params)))
         for eqn in jaxpr.eqns
+    )
+
+
+def _is_of_stages(eqn: JaxprEqn) -> bool:
+    # What is within a loop has a name stack of its own, so a user's loop there has not this name.
+    return STAGES in str(getattr(eqn.source_info, "name_stack", "")) and (
+        eqn.primitive.name != "while"
     )
 
 

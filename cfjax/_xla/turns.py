@@ -1,0 +1,118 @@
+"""Loops over stages turn by turn: each turn is scalarised, and tables of all stages stay whole."""
+
+from collections.abc import Callable, Sequence
+from typing import Any
+
+import jax.numpy as jnp
+from jax.extend.core import ClosedJaxpr, Jaxpr, JaxprEqn, Literal, jaxpr_as_fun
+
+from .jaxprs import altered, flattened, program_of, structs, variables, without_dead_code
+from .limits import MAX_LENGTH
+from .over_stages import Loop
+
+# What computes a program, of operands of which some are fixed.
+Run = Callable[[Sequence[Any], ClosedJaxpr, Sequence[bool]], Sequence[Any]]
+
+
+def by_turns(program: ClosedJaxpr, fixed: Sequence[bool], run: Run) -> ClosedJaxpr:
+    """The program, in whose loops `run` computes what each turn makes of short vectors."""
+    jaxpr, eqns = program.jaxpr, []
+    are_fixed = dict(zip(jaxpr.invars, fixed, strict=True))
+    are_fixed.update((v, True) for v in jaxpr.constvars)
+    for eqn in jaxpr.eqns:
+        flags = [isinstance(v, Literal) or are_fixed[v] for v in eqn.invars]
+        are_fixed.update((v, all(flags)) for v in eqn.outvars)
+        eqns.append(_by_turns(eqn, flags, run) if eqn.primitive.name == "scan" else eqn)
+    return ClosedJaxpr(altered(jaxpr, eqns=eqns), program.consts)
+
+
+def _by_turns(eqn: JaxprEqn, fixed: Sequence[bool], run: Run) -> JaxprEqn:
+    body = flattened(eqn.params["jaxpr"], ("jit", "pjit"))
+    jaxpr, n = body.jaxpr, Loop.of(eqn).num_constants
+    code = altered(jaxpr, constvars=[], invars=[*jaxpr.constvars, *jaxpr.invars])
+    # What is carried may change, and what it goes over does.
+    flags = [*[True] * len(body.consts), *fixed[:n], *[False] * (len(fixed) - n)]
+    turn = program_of(
+        lambda *operands: _turn(code, [*body.consts, *operands], flags, run),
+        *structs(jaxpr.invars),
+    )
+    return eqn.replace(params=eqn.params | {"jaxpr": turn})
+
+
+def _turn(jaxpr: Jaxpr, operands: Sequence[Any], fixed: Sequence[bool], run: Run) -> Sequence[Any]:
+    """The results of a turn, of which `run` computes what is not about tables."""
+    before, within, after = _apart(jaxpr)
+    end = _part(jaxpr, after, variables(jaxpr.outvars))
+    core = _part(jaxpr, within, variables((*jaxpr.outvars, *end.invars)))
+    start = _part(jaxpr, before, variables((*jaxpr.outvars, *end.invars, *core.invars)))
+    values: dict[Any, Any] = dict(zip(jaxpr.invars, operands, strict=True))
+    are_fixed = dict(zip(jaxpr.invars, fixed, strict=True))
+    for part in (start, core, end):
+        given = [values[v] for v in part.invars]
+        program = ClosedJaxpr(part, [])
+        if part is core:
+            outs = run(given, program, [are_fixed.get(v, False) for v in part.invars])
+        else:
+            outs = jaxpr_as_fun(program)(*given)
+        values.update(zip(part.outvars, outs, strict=True))
+
+    def read(v: Any) -> Any:
+        return jnp.asarray(v.val, v.aval.dtype) if isinstance(v, Literal) else values[v]
+
+    return list(map(read, jaxpr.outvars))
+
+
+def _part(jaxpr: Jaxpr, eqns: Sequence[JaxprEqn], wanted: Sequence[Any]) -> Jaxpr:
+    """A part of a program that makes what is wanted of it, and takes no more than it needs."""
+    made = {v for eqn in eqns for v in eqn.outvars}
+    outs = list(dict.fromkeys(v for v in wanted if v in made))
+    code = altered(jaxpr, constvars=[], invars=[], eqns=list(eqns), outvars=outs)
+    code = without_dead_code(code)
+    known = {v for eqn in code.eqns for v in eqn.outvars}
+    taken = dict.fromkeys(v for eqn in code.eqns for v in variables(eqn.invars) if v not in known)
+    return altered(code, invars=list(taken))
+
+
+def _apart(jaxpr: Jaxpr) -> tuple[list[JaxprEqn], list[JaxprEqn], list[JaxprEqn]]:
+    """What reads tables, what is on short vectors, and what makes tables of that."""
+    available = {*jaxpr.constvars, *jaxpr.invars}
+    tables = {v for v in jaxpr.invars if _is_table(v)}
+    could: list[int] = []
+    needed: set[Any] = set()
+    for k, eqn in enumerate(jaxpr.eqns):
+        taken = variables(eqn.invars)
+        if not all(v in available for v in taken):
+            continue
+        could.append(k)
+        if tables.isdisjoint(taken):
+            available.update(eqn.outvars)
+            continue
+        # What is made of a short vector that comes out of a table is scalarised.
+        some = [v for v in eqn.outvars if _is_table(v)]
+        tables.update(some)
+        available.update(some)
+        needed.update(eqn.outvars)
+    before: set[int] = set()
+    for k in reversed(could):
+        if not needed.isdisjoint(jaxpr.eqns[k].outvars):
+            before.add(k)
+            needed.update(variables(jaxpr.eqns[k].invars))
+    after: set[int] = set()
+    inner: set[Any] = set()
+    for k in reversed(range(len(jaxpr.eqns))):
+        eqn = jaxpr.eqns[k]
+        has_table = any(_is_table(v) for v in (*variables(eqn.invars), *eqn.outvars))
+        if k in before or (has_table and inner.isdisjoint(eqn.outvars)):
+            if k not in before:
+                after.add(k)
+        else:
+            inner.update(variables(eqn.invars))
+    parts: tuple[list[JaxprEqn], ...] = [], [], []
+    for k, eqn in enumerate(jaxpr.eqns):
+        parts[0 if k in before else 2 if k in after else 1].append(eqn)
+    return parts[0], parts[1], parts[2]
+
+
+def _is_table(v: Any) -> bool:
+    """Whether this is an array of vectors of all stages, or of what a loop made in all turns."""
+    return len(v.aval.shape) > 1 and v.aval.size > MAX_LENGTH

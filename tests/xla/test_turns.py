@@ -1,0 +1,199 @@
+"""Loops over the stages of a method: unrolled where a step is short, otherwise turn by turn."""
+
+import functools
+
+import diffrax
+import jax
+import jax.numpy as jnp
+import numpy as np
+import problems
+import pytest
+from xla import random_programs
+
+import cfjax
+from cfjax.scenes import heavy_top, rigid_body, spacecraft
+
+pytestmark = pytest.mark.usefixtures("rewritten_by_default")
+
+
+def step_of(scene, solver, field=None):
+    """The end of a step and its error, as a function of the state and the parameters."""
+    given = scene.problem()
+    term = given["term"] if field is None else cfjax.LieTerm(field)
+    t0, t1 = jnp.asarray(0.1), jnp.asarray(0.12)
+
+    def step(y, args):
+        state = solver.init(term, t0, t1, y, args)
+        return solver.step(term, t0, t1, y, args, state, made_jump=False)[:2]
+
+    args = jax.tree.map(jnp.asarray, given.get("args"))
+    return step, given["y0"], args
+
+
+def size(fun):
+    return lambda *args: sum(jnp.sum(jnp.sin(x)) for x in jax.tree.leaves(fun(*args)))
+
+
+def lines_of(fun, *args):
+    return jax.jit(fun).lower(*args).as_text().splitlines()
+
+
+def has_loop(fun, *args):
+    return any("stablehlo.while" in line for line in lines_of(fun, *args))
+
+
+def batch_of(fun, y, args):
+    ys = jax.tree.map(lambda x: jnp.stack([x, -x]), y)
+    return jax.vmap(fun, (0, None)), ys, args
+
+
+def test_a_short_step_has_no_loop():
+    step = step_of(rigid_body, cfjax.CF4())
+    assert "scan" in str(jax.make_jaxpr(step[0])(*step[1:]))
+    assert not has_loop(*step)
+    assert not has_loop(jax.grad(size(step[0])), *step[1:])
+    with cfjax.rewriting(False):
+        assert has_loop(*step)
+
+
+def test_a_long_step_is_unrolled_in_batches():
+    step = step_of(rigid_body, cfjax.CF54())
+    assert has_loop(*step)
+    assert not has_loop(*batch_of(*step))
+    assert has_loop(jax.grad(size(step[0])), *step[1:])
+    with cfjax.rewriting(True):
+        assert not has_loop(*step)
+
+
+def test_what_is_unrolled_has_no_terms_that_are_zero():
+    """It is the program of stages that were traced one by one, where a weight of one is no
+    product.
+    """
+
+    def products(unroll):
+        step = step_of(rigid_body, cfjax.CF4(unroll=unroll))
+        return sum("stablehlo.multiply" in line for line in lines_of(*step))
+
+    # A flow more would be forty.
+    assert 100 < products(True) <= products(None) < products(True) + 10
+
+
+def test_each_turn_of_a_long_step_is_scalarised():
+    """Sums over its stages are not."""
+    step = step_of(spacecraft, cfjax.RKMK8())
+    _, *functions = jax.jit(step[0]).lower(*step[1:]).as_text().split("func.func")
+    (turn,) = (text for text in functions if text.startswith(" private @cfjax"))
+
+    def products(text, type):
+        return sum("multiply" in s and f": tensor<{type}>" in s for s in text.splitlines())
+
+    assert products(turn, "f64") > 100
+    assert products(turn, "3xf64") == products(turn, "13x3xf64") == 0
+    assert any(products(text, "13x3xf64") for text in functions)
+
+
+@functools.cache
+def as_it_is(scene, transform):
+    with cfjax.rewriting(False):
+        step, *start = step_of(scene, cfjax.RKMK8())
+        return transform(step)(*start)
+
+
+def value(step):
+    return jax.jit(step, compiler_options=problems.QUICK)
+
+
+def gradient(step):
+    return value(jax.grad(size(step), (0, 1)))
+
+
+def batch(step):
+    return value(lambda y, args: batch_of(step, y, args)[0](*batch_of(step, y, args)[1:]))
+
+
+def gradients(step):
+    return batch(jax.grad(size(step)))
+
+
+def derivatives(step):
+    return value(jax.jacfwd(step))
+
+
+@pytest.mark.representatives(3)
+@pytest.mark.parametrize("scene", [heavy_top, spacecraft])
+@pytest.mark.parametrize("transform", [value, gradient, gradients, batch, derivatives])
+def test_a_long_step_agrees_with_the_program_as_it_is(scene, transform):
+    """Up to rounding, of which there are thousands in a step."""
+    step, *start = step_of(scene, cfjax.RKMK8())
+    found, expected = transform(step)(*start), as_it_is(scene, transform)
+    for a, b in zip(jax.tree.leaves(found), jax.tree.leaves(expected), strict=True):
+        assert (a.shape, a.dtype) == (b.shape, b.dtype)
+        np.testing.assert_allclose(a, b, rtol=0, atol=1e-12 * max(1.0, float(jnp.max(abs(b)))))
+
+
+def test_second_derivatives():
+    step, *start = step_of(rigid_body, cfjax.CF2())
+    found = jax.jit(jax.hessian(size(step)), compiler_options=problems.QUICK)(*start)
+    with cfjax.rewriting(False):
+        expected = jax.hessian(size(step_of(rigid_body, cfjax.CF2())[0]))(*start)
+    np.testing.assert_allclose(found, expected, rtol=0, atol=1e-13)
+
+
+@pytest.mark.representatives(1)
+@pytest.mark.parametrize("solver", [cfjax.CF54(), cfjax.RKMK8()])
+def test_a_solve_agrees_however_its_steps_are_compiled(solver):
+    """With output and error control, alone and in batches."""
+    term = cfjax.LieTerm(lambda t, y, args: cfjax.Rotation(-y / args + jnp.sin(t)))
+    inertia = jnp.asarray([1.0, 2.0, 3.0])
+
+    def solve(y):
+        return diffrax.diffeqsolve(
+            term,
+            solver,
+            0.0,
+            1.0,
+            None,
+            y,
+            inertia,
+            saveat=diffrax.SaveAt(ts=jnp.linspace(0.0, 1.0, 4)),
+            stepsize_controller=diffrax.PIDController(rtol=1e-6, atol=1e-6),
+            max_steps=64,
+        ).ys
+
+    few = jnp.outer(jnp.linspace(0.2, 1.4, 3), jnp.asarray([0.3, -0.7, 1.1]))
+    with cfjax.rewriting(False):
+        expected = value(jax.vmap(solve))(few)
+    # Some twenty steps, in each of which a rounding is multiplied by less than 2.
+    tight = dict(rtol=0, atol=1e-13)
+    for on in (None, True):
+        with cfjax.rewriting(on):
+            np.testing.assert_allclose(value(jax.vmap(solve))(few), expected, **tight)
+            np.testing.assert_allclose(value(solve)(few[0]), expected[0], **tight)
+
+
+def test_a_loop_of_a_field_is_left_alone():
+    """Also within the loop over stages."""
+
+    def field(t, y, args):
+        return cfjax.Rotation(jax.lax.fori_loop(0, 3, lambda k, w: w / args, y))
+
+    step = step_of(rigid_body, cfjax.CF4(), field)
+    assert "cfjax_step" not in str(jax.make_jaxpr(step[0])(*step[1:]))
+
+
+def test_an_update_whose_place_is_not_known_is_left_alone():
+    def updated(x):
+        y = jnp.sin(x) * x[0]
+        place = jnp.argmax(y)
+        return y.at[place].set(jax.lax.dynamic_index_in_dim(y, 2 - place, keepdims=False))
+
+    x = jnp.asarray([0.3, -0.7, 1.1])
+    batch = jax.vmap(lambda x: random_programs.rewritten(lambda y, _: updated(y))(x, None))
+    xs = jnp.stack([x, x[::-1]])
+    np.testing.assert_array_equal(batch(xs), jax.vmap(updated)(xs))
+    assert any("stablehlo.sine" in s and "2x3xf64" in s for s in lines_of(batch, xs))
+
+
+def test_the_switch_is_a_bool_or_none(no_shape_hook):
+    with pytest.raises(TypeError, match=r"on must be True, False or None, got 'yes'"):
+        cfjax.rewriting("yes")  # pyright: ignore[reportArgumentType]
