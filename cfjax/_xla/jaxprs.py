@@ -164,7 +164,7 @@ def by_parts(
         part = altered(jaxpr, eqns=eqns, constvars=[], invars=list(taken), outvars=list(given))
         outs = run(ClosedJaxpr(part, []), [env[v] for v in taken], stop == len(jaxpr.eqns))
         env.update(zip(given, outs, strict=True))
-    return [_read(v, env) for v in jaxpr.outvars]
+    return [value_of(v, env) for v in jaxpr.outvars]
 
 
 def _environment(program: ClosedJaxpr, operands: Sequence[Any]) -> dict[Any, Any]:
@@ -173,7 +173,8 @@ def _environment(program: ClosedJaxpr, operands: Sequence[Any]) -> dict[Any, Any
     return dict(zip(names, values, strict=True))
 
 
-def _read(v: Any, env: dict[Any, Any]) -> Any:
+def value_of(v: Any, env: dict[Any, Any]) -> Any:
+    """What a name of a program stands for, or its number."""
     aval: Any = v.aval
     return jnp.asarray(v.val, aval.dtype) if isinstance(v, Literal) else env[v]
 

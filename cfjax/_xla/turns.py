@@ -3,10 +3,17 @@
 from collections.abc import Callable, Sequence
 from typing import Any
 
-import jax.numpy as jnp
 from jax.extend.core import ClosedJaxpr, Jaxpr, JaxprEqn, Literal, jaxpr_as_fun
 
-from .jaxprs import altered, flattened, program_of, structs, variables, without_dead_code
+from .jaxprs import (
+    altered,
+    flattened,
+    program_of,
+    structs,
+    value_of,
+    variables,
+    without_dead_code,
+)
 from .limits import MAX_LENGTH
 from .over_stages import Loop
 
@@ -55,11 +62,7 @@ def _turn(jaxpr: Jaxpr, operands: Sequence[Any], fixed: Sequence[bool], run: Run
         else:
             outs = jaxpr_as_fun(program)(*given)
         values.update(zip(part.outvars, outs, strict=True))
-
-    def read(v: Any) -> Any:
-        return jnp.asarray(v.val, v.aval.dtype) if isinstance(v, Literal) else values[v]
-
-    return list(map(read, jaxpr.outvars))
+    return [value_of(v, values) for v in jaxpr.outvars]
 
 
 def _part(jaxpr: Jaxpr, eqns: Sequence[JaxprEqn], wanted: Sequence[Any]) -> Jaxpr:
