@@ -4,8 +4,8 @@
 in one run, from NumPy arrays to NumPy arrays. The picture shows trajectories per second.
 
 Then 1000 solves with adaptive steps of a tolerance of 1e-7: the end alone, the state at 21 times,
-and the gradient of a sum over these with respect to the start, also with `cfjax.rewriting(True)`.
-diffrax's Tsit5 in plain space takes turns.
+and the gradient of a sum over these with respect to the start. diffrax's Tsit5 in plain space takes
+turns.
 """
 
 import time
@@ -65,11 +65,10 @@ def measure(quick: bool) -> Iterator[results.Row]:
     members = _members(ADAPTIVE)
     for what, make in PROGRAMS.items():
         runs, waits = [], []
-        with cfjax.rewriting(True if what == REWRITTEN else None):
-            for solver in METHODS.values():
-                start = time.process_time()
-                runs.append(results.compiled(jax.vmap(make(solver)), *members))
-                waits.append(time.process_time() - start)
+        for solver in METHODS.values():
+            start = time.process_time()
+            runs.append(results.compiled(jax.vmap(make(solver)), *members))
+            waits.append(time.process_time() - start)
         taken = take_turns(runs, repeats=3 if quick else 15)
         for method, seconds, wait in zip(METHODS, taken, waits, strict=True):
             yield {
@@ -110,12 +109,10 @@ def _gradient(solver: Any) -> Callable[[Any, Any], Any]:
     return jax.grad(lambda y0, inertia: jnp.sum(solve(y0, inertia) ** 3))
 
 
-REWRITTEN = "gradient, `cfjax.rewriting(True)`"
 PROGRAMS: dict[str, Callable[[Any], Callable[[Any, Any], Any]]] = {
     "end alone": lambda solver: _adaptive(solver, 1),
     f"{TIMES} times": lambda solver: _adaptive(solver, TIMES),
     "gradient": _gradient,
-    REWRITTEN: _gradient,
 }
 
 
