@@ -866,8 +866,8 @@ DEFECTS = [
     ),
     Defect(
         "_xla/step.py",
-        "is_common = levels or everywhere",
-        "is_common = everywhere",
+        "FLAT_BATCHES if levels else alone",
+        "alone",
         "a long step that is not scalarised in batches",
         "xla/test_turns.py -k in_batches",
     ),

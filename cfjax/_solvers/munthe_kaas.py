@@ -324,7 +324,7 @@ class RKMK(AbstractMuntheKaas, diffrax.AbstractAdaptiveSolver):
             found = self._stages(elements[:n], rows, times, chart)
             return found.or_nan(found.elements[n:])
 
-        elements = [*elements[:n], *scalarised(later, start)]
+        elements = [*elements[:n], *scalarised(later, start, in_batches=True)]
         return Path.of(path.continuous_extension, start, elements)
 
     @property

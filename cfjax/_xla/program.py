@@ -436,20 +436,18 @@ def _unrolled(
 ) -> tuple[list[Any], list[bool]]:
     """The results of a loop, one turn after the other."""
     n, m = loop.num_constants, loop.num_constants + loop.num_carried
-    carry, carried_fixed = list(values[n:m]), list(fixed[n:m])
+    carry = values[n:m]
     # What is fixed in the first turn need not be so in the next.
-    carried_fixed = [False] * len(carry)
+    flags = [*fixed[:n], *[False] * len(carry), *fixed[m:]]
     rows: dict[int, list[Any]] = {}
-    num_rows = len(loop.body.jaxpr.outvars) - loop.num_carried
-    rows_fixed = [True] * num_rows
+    outs_fixed: list[bool] = []
     for k in loop.turns:
         turn = [_entry(x, k) for x in values[m:]]
-        flags = [*fixed[:n], *carried_fixed, *fixed[m:]]
         outs, outs_fixed = _evaluate_inner(loop.body, [*values[:n], *carry, *turn], flags, form)
         carry, rows[k] = outs[: m - n], outs[m - n :]
-        rows_fixed = [a and b for a, b in zip(rows_fixed, outs_fixed[m - n :], strict=True)]
-    stacks = [_stacked([rows[k][j] for k in range(loop.length)]) for j in range(num_rows)]
-    return [*carry, *stacks], [*carried_fixed, *rows_fixed]
+    stacks = map(_stacked, zip(*(rows[k] for k in range(loop.length)), strict=True))
+    # It is the same in every turn.
+    return [*carry, *stacks], [*[False] * len(carry), *outs_fixed[m - n :]]
 
 
 def _entry(x: Any, k: int) -> Any:

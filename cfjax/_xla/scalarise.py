@@ -16,19 +16,22 @@ from .step import step
 from .struct_of_arrays import StructOfArrays
 
 
-def scalarised(fun: Callable[[PyTree], PyTree], y: PyTree, is_pair: bool = False) -> PyTree:
+def scalarised(
+    fun: Callable[[PyTree], PyTree], y: PyTree, is_pair: bool = False, in_batches: bool = False
+) -> PyTree:
     """`fun(y)`, computed on single numbers where `y` is a small state of short vectors.
 
     The result agrees with that of `fun` to rounding. `fun` may close over traced values. Operations
     that have no rule get the array whole. Where `y` is another state or the program cannot be
     scalarised, and within another one that is scalarised, this is `fun(y)`. With `is_pair` the
-    function returns a pair, of which mostly the first part alone is used.
+    function returns a pair, of which mostly the first part alone is used. With `in_batches` values
+    of one system and derivatives are left as they are.
     """
     reading = None if where() else read(fun, y, "step")
     if reading is None:
         return fun(y)
     if not reading.rows:
-        return step(reading, y, is_pair)
+        return step(reading, y, is_pair, in_batches)
     program = traced(fun, y, reading, "step")
     if program is None:
         return fun(y)

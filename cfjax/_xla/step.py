@@ -6,6 +6,7 @@ again. So where it is lowered all is known that decides how it is compiled: how 
 program is, and what it is a batch of.
 """
 
+import functools
 from collections.abc import Callable, Sequence
 from typing import Any, NamedTuple
 
@@ -48,7 +49,8 @@ from .turns import by_turns
 # the step closes over, and `first` how many of its results are mostly used alone. A derivative is
 # linear in its last operands, `linear` of them, and a tangent knows what it is the tangent `of`.
 # With `once` its results are materialised together, as what needs several of them would compute it
-# anew for each. `everywhere` says that values of one system are scalarised as those of a batch.
+# anew for each. Values of one system that are longer than `alone` are not scalarised; if that is
+# zero, no derivatives are, either.
 step_p = Primitive("cfjax_step")
 step_p.multiple_results = True
 
@@ -61,7 +63,7 @@ class Of(NamedTuple):
     smooth: tuple[int, ...]
 
 
-def step(reading: Reading, y: PyTree, is_pair: bool) -> PyTree:
+def step(reading: Reading, y: PyTree, is_pair: bool, in_batches: bool) -> PyTree:
     """What the function that has been read makes of `y`, as one operation.
 
     With `is_pair` it returns a pair, of which mostly the first part alone is used. Reverse mode
@@ -86,7 +88,7 @@ def step(reading: Reading, y: PyTree, is_pair: bool) -> PyTree:
         first=len(jtu.tree_leaves(reading.shape[0])) if is_pair else structure.num_leaves,
         linear=0,
         once=False,
-        everywhere=is_everywhere(),
+        alone=0 if in_batches else FLAT_BATCHES if is_everywhere() else FLAT_VALUES,
         of=None,
     )
     return jtu.tree_unflatten(structure, outs)
@@ -108,8 +110,8 @@ def _sizes(operands: Sequence[Any], levels: Sequence[Any]) -> list[int]:
     return sizes
 
 
-def _jvp(primals, tangents, *, program, levels, fixed, everywhere, **params):
-    params = params | dict(levels=levels, fixed=fixed, everywhere=everywhere)
+def _jvp(primals, tangents, *, program, levels, fixed, alone, **params):
+    params = params | dict(levels=levels, fixed=fixed, alone=alone)
     outs = step_p.bind(*primals, program=program, **params)
     ways: list[Any] = [ad.Zero(jax.typeof(x).to_tangent_aval()) for x in outs]
     given = enumerate(zip(primals, tangents, strict=True))
@@ -127,7 +129,7 @@ def _jvp(primals, tangents, *, program, levels, fixed, everywhere, **params):
         first=len(smooth),
         linear=len(moving),
         once=True,
-        everywhere=everywhere,
+        alone=alone,
         of=Of(program, moving, smooth),
     )
     return outs, replaced(ways, smooth, new)
@@ -157,7 +159,7 @@ def _tangent(program: ClosedJaxpr, moving: tuple[int, ...], smooth: tuple[int, .
     return program_of(tangent, *avals, *(avals[k] for k in moving))
 
 
-def _transpose(cotangents, *operands, program, levels, fixed, linear, everywhere, of, **_):
+def _transpose(cotangents, *operands, program, levels, fixed, linear, alone, of, **_):
     unknown = tuple(k for k, x in enumerate(operands) if ad.is_undefined_primal(x))
     coming = tuple(k for k, x in enumerate(cotangents) if type(x) is not ad.Zero)
     results: list[Any] = [None] * len(operands)
@@ -186,7 +188,7 @@ def _transpose(cotangents, *operands, program, levels, fixed, linear, everywhere
         first=len(unknown),
         linear=len(coming),
         once=True,
-        everywhere=everywhere,
+        alone=alone,
         of=None,
     )
     for k, x in zip(unknown, outs, strict=True):
@@ -242,23 +244,22 @@ def _one_of(xs):
 
 
 @step_p.def_impl
-def _run(*operands, program, levels, fixed, first, linear, once, everywhere, of):
+def _run(*operands, program, levels, fixed, first, linear, once, alone, of):
     num_operations = length(program.jaxpr)
-    is_common = levels or everywhere
-    most = FLAT_DERIVATIVES if linear else FLAT_BATCHES if is_common else FLAT_VALUES
+    most = (FLAT_DERIVATIVES if alone else 0) if linear else FLAT_BATCHES if levels else alone
     if num_operations > most:
-        return _as_traced(operands, program, levels, fixed)
+        return _as_traced(operands, program, levels, fixed, alone)
     for k, size in enumerate(reversed(_sizes(operands, levels))):
         moves = [axis is not None for axis in levels[k]]
         is_linear = linear and not any(moves[: len(moves) - linear])
         if is_linear and size <= MAX_ENTRIES["step"]:
             params = dict(fixed=fixed, first=first, linear=linear, once=once)
-            params.update(program=program, everywhere=everywhere, of=of)
+            params.update(program=program, alone=alone, of=of)
             return _one_by_one(operands, levels, k, params)
     if levels and num_operations > FLAT_WHOLE:
         operands = _without_single_numbers(operands, levels)
     outs = _flat(operands, program, levels, fixed, first, once)
-    return _as_traced(operands, program, levels, fixed) if outs is None else outs
+    return _as_traced(operands, program, levels, fixed, alone) if outs is None else outs
 
 
 def _one_by_one(operands, levels, k, params):
@@ -317,18 +318,18 @@ def whole(eqn: JaxprEqn) -> ClosedJaxpr:
     return program_of(fun, *structs(eqn.invars)) if levels else program
 
 
-def _as_traced(operands, program, levels, fixed) -> list[Any]:
+def _as_traced(operands, program, levels, fixed, alone) -> list[Any]:
     if levels:
         operands = _without_single_numbers(operands, levels)
-    fun = jaxpr_as_fun(by_turns(not_materialised(program), fixed, _turn))
+    fun = jaxpr_as_fun(by_turns(not_materialised(program), fixed, functools.partial(_turn, alone)))
     # A literal comes out as NumPy's.
     return list(map(jnp.asarray, _in_batches(fun, levels)(*operands)))
 
 
-def _turn(operands: Sequence[Any], program: ClosedJaxpr, fixed: Sequence[bool]) -> Sequence[Any]:
+def _turn(alone: int, operands: Sequence[Any], program: ClosedJaxpr, fixed: Sequence[bool]):
     """A turn of a loop as an operation."""
     first = len(program.out_avals)
-    params = dict(levels=(), first=first, linear=0, once=True, everywhere=False, of=None)
+    params = dict(levels=(), first=first, linear=0, once=True, alone=alone, of=None)
     return step_p.bind(*operands, program=program, fixed=tuple(fixed), **params)
 
 

@@ -171,6 +171,35 @@ def test_a_solve_agrees_however_its_steps_are_compiled(solver):
             np.testing.assert_allclose(value(solve)(few[0]), expected[0], **tight)
 
 
+def test_output_within_a_step_is_scalarised_in_batches():
+    """For one system its flows are a loop."""
+    _, y, args = step_of(rigid_body, cfjax.CF4())
+    sol = diffrax.diffeqsolve(
+        rigid_body.problem()["term"],
+        cfjax.CF4(),
+        0.0,
+        1.0,
+        0.25,
+        y,
+        args,
+        saveat=diffrax.SaveAt(dense=True),
+    )
+    times = jnp.linspace(0.05, 0.95, 20)
+
+    at = lambda t: sol.evaluate(t)  # noqa: E731
+    batch = jax.vmap(at)
+
+    def num_loops(fun, *args):
+        return sum("stablehlo.while" in line for line in lines_of(fun, *args))
+
+    # Another finds the step.
+    assert num_loops(at, 0.3) == num_loops(batch, times) + 1 == 2
+    assert num_loops(jax.grad(lambda t: jnp.sum(at(t))), 0.3) > 1
+    found, expected = batch(times), jnp.stack([at(t) for t in times])
+    # Some hundred operations on numbers of size one.
+    np.testing.assert_allclose(found, expected, rtol=0, atol=1e-13)
+
+
 def test_a_loop_of_a_field_is_left_alone():
     """Also within the loop over stages."""
 
