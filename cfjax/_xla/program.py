@@ -135,7 +135,7 @@ class Reading(NamedTuple):
     consts: Sequence[Any]
     shape: PyTree
     rows: bool
-    length: int
+    length: float
 
     def scalarised(self, consts: Sequence[Any], *shapes: PyTree) -> tuple[ClosedJaxpr, Any] | None:
         """The program on what is split, of the given shapes; and the tree of its results.
@@ -302,7 +302,7 @@ def _has_rows(y: PyTree, max_entries: int) -> bool:
     )
 
 
-def operations(jaxpr: Jaxpr) -> int:
+def operations(jaxpr: Jaxpr) -> float:
     """About how many operations on single numbers or whole arrays there will be."""
     return sum(map(_operations_of, jaxpr.eqns))
 
@@ -326,12 +326,15 @@ def _length_of(eqn: JaxprEqn) -> float:
     return math.inf if name == "while" else _operations_of(eqn)
 
 
-def _operations_of(eqn: JaxprEqn) -> int:
+def _operations_of(eqn: JaxprEqn) -> float:
     name = eqn.primitive.name
     if name in _CALLS:
         return operations(eqn.params["jaxpr"].jaxpr)
     if name in MOVES:
         return 0
+    if name == "scan":
+        # Of stages that are too long together to be unrolled within a loop of steps.
+        return math.inf
     terms = 1
     if name == "dot_general":
         left: Any = eqn.invars[0].aval

@@ -92,6 +92,18 @@ def test_each_turn_of_a_long_step_is_scalarised():
     assert any(products(text, "13x3xf64") for text in functions)
 
 
+def test_a_step_that_is_too_long_keeps_its_loop_in_equal_steps():
+    """Unrolled, its gradient did not compile in a minute."""
+    given = spacecraft.problem()
+
+    def solve(y):
+        return cfjax.integrate(
+            given["term"], cfjax.RKMK8(), 0.0, 0.1, y, given["args"], num_steps=20, throw=False
+        ).ys
+
+    assert sum("stablehlo.while" in line for line in lines_of(solve, given["y0"])) == 2
+
+
 @functools.cache
 def as_it_is(scene, transform):
     with cfjax.rewriting(False):
