@@ -1,7 +1,6 @@
 """The derivatives, transposes and batches of an operation, which are operations too."""
 
 import functools
-import math
 import weakref
 from collections.abc import Callable, Sequence
 from typing import Any, NamedTuple
@@ -31,8 +30,7 @@ from .scope import Place
 class Kind(NamedTuple):
     """Where it runs, how many of the last operands it is linear in, which derivative it is, whether
     it is of a batch, up to which derivative there are operations, whether it is transposed, as in
-    reverse mode, or of several directions at once, and how many of its results come first: others
-    are seldom used.
+    reverse mode, or of several directions at once.
     """
 
     place: Place
@@ -42,7 +40,6 @@ class Kind(NamedTuple):
     last: int = 1
     is_transposed: bool = False
     is_mapped: bool = False
-    first: float = math.inf
 
 
 class Plain:

@@ -101,7 +101,7 @@ def _pruned(eqn: JaxprEqn, wanted: set[Any]) -> JaxprEqn:
     kind, size = eqn.params["kind"], len(eqn.invars)
     program, takes = narrowed(eqn.params["program"], gives)
     linear = sum(k >= size - kind.linear for k in takes)
-    kind = kind._replace(linear=linear, first=sum(k < kind.first for k in gives))
+    kind = kind._replace(linear=linear)
     return eqn.replace(
         invars=[eqn.invars[k] for k in takes],
         outvars=[eqn.outvars[k] for k in gives],

@@ -58,24 +58,20 @@ def operation(
     is_batch: bool = False,
     plain: Callable[..., PyTree] | None = None,
     order: int = 1,
-    is_pair: bool = False,
 ) -> PyTree:
     """`fun(*args)`, as one operation, of a batch if it is one already.
 
     `fun` may close over traced values, and has no effects. Reverse mode keeps the arguments and
     computes everything again, as with `jax.checkpoint`. `plain` is the same function before it was
-    scalarised, and closes over nothing that is traced: derivatives beyond `order` are of that. With
-    `is_pair` it returns a pair, of which mostly the first part alone is used.
+    scalarised, and closes over nothing that is traced: derivatives beyond `order` are of that.
     """
     leaves, structure = jtu.tree_flatten(args)
     leaves = list(map(jnp.asarray, leaves))
     out_structure: Any = None
-    num_first = 0
 
     def of_leaves(*leaves):
-        nonlocal out_structure, num_first
+        nonlocal out_structure
         out = fun(*jtu.tree_unflatten(structure, leaves))
-        num_first = len(jtu.tree_leaves(out[0] if is_pair else out))
         out, out_structure = jtu.tree_flatten(jtu.tree_map(jnp.asarray, out))
         return out
 
@@ -109,9 +105,6 @@ def operation(
             return [outs[k] for k in smooth]
 
         before = Plain(of_plain_leaves, structs(code.invars))
-    if is_pair and not is_batch:
-        # Along leading axes a copy of the program (`in_two`) would take much memory.
-        kind = kind._replace(first=sum(is_smooth[:num_first]))
     new = operation_p.bind(*operands, program=program, kind=kind, plain=before)
     return jtu.tree_unflatten(out_structure, replaced(outs, smooth, new))
 
@@ -143,8 +136,6 @@ def _places(jaxpr: Jaxpr) -> list[int]:
 def _run(*operands, program, kind, plain):
     if is_as_it_was(program, kind, plain):
         return jaxpr_as_fun(plain.program)(*operands)
-    if kind.is_batch and not kind.order and kind.first < len(program.jaxpr.outvars):
-        return in_two(program, int(kind.first), operands)
     order = min(kind.order, 2)
     most = WHOLE[kind.place][order]
     if kind.is_batch:

@@ -43,7 +43,6 @@ def scalarised(
         place="step",
         is_batch=program.rows,
         plain=program.plain,
-        is_pair=is_pair,
     )
     # One by one: what is not used is not computed.
     is_apart = lambda x: isinstance(x, StructOfArrays)  # noqa: E731
