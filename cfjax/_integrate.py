@@ -26,7 +26,7 @@ from ._numerics.checks import Fault, error_if, needing
 from ._numerics.squaring import max_over_batch
 from ._solvers.base import is_finite, result_of
 from ._step_back import repeat_and_undo
-from ._xla import invariants_first, limits, repeat
+from ._xla import invariants_first, repeat
 
 _NOT_FINITE = "y0 must be finite, got an entry that is not."
 _BLOW_UP = (
@@ -228,25 +228,23 @@ def equal_steps(
         solver = cast(Any, solver).for_equal_steps((t1 - t0) / intervals)
         forward = invariants_first(step, carry)
 
-    order = 0 if isinstance(num_steps, int) and num_steps <= limits.MANY else 1
-
     def advance(carry, number):
         if step_back:
             back = lambda carry: step(carry, -1)  # noqa: E731
             # What a function closes over becomes an argument, which has a derivative.
             there = eqx.filter_closure_convert(forward, carry)
             back = eqx.filter_closure_convert(back, carry)
-            several = lambda step, carry, number: repeat(step, carry, number, order=0)[0]  # noqa: E731
+            several = lambda step, carry, number: repeat(step, carry, number)[0]  # noqa: E731
             return repeat_and_undo(several, there, back, carry, number, throw_in_reverse)
         # XLA would scalarise a loop of one turn, and compute the step anew for each of its uses.
         if isinstance(number, int) and number == 1:
             return forward(carry)
         if checkpoint_every is None:
-            return repeat(forward, carry, number, order=order)[0]
+            return repeat(forward, carry, number)[0]
         length, rest = checkpoint_every, number % checkpoint_every
-        block = jax.checkpoint(lambda carry: repeat(forward, carry, length, order=order)[0])
+        block = jax.checkpoint(lambda carry: repeat(forward, carry, length)[0])
         carry, _ = lax.scan(lambda x, _: (block(x), None), carry, length=number // length)
-        return repeat(forward, carry, rest, order=order)[0]
+        return repeat(forward, carry, rest)[0]
 
     def steps_and_save(carry, _):
         carry = advance(carry, length if save_every is None else save_every)
@@ -254,7 +252,7 @@ def equal_steps(
 
     num_saves: Any = 1 if save_every is None else num_steps // save_every
     if save_every == 1 and num_saves > 1 and not step_back:
-        carry, ys = repeat(forward, carry, num_saves, lambda carry: carry[1], order)
+        carry, ys = repeat(forward, carry, num_saves, lambda carry: carry[1])
     else:
         carry, ys = lax.scan(steps_and_save, carry, length=num_saves)
     ts = time(

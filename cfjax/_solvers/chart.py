@@ -114,7 +114,7 @@ class Chart:
 
         XLA computes them once then, and not anew for each result.
         """
-        return materialised_together(tree, alone=True)
+        return materialised_together(tree)
 
     def constant(self, tree: PyTree) -> PyTree:
         """The same arrays, which in equal steps mostly do not change from step to step.

@@ -19,9 +19,9 @@ from .._control_term import is_driven
 from .._xla import are_long as are_long
 from .._xla import chosen as chosen
 from .._xla import computed_again as computed_again
+from .._xla import has_rows as has_rows
 from .._xla import invariant as invariant
 from .._xla import is_rewritten as is_rewritten
-from .._xla import is_unrolled as is_unrolled
 from .._xla import limits as limits
 from .._xla import materialised_if_long as materialised_if_long
 from .._xla import materialised_in_rows as materialised_in_rows
@@ -49,7 +49,7 @@ def by_turns(
     A loop of steps that is rewritten as a whole must have no loop within. So two turns are unrolled
     there; more would be too long, and then each turn is rewritten instead.
     """
-    if len(turns) == 1 or (len(turns) == 2 and is_unrolled()):
+    if len(turns) == 1 or (len(turns) == 2 and has_rows()):
         outputs = []
         for turn in turns:
             carry, output = body(carry, turn)
@@ -75,7 +75,7 @@ def shared_end(
     """
     is_used = is_followed or error is not None
     moving = with_sums(lambda c, z: z if is_used or c is not None else None, compensation, end)
-    moving, error = materialised_together((moving, error), alone=is_used)
+    moving, error = materialised_together((moving, error))
     return with_sums(
         lambda c, z, new: new if is_used or c is not None else z, compensation, end, moving
     ), error

@@ -19,7 +19,7 @@ from .._methods.tableau import Product, Row
 from .._numerics.matmul import matmul
 from .._numerics.vectors import pack
 from .chart import Chart
-from .compiled import are_long, chosen, is_unrolled, limits, over_stages, scalarised
+from .compiled import are_long, chosen, has_rows, limits, over_stages, scalarised
 
 
 def can_roll(unroll: bool | None, field: PyTree, point: PyTree, is_long: bool = False) -> bool:
@@ -34,7 +34,7 @@ def can_roll(unroll: bool | None, field: PyTree, point: PyTree, is_long: bool = 
     is_possible = any(map(is_field, parts)) and _is_plain(field)
     if unroll is not None:
         return is_possible and not unroll
-    pays = is_long or not is_unrolled()
+    pays = is_long or not has_rows()
     return is_possible and pays and _size(field) <= max(limits.MAX_SIZE, 4 * _size(point))
 
 
@@ -48,7 +48,7 @@ def _can_roll_in_room(
     first = known[-1]
     if unroll or not is_field(first) or type(first).room is AbstractFrozenField.room:
         return False
-    pays = unroll is False or (not is_unrolled() and _size(chart.start) <= limits.LARGE)
+    pays = unroll is False or (not has_rows() and _size(chart.start) <= limits.LARGE)
     if not pays or any(x.span is not first.span for x in known):
         return False
     room = first.room(chart.start, num_stages)
@@ -238,7 +238,7 @@ def rolled_elements(
     # Before all of them are traced, only to find that they are too long together. Few are mostly
     # short enough; to look costs a trace of one more.
     one = functools.partial(stage, times[0])
-    is_long = len(rows) > limits.MANY and is_unrolled() and are_long(one, first, len(rows))
+    is_long = len(rows) > limits.MANY and has_rows() and are_long(one, first, len(rows))
     if can_roll(unroll, first, first, is_long) and is_uniform(chart):
         fields = _Stacked.of(known, n)
         made, total = _rolled_elements(chart, fields, len(known), rows, times, element, number)

@@ -22,24 +22,18 @@ from .jaxprs import (
     replaced,
     structs,
 )
-from .limits import FORWARD, FUNCTION, MAX_ENTRIES, WHOLE
+from .limits import FUNCTION, MAX_ENTRIES
 from .materialise import materialised
-from .scope import Place
 
 
 class Kind(NamedTuple):
-    """Where it runs, how many of the last operands it is linear in, which derivative it is, whether
-    it is of a batch, up to which derivative there are operations, whether it is transposed, as in
-    reverse mode, or of several directions at once.
+    """How many of the last operands it is linear in, which derivative it is, and whether it is of a
+    batch.
     """
 
-    place: Place
     linear: int = 0
     order: int = 0
     is_batch: bool = False
-    last: int = 1
-    is_transposed: bool = False
-    is_mapped: bool = False
 
 
 class Plain:
@@ -72,20 +66,6 @@ class Plain:
             return [outs[k] for k in gives]
 
         return Plain(fun, [operands[k] for k in takes])
-
-
-def is_as_it_was(program: ClosedJaxpr, kind: Kind, plain: Plain | None) -> bool:
-    """Whether, outside of batches, this is of the program before it was scalarised.
-
-    That is a derivative in forward mode, in our own loop, that is too long for one function. On a
-    rigid body it would take 0.6 to 3 s more to compile, and save 0.1 to 0.3 s in 10 000 steps.
-    Within another loop those of long steps are never scalarised.
-    """
-    is_forward = bool(kind.linear) and not (kind.is_batch or kind.is_transposed)
-    if plain is None or kind.place != "loop" or not is_forward:
-        return False
-    length = sum(map(num_operations, program.jaxpr.eqns))
-    return kind.is_mapped or length > min(FORWARD, WHOLE[kind.place][min(kind.order, 2)])
 
 
 # Of the programs of a solve, which are differentiated one soon after the other.
@@ -125,7 +105,7 @@ def jvp_of(
 def _jvp(primals, tangents, *, program, kind, plain):
     given = enumerate(zip(primals, tangents, strict=True))
     moving = [k for k, (x, way) in given if type(way) is not ad.Zero and is_inexact(x)]
-    if moving and plain is not None and kind.order >= kind.last:
+    if moving and plain is not None and kind.order:
         return jvp_of(plain.program, primals, tangents, moving)
     outs = operation_p.bind(*primals, program=program, kind=kind, plain=plain)
     smooth = [k for k, x in enumerate(outs) if is_inexact(x)]
@@ -173,9 +153,7 @@ def _transpose(cotangents, *operands, program, kind, plain):
         )
     transposed = _transposed(program, plain, unknown, coming)
     fixed = (x for k, x in enumerate(operands) if k not in unknown)
-    new = transposed.bind(
-        [*fixed, *(cotangents[k] for k in coming)], kind._replace(is_transposed=True)
-    )
+    new = transposed.bind([*fixed, *(cotangents[k] for k in coming)], kind)
     return replaced(results, transposed.gives, new)
 
 
@@ -251,8 +229,7 @@ def _batch(operands, dims, *, program, kind, plain):
     if size <= MAX_ENTRIES["step"] and all(d is None for d in dims[:fixed]):
         # As for a Jacobian. Each on its own: in a program for all of them single numbers meet
         # arrays, and XLA would compute the former anew for every use.
-        moves = [d is not None for d in dims]
-        moving = [k for k, is_one in enumerate(moves) if is_one]
+        moving = [k for k, d in enumerate(dims) if d is not None]
 
         def one_by_one(*operands):
             def one(some):
@@ -261,23 +238,13 @@ def _batch(operands, dims, *, program, kind, plain):
 
             return lax.map(one, [jnp.moveaxis(operands[k], dims[k], 0) for k in moving])
 
-        if is_as_it_was(program, kind, plain) and all(reached(program.jaxpr, moves)):
-            # All at once, as it was. In a batch it is still scalarised, and then one by one.
-            outs = operation_p.bind(
-                *operands,
-                program=program_of(one_by_one, *operands),
-                kind=kind._replace(is_mapped=True),
-                plain=_batched(program, plain, tuple(dims), size)[1],
-            )
-        else:
-            outs = one_by_one(*operands)
+        outs = one_by_one(*operands)
         out_dims = [0] * len(outs)
     else:
         is_long = sum(map(num_operations, program.jaxpr.eqns)) > FUNCTION
-        if is_long and kind.place == "step" and not kind.linear:
+        if is_long and not kind.linear:
             # Single numbers, as the time of a step, that XLA would compute anew in each of its
-            # functions: 100 ms for a step of a thousand bodies with `RKMK8`. In our own loop they
-            # come with the carry or are the same in every turn.
+            # functions: 100 ms for a step of a thousand bodies with `RKMK8`.
             single = [k for k, x in enumerate(operands) if dims[k] is None and is_inexact(x)]
             new = materialised([operands[k] for k in single]) if single else []
             operands = replaced(operands, single, new)

@@ -52,7 +52,11 @@ def program_of(fun: Callable[..., Sequence[Array]], *structs: Any) -> ClosedJaxp
 
 
 def structs(atoms: Sequence[Any]) -> list[jax.ShapeDtypeStruct]:
-    return [jax.ShapeDtypeStruct(v.aval.shape, v.aval.dtype) for v in atoms]
+    return structs_of([v.aval for v in atoms])
+
+
+def structs_of(avals: Sequence[Any]) -> list[jax.ShapeDtypeStruct]:
+    return [jax.ShapeDtypeStruct(aval.shape, aval.dtype) for aval in avals]
 
 
 def variables(atoms: Iterable[Any]) -> list[Any]:

@@ -39,11 +39,18 @@ FUNCTION = 2000
 MAX_OPERATIONS = 2 * FUNCTION
 # Of the operations of a step that is compiled as one program of single numbers, with loops over
 # stages unrolled, and functions with a derivative of their own opened. Longer values of one system
-# gain nothing (compile), longer derivatives and values of a batch take too long to compile
-# (gradients, batch).
+# gain nothing in a loop that is not our own (compile).
 FLAT_VALUES = FUNCTION
-FLAT_DERIVATIVES = 2 * FUNCTION
-FLAT_BATCHES = 9 * FUNCTION // 2
+# Longer derivatives of one system take too long to compile for a few steps (compile, gradients).
+# What is compiled in spite of that, as many steps are to follow or it is a batch, is cut where a
+# turn of a loop over stages begins and ends (gradients, batch).
+FLAT_DERIVATIVES = 3 * FUNCTION
+FLAT_DERIVATIVES_IN_BATCHES = 5 * FUNCTION // 2
+# Of batches, and of what is made for many steps. A gradient of this length takes some 10 s to
+# compile (gradients, batch).
+FLAT_MANY = 7 * FUNCTION
+# Of a derivative that is differentiated again, and of that. (fits, gradients)
+FLAT_SECOND = 2 * FUNCTION
 # Of these what is longer is cut where a method says.
 FLAT_WHOLE = 2 * FUNCTION
 # What two functions need, XLA computes in both. In long programs it then computes single operations
@@ -51,14 +58,8 @@ FLAT_WHOLE = 2 * FUNCTION
 # on, counted as they are written, within diffrax's loop from 4000, in batches from 5000, and in
 # second ones earlier. So many are compiled as they are, for values, first and second derivatives;
 # longer ones in groups, though to materialise what these share takes time. (gradients, fits)
-WHOLE = {
-    "loop": (math.inf, 3 * FUNCTION, 3 * FUNCTION // 2),
-    "step": (math.inf, 7 * FUNCTION // 4, 3 * FUNCTION // 2),
-}
+WHOLE = (math.inf, 7 * FUNCTION // 4, 3 * FUNCTION // 2)
 WHOLE_IN_BATCHES = (math.inf, 9 * FUNCTION // 4, 3 * FUNCTION // 2)
-# Of a derivative in forward mode in our own loop, outside of batches. A longer one is that of the
-# step as it was: with `CF54` on a rigid body that has 3096 instructions, and this 11 563. (compile)
-FORWARD = 9 * FUNCTION // 4
 
 # Of the numbers of a point. If a loop over stages is differentiated, it keeps the points of all
 # stages for each of its turns, which is too much memory for larger ones; and unrolled, XLA keeps

@@ -16,7 +16,7 @@ from jaxtyping import Array, PyTree
 from .jaxprs import altered, replaced, without_dead_code
 from .limits import MAX_RESULTS, MAX_RESULTS_IN_BATCHES, MAX_SIZE
 from .pack import pack, sharding, unpack
-from .scope import has_rows, is_on, is_short, where
+from .scope import has_rows, is_on, is_rewritten, is_short
 
 
 def materialised(
@@ -45,11 +45,11 @@ def materialised_if_long(tree: PyTree) -> PyTree:
     return _once(tree, in_batches=True, is_cut=True)
 
 
-def materialised_together(tree: PyTree, alone: bool) -> PyTree:
+def materialised_together(tree: PyTree) -> PyTree:
     """The same arrays, all of which are used several times in what follows.
 
-    Otherwise each use would compute the step anew: in a batch, in our own loop, and if `alone` also
-    outside of these. They go together, as what one is made of others may be made of too.
+    Otherwise each use would compute the step anew. They go together, as what one is made of others
+    may be made of too.
     """
     leaves, structure = jtu.tree_flatten(tree)
     groups: list[list[Array]] = [[]]
@@ -57,10 +57,7 @@ def materialised_together(tree: PyTree, alone: bool) -> PyTree:
         if groups[-1] and sum(map(np.size, (*groups[-1], x))) > MAX_RESULTS:
             groups.append([])
         groups[-1].append(x)
-    alone = alone or where() == "loop"
-    return structure.unflatten(
-        x for group in groups for x in _once(group, in_batches=True, alone=alone)
-    )
+    return structure.unflatten(x for group in groups for x in _once(group, in_batches=True))
 
 
 def materialised_in_rows(tree: PyTree, alone: bool = False) -> PyTree:
@@ -70,7 +67,7 @@ def materialised_in_rows(tree: PyTree, alone: bool = False) -> PyTree:
     a program that is not rewritten, as it stands: in a long chain of flows XLA computes each again
     for all that follow.
     """
-    is_plain = alone and is_on() and not where()
+    is_plain = alone and is_on() and not is_rewritten()
     if not (has_rows() or is_plain):
         return tree
     leaves, structure = jtu.tree_flatten(tree)
@@ -83,7 +80,7 @@ def materialised_in_rows(tree: PyTree, alone: bool = False) -> PyTree:
 
 
 def _once(tree: PyTree, **options: bool) -> PyTree:
-    if not where():
+    if not is_rewritten():
         return tree
     leaves, structure = jtu.tree_flatten(tree)
     places = [k for k, x in enumerate(leaves) if is_short(x)]

@@ -263,15 +263,45 @@ def _by_jax(eqn: JaxprEqn, values: Sequence[Any]) -> list[Any] | None:
         is_clipped = params["mode"] == lax.GatherScatterMode.CLIP
         mode = lax.GatherScatterMode.CLIP if is_clipped else lax.GatherScatterMode.FILL_OR_DROP
         params = params | {"fill_value": -1, "mode": mode}
-    with jax.ensure_compile_time_eval():
-        arrays = list(map(jnp.asarray, operands))
-        if eqn.primitive.name == "scatter":
-            outs = _scatter(arrays, params)
-        else:
-            outs = np.asarray(eqn.primitive.bind(*arrays, **params))
+    outs = _outs(eqn.primitive.name, operands, params)
     if not (0 <= outs.min() and outs.max() < len(entries)):
         return None
     return [entries[k] for k in outs.flat]
+
+
+def _outs(name: str, operands: list[Any], params: dict[str, Any]) -> np.ndarray:
+    """The result. JAX would compile a program for each, which takes longer than the step."""
+    x = operands[0]
+    if name == "pad":
+        return _pad(x, operands[1], params["padding_config"])
+    if name in ("dynamic_slice", "dynamic_update_slice"):
+        is_update = name == "dynamic_update_slice"
+        sizes = operands[1].shape if is_update else params["slice_sizes"]
+        starts = operands[2 if is_update else 1 :]
+        given = zip(x.shape, starts, sizes, strict=True)
+        firsts = [min(max(int(k), 0), n - size) for n, k, size in given]
+        window = tuple(slice(k, k + size) for k, size in zip(firsts, sizes, strict=True))
+        if not is_update:
+            return x[window]
+        outs = x.copy()
+        outs[window] = operands[1]
+        return outs
+    with jax.ensure_compile_time_eval():
+        arrays = list(map(jnp.asarray, operands))
+        if name == "scatter":
+            return _scatter(arrays, params)
+        return np.asarray(lax.gather_p.bind(*arrays, **params))
+
+
+def _pad(x: np.ndarray, fill: Any, config: Sequence[tuple[int, int, int]]) -> np.ndarray:
+    """As `lax.pad`: fills between entries, then puts more before and after, or takes away."""
+    shape = [n + max(n - 1, 0) * inner for n, (_, _, inner) in zip(x.shape, config, strict=True)]
+    spaced = np.full(shape, fill, x.dtype)
+    spaced[tuple(slice(None, None, inner + 1) for _, _, inner in config)] = x
+    more = [(max(low, 0), max(high, 0)) for low, high, _ in config]
+    outs = np.pad(spaced, more, constant_values=fill)
+    less = zip(outs.shape, config, strict=True)
+    return outs[tuple(slice(max(-low, 0), n - max(-high, 0)) for n, (low, high, _) in less)]
 
 
 def _scatter(operands: Sequence[Array], params: dict[str, Any]) -> np.ndarray:

@@ -6,8 +6,7 @@ between which few values are on their way, and its derivatives are sequences of 
 pieces. What is too long for one of XLA's functions is compiled as several, which materialise
 these values.
 
-A derivative that would take too long to compile is JAX's own of the program as it was before it was
-scalarised (`Plain`), and so is a long one in forward mode (`is_as_it_was`).
+A second derivative is JAX's own of the program as it was before it was scalarised (`Plain`).
 """
 
 import functools
@@ -24,7 +23,7 @@ from jax.extend.core import ClosedJaxpr, Jaxpr, jaxpr_as_fun
 from jax.interpreters import mlir
 from jaxtyping import PyTree
 
-from .derivatives import Kind, Plain, is_as_it_was
+from .derivatives import Kind, Plain
 from .jaxprs import (
     CALLS,
     altered,
@@ -44,7 +43,6 @@ from .jaxprs import (
 )
 from .limits import FUNCTION, MAX_RESULTS_IN_BATCHES, WHOLE, WHOLE_IN_BATCHES
 from .materialise import materialised, not_materialised
-from .scope import Place
 
 _GROUP = FUNCTION // 2
 # A derivative has up to five times the operations, and should fit.
@@ -54,16 +52,14 @@ _PIECE = FUNCTION // 8
 def operation(
     fun: Callable[..., PyTree],
     *args: PyTree,
-    place: Place,
     is_batch: bool = False,
     plain: Callable[..., PyTree] | None = None,
-    order: int = 1,
 ) -> PyTree:
     """`fun(*args)`, as one operation, of a batch if it is one already.
 
     `fun` may close over traced values, and has no effects. Reverse mode keeps the arguments and
     computes everything again, as with `jax.checkpoint`. `plain` is the same function before it was
-    scalarised, and closes over nothing that is traced: derivatives beyond `order` are of that.
+    scalarised, and closes over nothing that is traced: derivatives beyond the first are of that.
     """
     leaves, structure = jtu.tree_flatten(args)
     leaves = list(map(jnp.asarray, leaves))
@@ -86,7 +82,7 @@ def operation(
     exact, takes = narrowed(ClosedJaxpr(code, []), whole)
     outs = replaced(outs, whole, jaxpr_as_fun(exact)(*(operands[k] for k in takes)))
 
-    kind = Kind(place, is_batch=is_batch, last=order)
+    kind = Kind(is_batch=is_batch)
     code = without_dead_code(altered(code, outvars=[code.outvars[k] for k in smooth]))
     program, ends = ClosedJaxpr(code, []), _places(code)
     if len(ends) > 2:
@@ -134,10 +130,8 @@ def _places(jaxpr: Jaxpr) -> list[int]:
 
 @operation_p.def_impl
 def _run(*operands, program, kind, plain):
-    if is_as_it_was(program, kind, plain):
-        return jaxpr_as_fun(plain.program)(*operands)
     order = min(kind.order, 2)
-    most = WHOLE[kind.place][order]
+    most = WHOLE[order]
     if kind.is_batch:
         most = min(most, WHOLE_IN_BATCHES[order])
     ends = _groups(program.jaxpr, most)

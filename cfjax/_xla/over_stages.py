@@ -11,7 +11,7 @@ from jax.extend.core import ClosedJaxpr, JaxprEqn, Primitive
 from jax.interpreters import mlir
 from jaxtyping import Array, PyTree
 
-from .scope import is_unrolled, where
+from .scope import has_rows, is_rewritten
 from .understood import STAGES
 
 
@@ -37,9 +37,9 @@ def computed_again(value: PyTree, compute: Callable[[], PyTree]) -> PyTree:
 
     There XLA computes anew, for each entry of the value, all that the value is made of.
     """
-    if is_unrolled():
+    if has_rows():
         return compute()
-    return chosen(on_numbers_p.bind(), compute, lambda: value) if where() else value
+    return chosen(on_numbers_p.bind(), compute, lambda: value) if is_rewritten() else value
 
 
 # Whether this is evaluated on single numbers.

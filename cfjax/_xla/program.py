@@ -25,9 +25,17 @@ from jax.extend.core import (
 )
 from jaxtyping import Array, PyTree
 
-from .jaxprs import called, evaluate, without_constants, without_dead_code
+from .jaxprs import (
+    altered,
+    called,
+    evaluate,
+    flattened,
+    replaced,
+    without_constants,
+    without_dead_code,
+)
 from .limits import (
-    FLAT_BATCHES,
+    FLAT_MANY,
     FLAT_WHOLE,
     FUNCTION,
     MAX_ENTRIES,
@@ -39,7 +47,6 @@ from .materialise import materialised, materialised_p
 from .over_stages import Loop, on_numbers_p
 from .rules import on_entries
 from .scope import (
-    Place,
     is_numeric,
     is_on,
     is_rows,
@@ -59,6 +66,7 @@ from .struct_of_arrays import (
     literal,
     struct_of_arrays,
 )
+from .turns import is_table, parts_of
 from .understood import MOVES, REDUCTIONS, is_in_place, is_readable
 
 # What is longer is read once more, with its stages in a loop.
@@ -148,7 +156,7 @@ class Reading(NamedTuple):
             first, moving = filled(consts, parameters), jtu.tree_leaves(y, is_leaf=_is_apart)
             fixed = [True] * len(first) + [False] * len(moving)
             is_long = self.length > FUNCTION
-            form = _Form(self.rows, is_long, has_reciprocals(self.code, fixed), _CALLS)
+            form = _Form(self.rows, is_long, False, has_reciprocals(self.code, fixed), _CALLS, {})
             outs, _ = _evaluate(self.code, (*first, *moving), fixed, form)
             # What is known before the program runs may come out as NumPy's.
             outs = [x if _is_apart(x) else jnp.asarray(x) for x in outs]
@@ -163,28 +171,33 @@ class Reading(NamedTuple):
         return made, out
 
 
-def read(fun: Callable[[PyTree], PyTree], y: PyTree, place: Place) -> Reading | None:
-    """The program of `fun` at `y`; None if it does not pay or cannot be scalarised.
+def read(
+    fun: Callable[[PyTree], PyTree],
+    y: PyTree,
+    most: int = MAX_ENTRIES["step"],
+) -> Reading | None:
+    """The program of `fun` at `y`, which has at most so many entries.
 
-    It must have no effects and be readable (`is_readable`).
+    None if it does not pay or cannot be scalarised. It must have no effects and be readable
+    (`is_readable`).
     """
-    rows = _has_rows(y, MAX_ENTRIES[place])
-    if not is_on() or not (rows or _is_small_state(y, MAX_ENTRIES[place])):
+    rows = _has_rows(y, most)
+    if not is_on() or not (rows or _is_small_state(y, most)):
         return None
-    with within(place, rows):
+    with within(rows):
         jaxpr, shape = jax.make_jaxpr(fun, return_shape=True)(y)
     try:
         code = without_dead_code(jaxpr.jaxpr)
         if jaxpr.effects or not is_readable(code):
             return None
         num_operations = operations(code)
-        if place == "loop" or rows:
+        if rows:
             is_short = num_operations <= MAX_OPERATIONS
         else:
             # All of it, or each turn of a loop over stages.
             scans = (eqn for eqn in code.eqns if eqn.primitive.name == "scan")
             loops = [eqn.params["jaxpr"].jaxpr for eqn in scans]
-            is_short = min(map(length, (code, *loops))) <= FLAT_BATCHES
+            is_short = min(map(length, (code, *loops))) <= FLAT_MANY
         if not is_short:
             return None
     except Exception as error:
@@ -192,22 +205,11 @@ def read(fun: Callable[[PyTree], PyTree], y: PyTree, place: Place) -> Reading | 
     return Reading(code, jaxpr.consts, shape, rows, num_operations)
 
 
-def trace(fun: Callable[[PyTree], PyTree], y: PyTree, place: Place) -> Program | None:
-    """`fun` as a program that is scalarised at `y`; None if that does not pay or cannot be done."""
-    reading = read(fun, y, place)
-    return None if reading is None else traced(fun, y, reading, place)
-
-
-def traced(
-    fun: Callable[[PyTree], PyTree],
-    y: PyTree,
-    reading: Reading,
-    place: Place,
-) -> Program | None:
+def traced(fun: Callable[[PyTree], PyTree], y: PyTree, reading: Reading) -> Program | None:
     """`fun`, which has been read, as a program that is scalarised; None if that cannot be done."""
     structure, rows = jtu.tree_structure(reading.shape), reading.rows
     before = ClosedJaxpr(reading.code, reading.consts)
-    if place == "loop" or reading.length > _SHORT:
+    if reading.length > _SHORT:
         # Where a step is not scalarised its stages may be one loop.
         with rewriting(False):
             rolled, shape = jax.make_jaxpr(fun, return_shape=True)(y)
@@ -230,15 +232,24 @@ def traced(
     return Program(run, plain, parameters, rows)
 
 
-def on_numbers(program: ClosedJaxpr, fixed: Sequence[bool], operands: Sequence[Any]) -> list[Any]:
-    """The results of a program that is not differentiated any more, apart.
+def on_numbers(
+    program: ClosedJaxpr,
+    fixed: Sequence[bool],
+    operands: Sequence[Any],
+    is_last: bool = True,
+    is_cut: bool = False,
+) -> list[Any]:
+    """The results of a program, apart. So are its operands.
 
-    So are its operands. `fixed` says which of them are the same in every step.
+    `fixed` says which of them are the same in every step, and `is_last` whether nothing is
+    differentiated any more. With `is_cut` each turn of a loop is a piece that reverse mode computes
+    again.
     """
     jaxpr, consts = program.jaxpr, list(map(_constant, program.consts))
     flags = [*[True] * len(consts), *fixed]
     is_long = length(jaxpr) > FLAT_WHOLE
-    form = _Form(False, is_long, has_reciprocals(jaxpr, flags), _LAST_CALLS)
+    calls = _LAST_CALLS if is_last else _CALLS
+    form = _Form(False, is_long, is_cut, has_reciprocals(jaxpr, flags), calls, {})
     outs, _ = _evaluate(jaxpr, (*consts, *operands), flags, form)
     # What is known before the program runs may come out as NumPy's.
     return [x if _is_apart(x) else jnp.asarray(x) for x in outs]
@@ -357,14 +368,17 @@ def _entries(shape: tuple[int, ...]) -> int:
 class _Form(NamedTuple):
     """How a program is scalarised.
 
-    Whether arrays have leading axes, the program is long, and products with reciprocals take the
-    place of divisions by what is fixed; which calls are a part of it, and under which parameter.
+    Whether arrays have leading axes, the program is long, is cut into pieces, and products with
+    reciprocals take the place of divisions by what is fixed; which calls are a part of it, and
+    under which parameter; and its literals, each of which is made once.
     """
 
     rows: bool
     is_long: bool
+    is_cut: bool
     has_reciprocals: bool
     calls: dict[str, str]
+    literals: dict[Any, Any]
 
 
 def _evaluate(
@@ -378,7 +392,12 @@ def _evaluate(
     loose: set[Any] = set()
 
     def read(v: Any) -> Any:
-        return literal(v) if isinstance(v, Literal) else env[v]
+        if not isinstance(v, Literal):
+            return env[v]
+        key = np.asarray(v.val).tobytes(), v.aval.dtype
+        if key not in form.literals:
+            form.literals[key] = literal(v)
+        return form.literals[key]
 
     def is_fixed(v: Any) -> bool:
         return isinstance(v, Literal) or v not in loose
@@ -446,11 +465,76 @@ def _unrolled(
     outs_fixed: list[bool] = []
     for k in loop.turns:
         turn = [_entry(x, k) for x in values[m:]]
-        outs, outs_fixed = _evaluate_inner(loop.body, [*values[:n], *carry, *turn], flags, form)
+        given = [*values[:n], *carry, *turn]
+        run = _in_parts if form.is_cut else _evaluate_inner
+        outs, outs_fixed = run(loop.body, given, flags, form)
         carry, rows[k] = outs[: m - n], outs[m - n :]
     stacks = map(_stacked, zip(*(rows[k] for k in range(loop.length)), strict=True))
     # It is the same in every turn.
     return [*carry, *stacks], [*[False] * len(carry), *outs_fixed[m - n :]]
+
+
+def _in_parts(
+    program: ClosedJaxpr, values: Sequence[Any], fixed: Sequence[bool], form: _Form
+) -> tuple[list[Any], list[bool]]:
+    """A turn, of which reverse mode keeps what goes in and comes out, and computes the rest again.
+
+    These are materialised, so that what XLA computes at once is about one turn.
+    """
+    program = flattened(program, ("jit", "pjit"))
+    jaxpr, consts = program.jaxpr, list(map(_constant, program.consts))
+    names = (*jaxpr.constvars, *jaxpr.invars)
+    code = altered(jaxpr, constvars=[], invars=list(names))
+    env = dict(zip(names, (*consts, *values), strict=True))
+    flags = dict(zip(names, (*[True] * len(consts), *fixed), strict=True))
+    start, core, end = parts_of(code)
+    for part in (start, core, end):
+        given, are_fixed = [env[v] for v in part.invars], [flags[v] for v in part.invars]
+        if part is core:
+            given = _in_memory(given)
+            outs, outs_fixed = _again(part, given, are_fixed, form)
+        else:
+            outs, outs_fixed = _evaluate(part, given, are_fixed, form)
+        if part is core:
+            outs = [
+                x if is_one or is_table(v) else _in_memory(x)
+                for v, x, is_one in zip(part.outvars, outs, outs_fixed, strict=True)
+            ]
+        env.update(zip(part.outvars, outs, strict=True))
+        flags.update(zip(part.outvars, outs_fixed, strict=True))
+    outs = [literal(v) if isinstance(v, Literal) else env[v] for v in jaxpr.outvars]
+    return outs, [isinstance(v, Literal) or flags[v] for v in jaxpr.outvars]
+
+
+def _in_memory(tree: Any) -> Any:
+    """The same, with all single numbers materialised together."""
+    leaves, structure = jtu.tree_flatten(tree)
+    is_number = lambda x: isinstance(x, Tracer) and is_inexact(x) and x.ndim == 0  # noqa: E731
+    places = [k for k, x in enumerate(leaves) if is_number(x)]
+    new = materialised([leaves[k] for k in places], in_batches=True) if places else []
+    return structure.unflatten(replaced(leaves, places, new))
+
+
+def _again(
+    jaxpr: Jaxpr, values: Sequence[Any], fixed: Sequence[bool], form: _Form
+) -> tuple[list[Any], list[bool]]:
+    """What a program makes of values, which reverse mode computes again."""
+    leaves, structure = jtu.tree_flatten(list(values))
+    places = [k for k, x in enumerate(leaves) if isinstance(x, Tracer)]
+    known: Any = None
+
+    def run(some: list[Any]) -> list[Any]:
+        nonlocal known
+        given = structure.unflatten(replaced(leaves, places, some))
+        outs, outs_fixed = _evaluate(jaxpr, given, fixed, form._replace(literals={}))
+        made, shape = jtu.tree_flatten(outs)
+        moving = [k for k, x in enumerate(made) if isinstance(x, Tracer)]
+        known = [None if k in moving else x for k, x in enumerate(made)], moving, shape, outs_fixed
+        return [made[k] for k in moving]
+
+    new = jax.checkpoint(run)([leaves[k] for k in places])
+    made, moving, shape, outs_fixed = known
+    return shape.unflatten(replaced(made, moving, new)), outs_fixed
 
 
 def _entry(x: Any, k: int) -> Any:

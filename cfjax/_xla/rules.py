@@ -1,6 +1,6 @@
 """The rules: what operations make of numbers and structs of arrays."""
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Hashable, Sequence
 from typing import Any
 
 import jax
@@ -8,7 +8,7 @@ import numpy as np
 from jax.extend.core import Jaxpr, JaxprEqn
 
 from . import arithmetic, moves
-from .jaxprs import evaluate
+from .jaxprs import evaluate, parameters
 from .limits import MAX_SIZE
 from .scope import is_numeric
 from .struct_of_arrays import Call, StructOfArrays, is_inexact, is_whole, known
@@ -63,8 +63,7 @@ def on_entries(
         constants = list(map(known, values))
         is_known = not any(x is None for x in constants) and not any(map(is_inexact, outs))
         if is_known and not eqn.effects:
-            with jax.ensure_compile_time_eval():
-                return list(map(np.asarray, evaluate(jaxpr, eqn, constants)))
+            return _of_known(jaxpr, eqn, constants)
         if any(aval.size > MAX_SIZE for aval in outs) or any(map(is_whole, values)):
             return None
     if eqn.effects or not is_understood(eqn) or any(aval.size == 0 for aval in avals):
@@ -76,3 +75,21 @@ def on_entries(
     results = results if isinstance(results, list) else [results]
     # Without axes it is a number.
     return [x if x.shape else x.entries[0] for x in results]
+
+
+# What an operation makes of what is known. A loop over stages asks for the same in each turn, and
+# JAX takes longer to answer than the rest of the turn.
+_found: dict[Hashable, list[np.ndarray]] = {}
+_MOST_FOUND = 2048
+
+
+def _of_known(jaxpr: Jaxpr, eqn: JaxprEqn, constants: Sequence[np.ndarray]) -> list[np.ndarray]:
+    given = tuple((x.tobytes(), x.dtype, x.shape) for x in constants)
+    key = eqn.primitive, parameters(eqn), given
+    if key not in _found:
+        with jax.ensure_compile_time_eval():
+            outs = list(map(np.asarray, evaluate(jaxpr, eqn, constants)))
+        if len(_found) >= _MOST_FOUND:
+            _found.clear()
+        _found[key] = outs
+    return _found[key]

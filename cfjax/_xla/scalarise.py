@@ -11,7 +11,7 @@ from jaxtyping import PyTree
 from .materialise import materialised
 from .operation import operation
 from .program import join, read, split, traced
-from .scope import where
+from .scope import is_rewritten
 from .step import step
 from .struct_of_arrays import StructOfArrays
 
@@ -27,12 +27,12 @@ def scalarised(
     function returns a pair, of which mostly the first part alone is used. With `in_batches` values
     of one system and derivatives are left as they are.
     """
-    reading = None if where() else read(fun, y, "step")
+    reading = None if is_rewritten() else read(fun, y)
     if reading is None:
         return fun(y)
     if not reading.rows:
         return step(reading, y, is_pair, in_batches)
-    program = traced(fun, y, reading, "step")
+    program = traced(fun, y, reading)
     if program is None:
         return fun(y)
     y, parameters = split((y, program.parameters), program.rows)
@@ -40,7 +40,6 @@ def scalarised(
     out = operation(
         program.run,
         *_materialised((y, parameters)),
-        place="step",
         is_batch=program.rows,
         plain=program.plain,
     )

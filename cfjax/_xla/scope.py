@@ -3,7 +3,7 @@
 import contextlib
 import os
 import warnings
-from typing import Any, Literal, NamedTuple
+from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -67,13 +67,10 @@ def unread(error: Exception) -> None:
     )
 
 
-Place = Literal["step", "loop"]
-
-
 class _Around(NamedTuple):
     """What is scalarised around a function that is being traced."""
 
-    place: Place | None = None
+    is_step: bool = False
     has_rows: bool = False
 
 
@@ -82,17 +79,12 @@ class _Around(NamedTuple):
 _around = jax.make_user_context(_Around())
 
 
-def within(place: Place, rows: bool) -> contextlib.AbstractContextManager:
-    """The time in which a program is traced that is to be scalarised as a whole.
+def within(rows: bool) -> contextlib.AbstractContextManager:
+    """The time in which the program of a step is traced that is to be scalarised.
 
     With `rows` its state has short vectors along leading axes.
     """
-    return _around(_around.value._replace(place=place, has_rows=rows))
-
-
-def where() -> Place | None:
-    """What is scalarised around here: one step, or a loop of many."""
-    return _around.value.place
+    return _around(_Around(True, rows))
 
 
 def has_rows() -> bool:
@@ -102,12 +94,7 @@ def has_rows() -> bool:
 
 def is_rewritten() -> bool:
     """Whether this is part of a program that is scalarised."""
-    return where() is not None
-
-
-def is_unrolled() -> bool:
-    """Whether this is part of a program that must have no loop within."""
-    return where() == "loop" or has_rows()
+    return _around.value.is_step
 
 
 def is_short(x: Any) -> bool:

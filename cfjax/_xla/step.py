@@ -4,6 +4,10 @@ The operation holds its program as it was traced: of whole arrays, and of one me
 Its derivatives, transposes and batches are JAX's own, of that program, and are the same operation
 again. So where it is lowered all is known that decides how it is compiled: how long this very
 program is, and what it is a batch of.
+
+A derivative also holds what it is derived from (`Of`). On single numbers it is JAX's derivative of
+the numbers, which knows what is zero; in the derivative of a loop over stages zeros are numbers as
+others are, and the program is up to twice as long.
 """
 
 import functools
@@ -17,7 +21,7 @@ from jax import lax
 from jax.core import ShapedArray
 from jax.extend.core import ClosedJaxpr, JaxprEqn, Primitive, jaxpr_as_fun
 from jax.interpreters import ad, batching, mlir
-from jaxtyping import PyTree
+from jaxtyping import Array, PyTree
 
 from .derivatives import once_for_each_program
 from .jaxprs import (
@@ -30,10 +34,13 @@ from .jaxprs import (
     reached,
     replaced,
     structs,
+    structs_of,
 )
 from .limits import (
-    FLAT_BATCHES,
     FLAT_DERIVATIVES,
+    FLAT_DERIVATIVES_IN_BATCHES,
+    FLAT_MANY,
+    FLAT_SECOND,
     FLAT_VALUES,
     FLAT_WHOLE,
     MAX_ENTRIES,
@@ -49,18 +56,29 @@ from .turns import by_turns
 # the step closes over, and `first` how many of its results are mostly used alone. A derivative is
 # linear in its last operands, `linear` of them, and a tangent knows what it is the tangent `of`.
 # With `once` its results are materialised together, as what needs several of them would compute it
-# anew for each. Values of one system that are longer than `alone` are not scalarised; if that is
-# zero, no derivatives are, either.
+# anew for each. `most` says how long values and derivatives of one system may be, to be scalarised
+# as a whole.
 step_p = Primitive("cfjax_step")
 step_p.multiple_results = True
 
 
 class Of(NamedTuple):
-    """What a program is the tangent of: some results of another along some of its operands."""
+    """What a program is derived from and how, and for which operands and results of that."""
 
+    derive: "_Derive"
     program: ClosedJaxpr
+    fixed: tuple[bool, ...]
+    of: "Of | None"
     moving: tuple[int, ...]
     smooth: tuple[int, ...]
+
+    def derived(self) -> ClosedJaxpr:
+        return _derived(self.program, self.derive, self.moving, self.smooth)
+
+
+# The limits for a step of many, and for any other.
+_MANY = FLAT_MANY, FLAT_MANY
+_USUAL = FLAT_VALUES, FLAT_DERIVATIVES
 
 
 def step(reading: Reading, y: PyTree, is_pair: bool, in_batches: bool) -> PyTree:
@@ -68,6 +86,43 @@ def step(reading: Reading, y: PyTree, is_pair: bool, in_batches: bool) -> PyTree
 
     With `is_pair` it returns a pair, of which mostly the first part alone is used. Reverse mode
     keeps `y` and what the function closes over, and computes the step again.
+    """
+    program, given = with_parameters(reading)
+    structure = jtu.tree_structure(reading.shape)
+    outs = _bound(
+        program,
+        given,
+        list(map(jnp.asarray, jtu.tree_leaves(y))),
+        len(jtu.tree_leaves(reading.shape[0])) if is_pair else structure.num_leaves,
+        (0, 0) if in_batches else _MANY if is_everywhere() else _USUAL,
+    )
+    return jtu.tree_unflatten(structure, outs)
+
+
+def one_of(
+    program: ClosedJaxpr, parameters: Sequence[Any], operands: Sequence[Any], is_many: bool
+) -> list[Any]:
+    """A step of several in one loop. If they are many, it may take longer to compile."""
+    most = _MANY if is_many else _USUAL
+    return _bound(program, parameters, operands, len(program.out_avals), most)
+
+
+def _bound(
+    program: ClosedJaxpr,
+    parameters: Sequence[Any],
+    operands: Sequence[Any],
+    first: int,
+    most: tuple[int, int],
+) -> list[Any]:
+    fixed = (*[True] * len(parameters), *[False] * len(operands))
+    params = dict(levels=(), fixed=fixed, first=first, linear=0, once=False, most=most, of=None)
+    return step_p.bind(*parameters, *operands, program=program, **params)
+
+
+def with_parameters(reading: Reading) -> tuple[ClosedJaxpr, list[Array]]:
+    """A program that has been read, as one of what it closes over too; and that.
+
+    What is known now stays within.
     """
     known, given = [], []
     for pair in zip(reading.code.constvars, reading.consts, strict=True):
@@ -78,20 +133,7 @@ def step(reading: Reading, y: PyTree, is_pair: bool, in_batches: bool) -> PyTree
         constvars=[v for v, _ in known],
         invars=[*(v for v, _ in given), *reading.code.invars],
     )
-    operands = [jnp.asarray(x) for x in (*(x for _, x in given), *jtu.tree_leaves(y))]
-    structure = jtu.tree_structure(reading.shape)
-    outs = step_p.bind(
-        *operands,
-        program=ClosedJaxpr(code, [x for _, x in known]),
-        levels=(),
-        fixed=tuple(k < len(given) for k in range(len(operands))),
-        first=len(jtu.tree_leaves(reading.shape[0])) if is_pair else structure.num_leaves,
-        linear=0,
-        once=False,
-        alone=0 if in_batches else FLAT_BATCHES if is_everywhere() else FLAT_VALUES,
-        of=None,
-    )
-    return jtu.tree_unflatten(structure, outs)
+    return ClosedJaxpr(code, [x for _, x in known]), [jnp.asarray(x) for _, x in given]
 
 
 @step_p.def_abstract_eval
@@ -110,8 +152,10 @@ def _sizes(operands: Sequence[Any], levels: Sequence[Any]) -> list[int]:
     return sizes
 
 
-def _jvp(primals, tangents, *, program, levels, fixed, alone, **params):
-    params = params | dict(levels=levels, fixed=fixed, alone=alone)
+def _jvp(primals, tangents, *, program, levels, fixed, linear, most, of, **params):
+    # Several derivatives in one loop take long to compile.
+    most = (most[0], min(most[1], FLAT_SECOND)) if linear else most
+    params = params | dict(levels=levels, fixed=fixed, linear=linear, most=most, of=of)
     outs = step_p.bind(*primals, program=program, **params)
     ways: list[Any] = [ad.Zero(jax.typeof(x).to_tangent_aval()) for x in outs]
     given = enumerate(zip(primals, tangents, strict=True))
@@ -120,26 +164,109 @@ def _jvp(primals, tangents, *, program, levels, fixed, alone, **params):
     smooth = tuple(k for k, x in enumerate(outs) if is_inexact(x) and are_reached[k])
     if not (moving and smooth):
         return outs, ways
+    of = Of(_tangent, program, fixed, of, moving, smooth)
     new = step_p.bind(
         *primals,
         *(tangents[k] for k in moving),
-        program=_tangent(program, moving, smooth),
+        program=of.derived(),
         levels=tuple((*axes, *(axes[k] for k in moving)) for axes in levels),
         fixed=(*fixed, *[False] * len(moving)),
         first=len(smooth),
         linear=len(moving),
         once=True,
-        alone=alone,
-        of=Of(program, moving, smooth),
+        most=most,
+        of=of,
     )
     return outs, replaced(ways, smooth, new)
 
 
+def _transpose(cotangents, *operands, program, levels, fixed, linear, most, of, **_):
+    unknown = tuple(k for k, x in enumerate(operands) if ad.is_undefined_primal(x))
+    coming = tuple(k for k, x in enumerate(cotangents) if type(x) is not ad.Zero)
+    results: list[Any] = [None] * len(operands)
+    if not coming:
+        return results
+    rest = [k for k in range(len(operands)) if k not in unknown]
+    first = len(operands) - linear
+    if of is not None and of.derive is _tangent and unknown[0] >= first:
+        # By `vjp` of what this is the derivative of: a loop in it has values in its carry, and is
+        # not linear.
+        moving = tuple(of.moving[k - first] for k in unknown)
+        smooth = tuple(of.smooth[k] for k in coming)
+        of = of._replace(derive=_backward, moving=moving, smooth=smooth)
+        # The other directions have no part in it.
+        rest = [k for k in rest if k < first]
+    else:
+        of = Of(_transposed, program, fixed, of, unknown, coming)
+    outs = step_p.bind(
+        *(operands[k] for k in rest),
+        *(cotangents[k] for k in coming),
+        program=of.derived(),
+        levels=tuple((*(axes[k] for k in rest), *[0] * len(coming)) for axes in levels),
+        fixed=(*(fixed[k] for k in rest), *[False] * len(coming)),
+        first=len(unknown),
+        linear=len(coming),
+        once=True,
+        most=most,
+        of=of,
+    )
+    for k, x in zip(unknown, outs, strict=True):
+        # What all members share gets the sum of their derivatives.
+        shared = tuple(n for n, axes in enumerate(reversed(levels)) if axes[k] is None)
+        results[k] = jnp.sum(x, shared) if shared else x
+    return results
+
+
+# Of a function of whole arrays, or of numbers, with the shapes of its operands; of operands that
+# move; and of results.
+_Derive = Callable[[Callable[..., Any], Sequence[Any], Sequence[int], Sequence[int]], Any]
+
+
+def _tangent(fun, shapes, moving, smooth):
+    """Of the operands, and of tangents of those that move."""
+    n = len(shapes)
+
+    def tangent(*xs):
+        some = _some(fun, xs[:n], moving, smooth)
+        return jax.jvp(some, [xs[k] for k in moving], list(xs[n:]))[1]
+
+    return tangent
+
+
+def _backward(fun, shapes, moving, smooth):
+    """Of the operands, and of cotangents of the results."""
+    n = len(shapes)
+
+    def backward(*xs):
+        some = _some(fun, xs[:n], moving, smooth)
+        return list(jax.vjp(some, *(xs[k] for k in moving))[1](list(xs[n:])))
+
+    return backward
+
+
+def _transposed(fun, shapes, moving, smooth):
+    """Of the operands in which the function is not linear, and of cotangents of the results."""
+    rest = _others(shapes, moving)
+
+    def transposed(*xs):
+        some = _some(fun, replaced(shapes, rest, xs[: len(rest)]), moving, smooth)
+        back = jax.linear_transpose(some, *(shapes[k] for k in moving))
+        return list(back(list(xs[len(rest) :])))
+
+    return transposed
+
+
+def _others(operands: Sequence[Any], moving: Sequence[int]) -> list[int]:
+    return [k for k in range(len(operands)) if k not in moving]
+
+
 def _some(
-    program: ClosedJaxpr, values: Sequence[Any], places: Sequence[int], gives: Sequence[int]
+    fun: Callable[..., Sequence[Any]],
+    values: Sequence[Any],
+    places: Sequence[int],
+    gives: Sequence[int],
 ) -> Callable[..., list[Any]]:
     """Some results as a function of some operands."""
-    fun = jaxpr_as_fun(program)
 
     def some(*xs: Any) -> list[Any]:
         outs = fun(*replaced(values, places, xs))
@@ -149,82 +276,16 @@ def _some(
 
 
 @once_for_each_program
-def _tangent(program: ClosedJaxpr, moving: tuple[int, ...], smooth: tuple[int, ...]) -> ClosedJaxpr:
-    n, avals = len(program.in_avals), program.in_avals
-
-    def tangent(*xs):
-        fun = _some(program, xs[:n], moving, smooth)
-        return jax.jvp(fun, [xs[k] for k in moving], list(xs[n:]))[1]
-
-    return program_of(tangent, *avals, *(avals[k] for k in moving))
-
-
-def _transpose(cotangents, *operands, program, levels, fixed, linear, alone, of, **_):
-    unknown = tuple(k for k, x in enumerate(operands) if ad.is_undefined_primal(x))
-    coming = tuple(k for k, x in enumerate(cotangents) if type(x) is not ad.Zero)
-    results: list[Any] = [None] * len(operands)
-    if not coming:
-        return results
-    rest = [k for k in range(len(operands)) if k not in unknown]
-    first = len(operands) - linear
-    if of is not None and unknown[0] >= first:
-        # By `vjp` of what this is the derivative of: a loop in it has values in its carry, and is
-        # not linear.
-        back = _backward(
-            of.program,
-            tuple(of.moving[k - first] for k in unknown),
-            tuple(of.smooth[k] for k in coming),
-        )
-        # The other directions have no part in it.
-        rest = [k for k in rest if k < first]
-    else:
-        back = _transposed(program, unknown, coming)
-    outs = step_p.bind(
-        *(operands[k] for k in rest),
-        *(cotangents[k] for k in coming),
-        program=back,
-        levels=tuple((*(axes[k] for k in rest), *[0] * len(coming)) for axes in levels),
-        fixed=(*(fixed[k] for k in rest), *[False] * len(coming)),
-        first=len(unknown),
-        linear=len(coming),
-        once=True,
-        alone=alone,
-        of=None,
-    )
-    for k, x in zip(unknown, outs, strict=True):
-        # What all members share gets the sum of their derivatives.
-        shared = tuple(n for n, axes in enumerate(reversed(levels)) if axes[k] is None)
-        results[k] = jnp.sum(x, shared) if shared else x
-    return results
-
-
-@once_for_each_program
-def _backward(
-    program: ClosedJaxpr, moving: tuple[int, ...], smooth: tuple[int, ...]
+def _derived(
+    program: ClosedJaxpr, derive: _Derive, moving: tuple[int, ...], smooth: tuple[int, ...]
 ) -> ClosedJaxpr:
-    n, avals = len(program.in_avals), program.in_avals
-
-    def backward(*xs):
-        fun = _some(program, xs[:n], moving, smooth)
-        return jax.vjp(fun, *(xs[k] for k in moving))[1](list(xs[n:]))
-
-    return program_of(backward, *avals, *(program.out_avals[k] for k in smooth))
-
-
-@once_for_each_program
-def _transposed(
-    program: ClosedJaxpr, unknown: tuple[int, ...], coming: tuple[int, ...]
-) -> ClosedJaxpr:
-    avals = program.in_avals
-    rest = [k for k in range(len(avals)) if k not in unknown]
-
-    def transposed(*xs):
-        known = replaced(avals, rest, xs[: len(rest)])
-        fun = _some(program, known, unknown, coming)
-        return jax.linear_transpose(fun, *(avals[k] for k in unknown))(list(xs[len(rest) :]))
-
-    cotangents = (program.out_avals[k] for k in coming)
-    return program_of(transposed, *(avals[k] for k in rest), *cotangents)
+    given, outs = program.in_avals, program.out_avals
+    fun = derive(jaxpr_as_fun(program), given, moving, smooth)
+    if derive is _tangent:
+        return program_of(fun, *given, *(given[k] for k in moving))
+    if derive is _transposed:
+        given = [given[k] for k in _others(given, moving)]
+    return program_of(fun, *given, *(outs[k] for k in smooth))
 
 
 def _batch(operands, dims, *, program, levels, **params):
@@ -244,22 +305,43 @@ def _one_of(xs):
 
 
 @step_p.def_impl
-def _run(*operands, program, levels, fixed, first, linear, once, alone, of):
+def _run(*operands, program, levels, fixed, first, linear, once, most, of):
     num_operations = length(program.jaxpr)
-    most = (FLAT_DERIVATIVES if alone else 0) if linear else FLAT_BATCHES if levels else alone
-    if num_operations > most:
-        return _as_traced(operands, program, levels, fixed, alone)
+    if num_operations > _most(levels, linear, most):
+        return _as_traced(operands, program, levels, fixed, most)
     for k, size in enumerate(reversed(_sizes(operands, levels))):
         moves = [axis is not None for axis in levels[k]]
         is_linear = linear and not any(moves[: len(moves) - linear])
         if is_linear and size <= MAX_ENTRIES["step"]:
             params = dict(fixed=fixed, first=first, linear=linear, once=once)
-            params.update(program=program, alone=alone, of=of)
+            params.update(program=program, most=most, of=of)
             return _one_by_one(operands, levels, k, params)
-    if levels and num_operations > FLAT_WHOLE:
+    # In our own loop these come with the carry, or are the same in every turn.
+    if levels and num_operations > FLAT_WHOLE and most != _MANY:
         operands = _without_single_numbers(operands, levels)
-    outs = _flat(operands, program, levels, fixed, first, once)
-    return _as_traced(operands, program, levels, fixed, alone) if outs is None else outs
+    most_at_once = FLAT_DERIVATIVES_IN_BATCHES if levels else FLAT_DERIVATIVES
+    fun = _of_numbers(program, fixed, of, num_operations > most_at_once)
+    outs = _flat(operands, fun, levels, first, once)
+    return _as_traced(operands, program, levels, fixed, most) if outs is None else outs
+
+
+def _most(levels: Sequence[Any], linear: int, most: tuple[int, int]) -> int:
+    """How long a program may be, to be scalarised as a whole."""
+    values, derivatives = most
+    if not linear:
+        return FLAT_MANY if levels else values
+    return FLAT_MANY if levels and derivatives > FLAT_SECOND else derivatives
+
+
+def _of_numbers(
+    program: ClosedJaxpr, fixed: Sequence[bool], of: Of | None, is_cut: bool, is_last: bool = True
+) -> Callable[..., list[Any]]:
+    """The program of operands that are apart. A derivative is that of the numbers."""
+    if of is None:
+        return lambda *xs: on_numbers(program, fixed, xs, is_last, is_cut and not is_last)
+    fun = _of_numbers(of.program, of.fixed, of.of, is_cut, False)
+    shapes = jax.eval_shape(split, structs_of(of.program.in_avals))
+    return of.derive(fun, shapes, of.moving, of.smooth)
 
 
 def _one_by_one(operands, levels, k, params):
@@ -280,15 +362,14 @@ def _one_by_one(operands, levels, k, params):
     return [jnp.moveaxis(x, 0, len(levels) - 1 - k) for x in outs]
 
 
-def _flat(operands, program, levels, fixed, first, once) -> list[Any] | None:
+def _flat(
+    operands: Sequence[Any],
+    fun: Callable[..., list[Any]],
+    levels: Sequence[Any],
+    first: int,
+    once: bool,
+) -> list[Any] | None:
     """The results, computed on single numbers; None if the program declines."""
-
-    def on_one(*given):
-        outs = on_numbers(program, fixed, given)
-        # More results are left to XLA, which drops what nobody uses.
-        leaves, structure = jtu.tree_flatten(outs)
-        is_few = len(leaves) <= MAX_RESULTS_IN_BATCHES
-        return structure.unflatten(together(leaves) if once and is_few else leaves)
 
     def apart(k: int) -> Any:
         axes = [(axes[k],) for axes in levels if axes[k] is not None]
@@ -296,7 +377,7 @@ def _flat(operands, program, levels, fixed, first, once) -> list[Any] | None:
 
     given = [apart(k) for k in range(len(operands))]
     try:
-        made, out = jax.make_jaxpr(_in_batches(on_one, levels), return_shape=True)(*given)
+        made, out = jax.make_jaxpr(_in_batches(fun, levels), return_shape=True)(*given)
         code = flattened(made, CALLS, is_once=True)
     except Declined:
         return None
@@ -307,6 +388,13 @@ def _flat(operands, program, levels, fixed, first, once) -> list[Any] | None:
         new = in_two(code, len(jtu.tree_leaves(out[:first])), leaves)
     else:
         new = called(code, leaves)
+    if once:
+        # But for what is known, as the derivative by what has no part in it.
+        are_made = reached(code.jaxpr, [True] * len(leaves))
+        places = [k for k, is_one in enumerate(are_made) if is_one]
+        # More results are left to XLA, which drops what nobody uses.
+        if len(places) <= MAX_RESULTS_IN_BATCHES:
+            new = replaced(new, places, together([new[k] for k in places]))
     outs = jtu.tree_unflatten(jtu.tree_structure(out), new)
     return [_in_batches(join, [(0,)] * len(levels))(x) for x in outs]
 
@@ -318,18 +406,20 @@ def whole(eqn: JaxprEqn) -> ClosedJaxpr:
     return program_of(fun, *structs(eqn.invars)) if levels else program
 
 
-def _as_traced(operands, program, levels, fixed, alone) -> list[Any]:
+def _as_traced(operands, program, levels, fixed, most) -> list[Any]:
     if levels:
         operands = _without_single_numbers(operands, levels)
-    fun = jaxpr_as_fun(by_turns(not_materialised(program), fixed, functools.partial(_turn, alone)))
+    fun = jaxpr_as_fun(by_turns(not_materialised(program), fixed, functools.partial(_turn, most)))
     # A literal comes out as NumPy's.
     return list(map(jnp.asarray, _in_batches(fun, levels)(*operands)))
 
 
-def _turn(alone: int, operands: Sequence[Any], program: ClosedJaxpr, fixed: Sequence[bool]):
+def _turn(
+    most: tuple[int, int], operands: Sequence[Any], program: ClosedJaxpr, fixed: Sequence[bool]
+):
     """A turn of a loop as an operation."""
     first = len(program.out_avals)
-    params = dict(levels=(), first=first, linear=0, once=True, alone=alone, of=None)
+    params = dict(levels=(), first=first, linear=0, once=True, most=most, of=None)
     return step_p.bind(*operands, program=program, fixed=tuple(fixed), **params)
 
 

@@ -48,10 +48,7 @@ def _by_turns(eqn: JaxprEqn, fixed: Sequence[bool], run: Run) -> JaxprEqn:
 
 def _turn(jaxpr: Jaxpr, operands: Sequence[Any], fixed: Sequence[bool], run: Run) -> Sequence[Any]:
     """The results of a turn, of which `run` computes what is not about tables."""
-    before, within, after = _apart(jaxpr)
-    end = _part(jaxpr, after, variables(jaxpr.outvars))
-    core = _part(jaxpr, within, variables((*jaxpr.outvars, *end.invars)))
-    start = _part(jaxpr, before, variables((*jaxpr.outvars, *end.invars, *core.invars)))
+    start, core, end = parts_of(jaxpr)
     values: dict[Any, Any] = dict(zip(jaxpr.invars, operands, strict=True))
     are_fixed = dict(zip(jaxpr.invars, fixed, strict=True))
     for part in (start, core, end):
@@ -63,6 +60,15 @@ def _turn(jaxpr: Jaxpr, operands: Sequence[Any], fixed: Sequence[bool], run: Run
             outs = jaxpr_as_fun(program)(*given)
         values.update(zip(part.outvars, outs, strict=True))
     return [value_of(v, values) for v in jaxpr.outvars]
+
+
+def parts_of(jaxpr: Jaxpr) -> tuple[Jaxpr, Jaxpr, Jaxpr]:
+    """What a turn reads of tables, what it makes of short vectors, and the tables of that."""
+    before, within, after = _apart(jaxpr)
+    end = _part(jaxpr, after, variables(jaxpr.outvars))
+    core = _part(jaxpr, within, variables((*jaxpr.outvars, *end.invars)))
+    start = _part(jaxpr, before, variables((*jaxpr.outvars, *end.invars, *core.invars)))
+    return start, core, end
 
 
 def _part(jaxpr: Jaxpr, eqns: Sequence[JaxprEqn], wanted: Sequence[Any]) -> Jaxpr:
@@ -79,7 +85,7 @@ def _part(jaxpr: Jaxpr, eqns: Sequence[JaxprEqn], wanted: Sequence[Any]) -> Jaxp
 def _apart(jaxpr: Jaxpr) -> tuple[list[JaxprEqn], list[JaxprEqn], list[JaxprEqn]]:
     """What reads tables, what is on short vectors, and what makes tables of that."""
     available = {*jaxpr.constvars, *jaxpr.invars}
-    tables = {v for v in jaxpr.invars if _is_table(v)}
+    tables = {v for v in jaxpr.invars if is_table(v)}
     could: list[int] = []
     needed: set[Any] = set()
     for k, eqn in enumerate(jaxpr.eqns):
@@ -91,7 +97,7 @@ def _apart(jaxpr: Jaxpr) -> tuple[list[JaxprEqn], list[JaxprEqn], list[JaxprEqn]
             available.update(eqn.outvars)
             continue
         # What is made of a short vector that comes out of a table is scalarised.
-        some = [v for v in eqn.outvars if _is_table(v)]
+        some = [v for v in eqn.outvars if is_table(v)]
         tables.update(some)
         available.update(some)
         needed.update(eqn.outvars)
@@ -104,7 +110,7 @@ def _apart(jaxpr: Jaxpr) -> tuple[list[JaxprEqn], list[JaxprEqn], list[JaxprEqn]
     inner: set[Any] = set()
     for k in reversed(range(len(jaxpr.eqns))):
         eqn = jaxpr.eqns[k]
-        has_table = any(_is_table(v) for v in (*variables(eqn.invars), *eqn.outvars))
+        has_table = any(is_table(v) for v in (*variables(eqn.invars), *eqn.outvars))
         if k in before or (has_table and inner.isdisjoint(eqn.outvars)):
             if k not in before:
                 after.add(k)
@@ -116,6 +122,6 @@ def _apart(jaxpr: Jaxpr) -> tuple[list[JaxprEqn], list[JaxprEqn], list[JaxprEqn]
     return parts[0], parts[1], parts[2]
 
 
-def _is_table(v: Any) -> bool:
+def is_table(v: Any) -> bool:
     """Whether this is an array of vectors of all stages, or of what a loop made in all turns."""
     return len(v.aval.shape) > 1 and v.aval.size > MAX_LENGTH

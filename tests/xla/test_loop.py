@@ -9,7 +9,6 @@ import jax.tree_util as jtu
 import numpy as np
 import pytest
 from jax import lax
-from jax.extend.core import jaxprs_in_params
 
 from cfjax._xla.invariant import invariant, invariants_first
 from cfjax._xla.loop import repeat
@@ -163,43 +162,6 @@ def test_only_what_is_differentiated():
         return jax.jacfwd(jax.grad(fun, 1), 0)(VECTOR, jnp.asarray(0.7)), jax.grad(fun)(VECTOR, 0.7)
 
     close(run(True), run(False), VECTOR)
-
-
-def scans(jaxpr):
-    for eqn in jaxpr.eqns:
-        if eqn.primitive.name == "scan":
-            yield eqn
-        for inner in jaxprs_in_params(eqn.params):
-            yield from scans(inner)
-
-
-def carried(loop):
-    """How many numbers a loop carries: what it collects has an axis more outside than within."""
-    pairs = zip(loop.outvars, loop.params["jaxpr"].jaxpr.outvars, strict=True)
-    return sum(out.aval.size for out, inner in pairs if out.aval.shape == inner.aval.shape)
-
-
-def test_a_derivative_does_not_carry_what_has_none(rewritten):
-    """As what a compensated sum has lost."""
-
-    def end(repeated, x):
-        def step(carry):
-            x, lost = carry
-            move = jnp.sin(x) * VECTOR + lost
-            return x + move, lax.stop_gradient(move * 1e-3 - lost)
-
-        carry = x, jnp.zeros(3)
-        if repeated:
-            carry = repeat(step, carry, NUM_STEPS)[0]
-        else:
-            carry = lax.scan(lambda c, _: (step(c), None), carry, length=NUM_STEPS)[0]
-        return jnp.sum(carry[0])
-
-    want, found = (jax.grad(lambda x, r=r: end(r, x)) for r in (False, True))
-    close(jax.jit(found)(VECTOR), jax.jit(want)(VECTOR), VECTOR)
-    loops = list(scans(jax.make_jaxpr(found)(VECTOR).jaxpr))
-    # Forward with what is lost, backward without.
-    assert list(map(carried, loops)) == [6, 3]
 
 
 def test_what_moves_only_later():

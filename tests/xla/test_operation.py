@@ -8,7 +8,6 @@ import numpy as np
 import problems
 import pytest
 
-from cfjax._xla import derivatives
 from cfjax._xla import operation as module
 from cfjax._xla.operation import operation
 from cfjax._xla.pack import pack, unpack
@@ -30,7 +29,7 @@ def plain(x, scale):
 
 
 def whole(x, scale):
-    return operation(lambda x, scale: turn(x, scale, 6), x, scale, place="step")
+    return operation(lambda x, scale: turn(x, scale, 6), x, scale)
 
 
 def size(fun):
@@ -42,7 +41,7 @@ def lengths(request, monkeypatch):
     """Compiled as they are, and in pieces."""
     if request.param == "several":
         monkeypatch.setattr(module, "_PIECE", 12)
-        monkeypatch.setattr(module, "WHOLE", {"step": (0, 0, 0)})
+        monkeypatch.setattr(module, "WHOLE", (0, 0, 0))
         monkeypatch.setattr(module, "_GROUP", 30)
 
 
@@ -89,38 +88,6 @@ def test_derivatives(inner, outer, argument):
     check(quick(second(whole))(X, SCALE), second(plain)(X, SCALE))
 
 
-def test_what_is_long_is_in_forward_mode_of_the_program_as_it_was(monkeypatch):
-    """In our own loop. Not in reverse mode, nor in batches."""
-    monkeypatch.setitem(module.WHOLE, "loop", module.WHOLE["step"])
-    monkeypatch.setattr(derivatives, "WHOLE", {"loop": (0, 0, 0)})
-
-    def marked(x, scale):
-        first, *rest = turn(x, scale, 6)
-        return [first + 0 * jnp.tan(x), *rest]
-
-    def both(x, scale):
-        run = lambda x, scale: turn(x, scale, 6)  # noqa: E731
-        return operation(run, x, scale, place="loop", plain=marked, order=2)
-
-    xs = jnp.outer(jnp.linspace(0.1, 1, 40), X)
-    for is_marked, transform, point in (
-        (True, jax.jacfwd, X),
-        (True, lambda f: lambda *args: jax.jvp(f, args, args)[1], X),
-        (False, jax.jacrev, X),
-        # Either mode has a part in these.
-        (None, lambda f: jax.jacfwd(jax.jacrev(f)), X),
-        (None, lambda f: jax.jacrev(jax.jacfwd(f)), X),
-        (False, lambda f: jax.vmap(jax.jacfwd(f), (0, None)), xs),
-        (False, lambda f: jax.vmap(jax.jacrev(jax.jacfwd(f)), (0, None)), xs),
-    ):
-        program = transform(size(both))
-        check(quick(program)(point, SCALE), transform(size(plain))(point, SCALE))
-        if is_marked is not None:
-            # The derivative of a tangent has it too.
-            text = jax.jit(program).lower(point, SCALE).as_text()
-            assert ("stablehlo.tan" in text or "chlo.tan" in text) == is_marked
-
-
 @pytest.mark.slow
 def test_third_derivatives():
     third = lambda f: jax.jacfwd(jax.jacrev(jax.grad(size(f))))  # noqa: E731
@@ -137,7 +104,7 @@ def test_derivatives_in_batches_are_cut_earlier(monkeypatch):
     check(quick(batch)(xs, SCALE), jax.vmap(jax.grad(size(plain)), (0, None))(xs, SCALE))
     # What is shared by two pieces of a batch goes through a call.
     texts = [jax.jit(fun).lower(x, SCALE).as_text() for fun, x in ((gradient, X), (batch, xs))]
-    is_cut_alone = module.WHOLE["step"][1] == 0
+    is_cut_alone = module.WHOLE[1] == 0
     assert ["inlineable" in text for text in texts] == [is_cut_alone, True]
 
 
@@ -160,13 +127,13 @@ def test_constants_that_agree_in_nine_digits_stay_apart():
         a = unpack(x)[0]
         return a * (1 / 3 + 1e-10) - a * (1 / 3)
 
-    found = quick(lambda x: operation(fun, x, place="step"))(X)
+    found = quick(lambda x: operation(fun, x))(X)
     # The rounding of two numbers of size 0.1.
     np.testing.assert_allclose(found, 1e-10 * X[0], rtol=0, atol=1e-16)
 
 
 def test_closing_over_traced_values():
-    fun = lambda scale: operation(lambda x: turn(x, scale, 6), X, place="step")[0]  # noqa: E731
+    fun = lambda scale: operation(lambda x: turn(x, scale, 6), X)[0]  # noqa: E731
     check(quick(jax.jacrev(fun))(SCALE), jax.jacfwd(lambda scale: plain(X, scale)[0])(SCALE))
 
 
@@ -195,5 +162,5 @@ def test_branches_and_loops_inside():
         return [jnp.where(y[0] > 0, y, x), jax.lax.cond(y[1] > 0, jnp.sin, jnp.cos, y)]
 
     both = lambda f: lambda x: jnp.sum(f(x)[0] * f(x)[1])  # noqa: E731
-    found = quick(jax.hessian(both(lambda x: operation(fun, x, place="step"))))(X)
+    found = quick(jax.hessian(both(lambda x: operation(fun, x))))(X)
     check(found, jax.hessian(both(fun))(X))
