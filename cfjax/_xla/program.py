@@ -394,7 +394,8 @@ def _evaluate(
     def read(v: Any) -> Any:
         if not isinstance(v, Literal):
             return env[v]
-        key = np.asarray(v.val).tobytes(), v.aval.dtype
+        aval: Any = v.aval
+        key = np.asarray(v.val).tobytes(), aval.dtype
         if key not in form.literals:
             form.literals[key] = literal(v)
         return form.literals[key]

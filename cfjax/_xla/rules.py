@@ -60,8 +60,8 @@ def on_entries(
         or any(aval.size > MAX_SIZE for aval in avals)
     )
     if not is_large:
-        constants = list(map(known, values))
-        is_known = not any(x is None for x in constants) and not any(map(is_inexact, outs))
+        constants = [x for x in map(known, values) if x is not None]
+        is_known = len(constants) == len(values) and not any(map(is_inexact, outs))
         if is_known and not eqn.effects:
             return _of_known(jaxpr, eqn, constants)
         if any(aval.size > MAX_SIZE for aval in outs) or any(map(is_whole, values)):
