@@ -395,7 +395,8 @@ def _evaluate(
         if not isinstance(v, Literal):
             return env[v]
         aval: Any = v.aval
-        key = np.asarray(v.val).tobytes(), aval.dtype
+        value = np.asarray(v.val)
+        key = value.tobytes(), value.dtype, aval.dtype
         if key not in form.literals:
             form.literals[key] = literal(v)
         return form.literals[key]

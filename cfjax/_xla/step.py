@@ -30,6 +30,7 @@ from .jaxprs import (
     called,
     flattened,
     is_inexact,
+    narrowed,
     program_of,
     reached,
     replaced,
@@ -114,9 +115,23 @@ def _bound(
     first: int,
     most: tuple[int, int],
 ) -> list[Any]:
+    given, outs = [*parameters, *operands], program.out_avals
     fixed = (*[True] * len(parameters), *[False] * len(operands))
-    params = dict(levels=(), fixed=fixed, first=first, linear=0, once=False, most=most, of=None)
-    return step_p.bind(*parameters, *operands, program=program, **params)
+    # Integers that depend on integers alone, as the number of a step, are on their own: a transpose
+    # of what is linear has their values.
+    are_made = reached(program.jaxpr, list(map(is_inexact, given)))
+    made = [k for k, x in enumerate(outs) if is_inexact(x) or are_made[k]]
+    exact = [k for k in range(len(outs)) if k not in made]
+    params = dict(levels=(), fixed=fixed, linear=0, once=False, most=most, of=None)
+    new = step_p.bind(
+        *given,
+        program=narrowed(program, made, range(len(given)))[0],
+        first=sum(k < first for k in made),
+        **params,
+    )
+    counting, takes = narrowed(program, exact)
+    known = map(jnp.asarray, jaxpr_as_fun(counting)(*(given[k] for k in takes)))
+    return replaced(replaced([None] * len(outs), made, new), exact, list(known))
 
 
 def with_parameters(reading: Reading) -> tuple[ClosedJaxpr, list[Array]]:
