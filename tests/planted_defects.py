@@ -893,6 +893,13 @@ DEFECTS = [
         "xla/test_step.py",
     ),
     Defect(
+        "_xla/program.py",
+        "np.asarray(form.calls is _LAST_CALLS)",
+        "np.asarray(True)",
+        "a derivative of a step that fails, in which zero is multiplied by NaN",
+        "solvers/test_full_turns.py -k taken_again",
+    ),
+    Defect(
         "_xla/rules.py",
         "key = eqn.primitive, parameters(eqn), given",
         "key = eqn.primitive, given",

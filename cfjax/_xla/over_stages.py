@@ -33,7 +33,7 @@ def chosen(predicate: Array, yes: Callable[[], PyTree], no: Callable[[], PyTree]
 
 
 def computed_again(value: PyTree, compute: Callable[[], PyTree]) -> PyTree:
-    """`value`, which `compute()` computes again where this is scalarised.
+    """`value`, which `compute()` computes again where this is scalarised and not differentiated.
 
     There XLA computes anew, for each entry of the value, all that the value is made of.
     """
@@ -42,7 +42,7 @@ def computed_again(value: PyTree, compute: Callable[[], PyTree]) -> PyTree:
     return chosen(on_numbers_p.bind(), compute, lambda: value) if is_rewritten() else value
 
 
-# Whether this is evaluated on single numbers.
+# Whether this is evaluated on single numbers, and not differentiated.
 on_numbers_p = Primitive("cfjax_on_numbers")
 
 

@@ -421,7 +421,9 @@ def _evaluate(
             inner = eqn.params[form.calls[name]]
             outs, outs_fixed = _evaluate_inner(inner, values, fixed, form)
         elif eqn.primitive is on_numbers_p:
-            outs = [np.asarray(True)]
+            # In a derivative, what is computed again at the end of a step that fails would be zero
+            # times NaN.
+            outs = [np.asarray(form.calls is _LAST_CALLS)]
         elif name == "scan":
             outs, outs_fixed = _unrolled(Loop.of(eqn), values, fixed, form)
         elif name == "cond":

@@ -331,8 +331,7 @@ def _run(*operands, program, levels, fixed, first, linear, once, most, of):
             params = dict(fixed=fixed, first=first, linear=linear, once=once)
             params.update(program=program, most=most, of=of)
             return _one_by_one(operands, levels, k, params)
-    # In our own loop these come with the carry, or are the same in every turn.
-    if levels and num_operations > FLAT_WHOLE and most != _MANY:
+    if levels and num_operations > FLAT_WHOLE:
         operands = _without_single_numbers(operands, levels)
     most_at_once = FLAT_DERIVATIVES_IN_BATCHES if levels else FLAT_DERIVATIVES
     fun = _of_numbers(program, fixed, of, num_operations > most_at_once)

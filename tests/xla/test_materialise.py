@@ -116,21 +116,6 @@ def test_the_time_of_a_long_step_in_a_batch_is_computed_once(rewritten):
     assert " reduce(" in program
 
 
-def test_parameters_of_a_long_step_in_our_own_loop_are_not_materialised(rewritten):
-    """They are the same in every turn, so that no function of XLA's computes them anew."""
-    given = rigid_body.problem()
-
-    def solve(y0):
-        return cfjax.integrate(
-            given["term"], cfjax.RKMK8(), 0.0, 1.0, y0, num_steps=20, args=given["args"]
-        ).ys
-
-    y0s = jnp.stack([given["y0"], -given["y0"]] * 50)
-    program = jax.jit(jax.vmap(solve)).lower(y0s).as_text()
-    # A single number is materialised by adding a zero to it.
-    assert not re.search(r"stablehlo.add across dimensions = \[0\] : \(tensor<2x\d+xf64>", program)
-
-
 @pytest.mark.parametrize("in_batches", [False, True])
 def test_in_a_batch_only_if_asked_for(in_batches):
     """There a call is what XLA does not fuse."""
