@@ -967,7 +967,7 @@ DEFECTS = [
         "None if keep is None else lambda arrays: arrays,",
         "None if keep is None else lambda arrays: [2 * arrays[0], *arrays[1:]],",
         "what is kept of each step that is not the state",
-        "xla/test_loop.py",
+        "test_integrate.py",
     ),
     Defect(
         "_xla/arithmetic.py",

@@ -118,7 +118,9 @@ def _within(value: Any) -> Any:
     if isinstance(value, Jaxpr):
         return _not_materialised(value)
     if isinstance(value, tuple) and any(isinstance(x, ClosedJaxpr) for x in value):
-        return tuple(map(_within, value))
+        new = map(_within, value)
+        # Those of a linear solve have names.
+        return value._make(new) if hasattr(value, "_make") else tuple(new)  # pyright: ignore[reportAttributeAccessIssue]
     return value
 
 

@@ -170,3 +170,14 @@ def test_what_is_seldom_used_of_a_batch_is_computed_in_parts(rewritten, has_rest
     assert program.count(" sine(") <= 36 + has_rest * (36 + 9)
     packed = [int(n) for n in re.findall(r"f64\[50,(\d+)\]", program)]
     assert max(packed) <= MAX_RESULTS_IN_BATCHES
+
+
+def test_a_linear_solve_in_a_program_that_is_left_as_it_was_traced(rewritten):
+    """Its programs have names."""
+
+    def fun(y):
+        return jnp.linalg.solve(jnp.outer(y, y) + 9 * jnp.eye(3), y)
+
+    found = jax.jit(lambda y: scalarised(fun, y, in_batches=True))(jnp.arange(3.0))
+    # The same operations.
+    np.testing.assert_allclose(found, fun(jnp.arange(3.0)), rtol=1e-15)
