@@ -964,8 +964,8 @@ DEFECTS = [
     ),
     Defect(
         "_xla/loop.py",
-        "None if keep is None else lambda arrays: arrays,",
-        "None if keep is None else lambda arrays: [2 * arrays[0], *arrays[1:]],",
+        "keeps = None if keep is None else lambda carried: carried",
+        "keeps = None if keep is None else lambda carried: [2 * carried[0], *carried[1:]]",
         "what is kept of each step that is not the state",
         "test_integrate.py",
     ),

@@ -46,7 +46,7 @@ def by_turns(
 ) -> tuple[PyTree, list[PyTree]]:
     """What `jax.lax.scan` makes of some turns, with the outputs of each; most in one loop.
 
-    A loop of steps that is rewritten as a whole must have no loop within. So two turns are unrolled
+    A step with leading axes that is rewritten must have no loop within. So two turns are unrolled
     there; more would be too long, and then each turn is rewritten instead.
     """
     if len(turns) == 1 or (len(turns) == 2 and has_rows()):

@@ -27,13 +27,10 @@ from .materialise import materialised
 
 
 class Kind(NamedTuple):
-    """How many of the last operands it is linear in, which derivative it is, and whether it is of a
-    batch.
-    """
+    """How many of the last operands it is linear in, and which derivative it is."""
 
     linear: int = 0
     order: int = 0
-    is_batch: bool = False
 
 
 class Plain:
@@ -249,7 +246,6 @@ def _batch(operands, dims, *, program, kind, plain):
             new = materialised([operands[k] for k in single]) if single else []
             operands = replaced(operands, single, new)
         batched, plain, out_dims = _batched(program, plain, tuple(dims), size)
-        kind = kind._replace(is_batch=True)
         outs = operation_p.bind(*operands, program=batched, kind=kind, plain=plain)
     return outs, out_dims
 

@@ -54,12 +54,11 @@ FLAT_SECOND = 2 * FUNCTION
 # Of these what is longer is cut where a method says.
 FLAT_WHOLE = 2 * FUNCTION
 # What two functions need, XLA computes in both. In long programs it then computes single operations
-# exponentially often: in values never as measured, in first derivatives from some 8000 operations
-# on, counted as they are written, within diffrax's loop from 4000, in batches from 5000, and in
-# second ones earlier. So many are compiled as they are, for values, first and second derivatives;
-# longer ones in groups, though to materialise what these share takes time. (gradients, fits)
+# exponentially often: in values never as measured, in derivatives from some 4000 operations on, and
+# in second ones earlier. On leading axes so many are compiled as they are, for values, first and
+# second derivatives; longer ones in groups, though to materialise what these share takes time.
+# (leading_axes)
 WHOLE = (math.inf, 7 * FUNCTION // 4, 3 * FUNCTION // 2)
-WHOLE_IN_BATCHES = (math.inf, 9 * FUNCTION // 4, 3 * FUNCTION // 2)
 
 # Of the numbers of a point. If a loop over stages is differentiated, it keeps the points of all
 # stages for each of its turns, which is too much memory for larger ones; and unrolled, XLA keeps

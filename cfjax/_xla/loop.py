@@ -37,60 +37,57 @@ def repeat(
     """
     reading = read(step, carry, MAX_ENTRIES["loop"])
     if reading is None:
+        steps = None
+    elif reading.rows:
+        steps = _of_rows(step, carry, reading)
+    else:
+        is_many = not isinstance(num_steps, int) or num_steps > MANY
+        steps = _of_vector(carry, reading, is_many)
+    if steps is None:
         return _loop(jax.checkpoint(step), carry, num_steps, keep)
-    if reading.rows:
-        return _of_rows(step, reading, carry, num_steps, keep)
+    keeps = None if keep is None else lambda carried: carried
+    end, kept = _loop(steps.step, steps.start, num_steps, keeps)
+    return steps.whole(end), None if keep is None else keep(jax.vmap(steps.whole)(kept))
+
+
+class _Steps(NamedTuple):
+    """A step of what is carried, what that is at first, and the carry as it was."""
+
+    step: Callable[[PyTree], PyTree]
+    start: PyTree
+    whole: Callable[[PyTree], PyTree]
+
+
+def _of_vector(carry: PyTree, reading: Reading, is_many: bool) -> _Steps:
     leaves, structure = jtu.tree_flatten(carry)
     leaves = list(map(jnp.asarray, leaves))
     program, parameters = with_parameters(reading)
-    form = _Form.of(leaves)
-    n = len(parameters)
+    form, n = _Form.of(leaves), len(parameters)
 
     def on_vector(*operands: Array) -> list[Array]:
         return form.packed(jaxpr_as_fun(program)(*operands[:n], *form.unpacked(operands[n:])))
 
     start = form.packed(leaves)
     code = program_of(on_vector, *parameters, *start)
-    is_many = not isinstance(num_steps, int) or num_steps > MANY
-
-    def whole(arrays: Sequence[Array]) -> PyTree:
-        return jtu.tree_unflatten(structure, form.unpacked(arrays))
-
-    end, kept = _loop(
+    return _Steps(
         lambda arrays: one_of(code, parameters, arrays, is_many),
         start,
-        num_steps,
-        None if keep is None else lambda arrays: arrays,
+        lambda arrays: jtu.tree_unflatten(structure, form.unpacked(arrays)),
     )
-    return whole(end), None if keep is None else keep(jax.vmap(whole)(kept))
 
 
-def _of_rows(
-    step: Callable[[PyTree], PyTree],
-    reading: Reading,
-    carry: PyTree,
-    num_steps: int | Int[Array, ""],
-    keep: Callable[[PyTree], PyTree] | None,
-) -> tuple[PyTree, PyTree]:
-    """The same of a state with leading axes, whose entries stay apart from step to step."""
+def _of_rows(step: Callable[[PyTree], PyTree], carry: PyTree, reading: Reading) -> _Steps | None:
+    """Of a state with leading axes, whose entries stay apart from step to step."""
     program = traced(step, carry, reading)
     if program is None:
-        return _loop(jax.checkpoint(step), carry, num_steps, keep)
+        return None
     start, parameters = split((carry, program.parameters), rows=True)
 
-    def run(y: PyTree, parameters: PyTree) -> PyTree:
-        return split_like(start, program.run(y, parameters))
+    def like_start(run: Callable[[PyTree, PyTree], PyTree]) -> Callable[[PyTree, PyTree], PyTree]:
+        return lambda y, parameters: split_like(start, run(y, parameters))
 
-    def plain(y: PyTree, parameters: PyTree) -> PyTree:
-        return split_like(start, program.plain(y, parameters))
-
-    end, kept = _loop(
-        lambda y: operation(run, y, parameters, is_batch=True, plain=plain),
-        start,
-        num_steps,
-        None if keep is None else lambda y: y,
-    )
-    return join(end), None if keep is None else keep(jax.vmap(join)(kept))
+    run, plain = map(like_start, (program.run, program.plain))
+    return _Steps(lambda y: operation(run, y, parameters, plain=plain), start, join)
 
 
 def _loop(

@@ -8,6 +8,7 @@ import jax
 import jax.numpy as jnp
 import jax.tree_util as jtu
 import numpy as np
+from jax.core import Tracer
 from jax.experimental.xla_metadata import set_xla_metadata
 from jax.extend.core import ClosedJaxpr, Jaxpr, Literal, Primitive
 from jax.interpreters import ad, batching, mlir
@@ -77,6 +78,21 @@ def materialised_in_rows(tree: PyTree, alone: bool = False) -> PyTree:
     for k in places:
         (leaves[k],) = materialised([leaves[k]], in_batches=True)
     return structure.unflatten(leaves)
+
+
+def numbers_materialised(tree: PyTree, now: bool = True) -> PyTree:
+    """The same, with all single numbers materialised together; if not `now`, where this is
+    differentiated.
+    """
+    leaves, structure = jtu.tree_flatten(tree)
+    places = [k for k, x in enumerate(leaves) if _is_number(x)]
+    numbers = [leaves[k] for k in places]
+    new = materialised(numbers, in_batches=True, now=now) if places else []
+    return structure.unflatten(replaced(leaves, places, new))
+
+
+def _is_number(x: Any) -> bool:
+    return isinstance(x, Tracer) and x.ndim == 0 and jnp.issubdtype(x.dtype, jnp.inexact)
 
 
 def _once(tree: PyTree, **options: bool) -> PyTree:

@@ -41,7 +41,7 @@ from .jaxprs import (
     without_constants,
     without_dead_code,
 )
-from .limits import FUNCTION, MAX_RESULTS_IN_BATCHES, WHOLE, WHOLE_IN_BATCHES
+from .limits import FUNCTION, MAX_RESULTS_IN_BATCHES, WHOLE
 from .materialise import materialised, not_materialised
 
 _GROUP = FUNCTION // 2
@@ -52,10 +52,9 @@ _PIECE = FUNCTION // 8
 def operation(
     fun: Callable[..., PyTree],
     *args: PyTree,
-    is_batch: bool = False,
     plain: Callable[..., PyTree] | None = None,
 ) -> PyTree:
-    """`fun(*args)`, as one operation, of a batch if it is one already.
+    """`fun(*args)`, as one operation.
 
     `fun` may close over traced values, and has no effects. Reverse mode keeps the arguments and
     computes everything again, as with `jax.checkpoint`. `plain` is the same function before it was
@@ -82,7 +81,7 @@ def operation(
     exact, takes = narrowed(ClosedJaxpr(code, []), whole)
     outs = replaced(outs, whole, jaxpr_as_fun(exact)(*(operands[k] for k in takes)))
 
-    kind = Kind(is_batch=is_batch)
+    kind = Kind()
     code = without_dead_code(altered(code, outvars=[code.outvars[k] for k in smooth]))
     program, ends = ClosedJaxpr(code, []), _places(code)
     if len(ends) > 2:
@@ -130,11 +129,7 @@ def _places(jaxpr: Jaxpr) -> list[int]:
 
 @operation_p.def_impl
 def _run(*operands, program, kind, plain):
-    order = min(kind.order, 2)
-    most = WHOLE[order]
-    if kind.is_batch:
-        most = min(most, WHOLE_IN_BATCHES[order])
-    ends = _groups(program.jaxpr, most)
+    ends = _groups(program.jaxpr, WHOLE[min(kind.order, 2)])
     # Of a second derivative there are several in one loop.
     if len(ends) == 2 and kind.order < 2:
         return _once(program, operands)

@@ -43,7 +43,7 @@ from .limits import (
     MAX_OPERATIONS,
     MAX_SIZE,
 )
-from .materialise import materialised, materialised_p
+from .materialise import materialised, materialised_p, numbers_materialised
 from .over_stages import Loop, on_numbers_p
 from .rules import on_entries
 from .scope import (
@@ -66,7 +66,7 @@ from .struct_of_arrays import (
     literal,
     struct_of_arrays,
 )
-from .turns import is_table, parts_of
+from .turns import in_parts, is_table
 from .understood import MOVES, REDUCTIONS, is_in_place, is_readable
 
 # What is longer is read once more, with its stages in a loop.
@@ -118,15 +118,14 @@ def are_long(fun: Callable[[PyTree], PyTree], y: PyTree, times: int) -> bool:
 class Program(NamedTuple):
     """A function that is scalarised, and what it closes over.
 
-    `run(y, parameters)` takes both split, returns what is split and closes over nothing traced.
-    `plain` is the same, but for how it computes: as the function does. With `rows` the state has
-    short vectors along leading axes, and is to be split so.
+    Its state has short vectors along leading axes. `run(y, parameters)` takes both split, returns
+    what is split and closes over nothing traced. `plain` is the same, but for how it computes: as
+    the function does.
     """
 
     run: Callable[[PyTree, PyTree], PyTree]
     plain: Callable[[PyTree, PyTree], PyTree]
     parameters: list[Array]
-    rows: bool
 
 
 class Declined(Exception):
@@ -146,7 +145,7 @@ class Reading(NamedTuple):
     length: float
 
     def scalarised(self, consts: Sequence[Any], *shapes: PyTree) -> tuple[ClosedJaxpr, Any] | None:
-        """The program on what is split, of the given shapes; and the tree of its results.
+        """The program of rows on what is split, of the given shapes; and the tree of its results.
 
         `consts` are the values or parameters in the place of those that it closes over.
         """
@@ -156,11 +155,11 @@ class Reading(NamedTuple):
             first, moving = filled(consts, parameters), jtu.tree_leaves(y, is_leaf=_is_apart)
             fixed = [True] * len(first) + [False] * len(moving)
             is_long = self.length > FUNCTION
-            form = _Form(self.rows, is_long, False, has_reciprocals(self.code, fixed), _CALLS, {})
+            form = _Form(True, is_long, False, has_reciprocals(self.code, fixed), _CALLS, {})
             outs, _ = _evaluate(self.code, (*first, *moving), fixed, form)
             # What is known before the program runs may come out as NumPy's.
             outs = [x if _is_apart(x) else jnp.asarray(x) for x in outs]
-            return split(jtu.tree_unflatten(structure, outs), self.rows)
+            return split(jtu.tree_unflatten(structure, outs), rows=True)
 
         try:
             made, out = jax.make_jaxpr(apart, return_shape=True)(*shapes)
@@ -207,7 +206,7 @@ def read(
 
 def traced(fun: Callable[[PyTree], PyTree], y: PyTree, reading: Reading) -> Program | None:
     """`fun`, which has been read, as a program that is scalarised; None if that cannot be done."""
-    structure, rows = jtu.tree_structure(reading.shape), reading.rows
+    structure = jtu.tree_structure(reading.shape)
     before = ClosedJaxpr(reading.code, reading.consts)
     if reading.length > _SHORT:
         # Where a step is not scalarised its stages may be one loop.
@@ -215,21 +214,22 @@ def traced(fun: Callable[[PyTree], PyTree], y: PyTree, reading: Reading) -> Prog
             rolled, shape = jax.make_jaxpr(fun, return_shape=True)(y)
         before = rolled if jtu.tree_structure(shape) == structure else before
     parameters, consts, first = closed_over(reading.consts, before.consts)
-    shapes = jax.eval_shape(lambda *args: split(args, rows), y, parameters)
+    shapes = jax.eval_shape(lambda *args: split(args, rows=True), y, parameters)
     found = reading.scalarised(consts, *shapes)
     if found is None:
         return None
     (made, out), code = found, without_constants(before)
 
     def run(y: PyTree, parameters: PyTree) -> PyTree:
-        return run_split(made, out, y, parameters)
+        outs = called(made, jtu.tree_leaves((y, parameters)))
+        return jtu.tree_unflatten(jtu.tree_structure(out), outs)
 
     def plain(y: PyTree, parameters: PyTree) -> PyTree:
         constants = map(_whole, filled(first, parameters))
         outs = jaxpr_as_fun(code)(*constants, *jtu.tree_leaves(join(y)))
         return split_like(out, jtu.tree_unflatten(structure, outs))
 
-    return Program(run, plain, parameters, rows)
+    return Program(run, plain, parameters)
 
 
 def on_numbers(
@@ -255,12 +255,6 @@ def on_numbers(
     return [x if _is_apart(x) else jnp.asarray(x) for x in outs]
 
 
-def run_split(made: ClosedJaxpr, out: PyTree, y: PyTree, parameters: PyTree) -> PyTree:
-    """What a scalarised program with such results makes of what is split."""
-    outs = called(made, jtu.tree_leaves((y, parameters)))
-    return jtu.tree_unflatten(jtu.tree_structure(out), outs)
-
-
 class _Parameter(NamedTuple):
     """In the place of an array that a program closes over."""
 
@@ -268,18 +262,17 @@ class _Parameter(NamedTuple):
 
 
 def closed_over(
-    consts: Sequence[Any], *others: Sequence[Any]
-) -> tuple[list[Array], list[Any], *tuple[list[Any], ...]]:
-    """The arrays that programs close over; and for each what it has, with these as parameters.
+    consts: Sequence[Any], before: Sequence[Any]
+) -> tuple[list[Array], list[Any], list[Any]]:
+    """The arrays that two programs close over; and what each has, with these as parameters.
 
     The first program is to be scalarised. It has indices as NumPy's arrays.
     """
     unknown = {id(x): x for x in consts if known_constant(x) is None}
-    unknown |= {id(x): x for more in others for x in more if isinstance(x, Tracer)}
+    unknown |= {id(x): x for x in before if isinstance(x, Tracer)}
     number = {key: _Parameter(k) for k, key in enumerate(unknown)}
     first = [number[id(x)] if id(x) in number else known_constant(x) for x in consts]
-    rest = [[number.get(id(x), x) for x in more] for more in others]
-    return list(map(jnp.asarray, unknown.values())), first, *rest
+    return list(map(jnp.asarray, unknown.values())), first, [number.get(id(x), x) for x in before]
 
 
 def filled(consts: Sequence[Any], parameters: Sequence[Any]) -> list[Any]:
@@ -487,36 +480,21 @@ def _in_parts(
     """
     program = flattened(program, ("jit", "pjit"))
     jaxpr, consts = program.jaxpr, list(map(_constant, program.consts))
-    names = (*jaxpr.constvars, *jaxpr.invars)
-    code = altered(jaxpr, constvars=[], invars=list(names))
-    env = dict(zip(names, (*consts, *values), strict=True))
-    flags = dict(zip(names, (*[True] * len(consts), *fixed), strict=True))
-    start, core, end = parts_of(code)
-    for part in (start, core, end):
-        given, are_fixed = [env[v] for v in part.invars], [flags[v] for v in part.invars]
-        if part is core:
-            given = _in_memory(given)
-            outs, outs_fixed = _again(part, given, are_fixed, form)
-        else:
-            outs, outs_fixed = _evaluate(part, given, are_fixed, form)
-        if part is core:
-            outs = [
-                x if is_one or is_table(v) else _in_memory(x)
-                for v, x, is_one in zip(part.outvars, outs, outs_fixed, strict=True)
-            ]
-        env.update(zip(part.outvars, outs, strict=True))
-        flags.update(zip(part.outvars, outs_fixed, strict=True))
-    outs = [literal(v) if isinstance(v, Literal) else env[v] for v in jaxpr.outvars]
-    return outs, [isinstance(v, Literal) or flags[v] for v in jaxpr.outvars]
+    code = altered(jaxpr, constvars=[], invars=[*jaxpr.constvars, *jaxpr.invars])
+    values, fixed = [*consts, *values], [*[True] * len(consts), *fixed]
 
+    def core(part: Jaxpr, given: Sequence[Any], are_fixed: Sequence[bool]) -> Any:
+        outs, outs_fixed = _again(part, numbers_materialised(given), are_fixed, form)
+        moving = [k for k, v in enumerate(part.outvars) if not (outs_fixed[k] or is_table(v))]
+        new = numbers_materialised([outs[k] for k in moving])
+        return replaced(outs, moving, new), outs_fixed
 
-def _in_memory(tree: Any) -> Any:
-    """The same, with all single numbers materialised together."""
-    leaves, structure = jtu.tree_flatten(tree)
-    is_number = lambda x: isinstance(x, Tracer) and is_inexact(x) and x.ndim == 0  # noqa: E731
-    places = [k for k, x in enumerate(leaves) if is_number(x)]
-    new = materialised([leaves[k] for k in places], in_batches=True) if places else []
-    return structure.unflatten(replaced(leaves, places, new))
+    def rest(part: Jaxpr, given: Sequence[Any], are_fixed: Sequence[bool]) -> Any:
+        return _evaluate(part, given, are_fixed, form)
+
+    made = in_parts(code, values, fixed, core, rest)
+    found = [(literal(v), True) if isinstance(v, Literal) else made[v] for v in jaxpr.outvars]
+    return [x for x, _ in found], [is_one for _, is_one in found]
 
 
 def _again(

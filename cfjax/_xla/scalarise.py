@@ -1,14 +1,11 @@
 """A function on single numbers: where it is scalarised, and where it is left as it is."""
 
 from collections.abc import Callable
-from typing import Any
 
-import jax.numpy as jnp
 import jax.tree_util as jtu
-from jax.core import Tracer
 from jaxtyping import PyTree
 
-from .materialise import materialised
+from .materialise import numbers_materialised
 from .operation import operation
 from .program import join, read, split, traced
 from .scope import is_rewritten
@@ -35,29 +32,10 @@ def scalarised(
     program = traced(fun, y, reading)
     if program is None:
         return fun(y)
-    y, parameters = split((y, program.parameters), program.rows)
+    y, parameters = split((y, program.parameters), rows=True)
     # What is around may use single entries, so that XLA computes anew what these share.
-    out = operation(
-        program.run,
-        *_materialised((y, parameters)),
-        is_batch=program.rows,
-        plain=program.plain,
-    )
+    given = numbers_materialised((y, parameters), now=False)
+    out = operation(program.run, *given, plain=program.plain)
     # One by one: what is not used is not computed.
     is_apart = lambda x: isinstance(x, StructOfArrays)  # noqa: E731
-    return jtu.tree_map(lambda x: join(_materialised(x)), out, is_leaf=is_apart)
-
-
-def _materialised(tree: Any) -> Any:
-    """The same, with all single numbers materialised where this is differentiated."""
-    leaves, structure = jtu.tree_flatten(tree)
-    places = [k for k, x in enumerate(leaves) if _is_number(x)]
-    if places:
-        new = materialised([leaves[k] for k in places], in_batches=True, now=False)
-        for k, x in zip(places, new, strict=True):
-            leaves[k] = x
-    return jtu.tree_unflatten(structure, leaves)
-
-
-def _is_number(x: Any) -> bool:
-    return isinstance(x, Tracer) and x.ndim == 0 and jnp.issubdtype(x.dtype, jnp.inexact)
+    return jtu.tree_map(lambda x: join(numbers_materialised(x, now=False)), out, is_leaf=is_apart)

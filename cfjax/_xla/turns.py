@@ -48,21 +48,39 @@ def _by_turns(eqn: JaxprEqn, fixed: Sequence[bool], run: Run) -> JaxprEqn:
 
 def _turn(jaxpr: Jaxpr, operands: Sequence[Any], fixed: Sequence[bool], run: Run) -> Sequence[Any]:
     """The results of a turn, of which `run` computes what is not about tables."""
-    start, core, end = parts_of(jaxpr)
-    values: dict[Any, Any] = dict(zip(jaxpr.invars, operands, strict=True))
-    are_fixed = dict(zip(jaxpr.invars, fixed, strict=True))
-    for part in (start, core, end):
-        given = [values[v] for v in part.invars]
-        program = ClosedJaxpr(part, [])
-        if part is core:
-            outs = run(given, program, [are_fixed.get(v, False) for v in part.invars])
-        else:
-            outs = jaxpr_as_fun(program)(*given)
-        values.update(zip(part.outvars, outs, strict=True))
+
+    def core(part: Jaxpr, given: Sequence[Any], are_fixed: Sequence[bool]) -> Any:
+        return run(given, ClosedJaxpr(part, []), are_fixed), [False] * len(part.outvars)
+
+    def rest(part: Jaxpr, given: Sequence[Any], _: Sequence[bool]) -> Any:
+        return jaxpr_as_fun(ClosedJaxpr(part, []))(*given), [False] * len(part.outvars)
+
+    made = in_parts(jaxpr, operands, fixed, core, rest)
+    values = {v: x for v, (x, _) in made.items()}
     return [value_of(v, values) for v in jaxpr.outvars]
 
 
-def parts_of(jaxpr: Jaxpr) -> tuple[Jaxpr, Jaxpr, Jaxpr]:
+# What computes a part of a turn, of values of which some are fixed; and which results are.
+Part = Callable[[Jaxpr, Sequence[Any], Sequence[bool]], tuple[Sequence[Any], Sequence[bool]]]
+
+
+def in_parts(
+    jaxpr: Jaxpr, operands: Sequence[Any], fixed: Sequence[bool], core: Part, rest: Part
+) -> dict[Any, tuple[Any, bool]]:
+    """The values of a turn, and whether each is fixed.
+
+    `core` computes what is made of short vectors, `rest` what is read of tables and put into them.
+    """
+    values = zip(operands, fixed, strict=True)
+    made: dict[Any, tuple[Any, bool]] = dict(zip(jaxpr.invars, values, strict=True))
+    for part, run in zip(_parts_of(jaxpr), (rest, core, rest), strict=True):
+        given = [made[v] for v in part.invars]
+        outs = run(part, [x for x, _ in given], [is_one for _, is_one in given])
+        made.update(zip(part.outvars, zip(*outs, strict=True), strict=True))
+    return made
+
+
+def _parts_of(jaxpr: Jaxpr) -> tuple[Jaxpr, Jaxpr, Jaxpr]:
     """What a turn reads of tables, what it makes of short vectors, and the tables of that."""
     before, within, after = _apart(jaxpr)
     end = _part(jaxpr, after, variables(jaxpr.outvars))
