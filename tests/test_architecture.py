@@ -72,7 +72,6 @@ PRIVATE_IN_TESTS = {
     "xla/random_programs.py": "programs rewritten, which no solve is",
     "xla/test_loop.py": "the loop that runs a piece of a program more than once",
     "xla/test_materialise.py": "calls that keep XLA from fusing",
-    "xla/test_operation.py": "primitives that carry a program",
     "xla/test_pack.py": "primitives that put entries together",
     "xla/test_scalars.py": "programs on single numbers, equation by equation",
     "xla/test_struct_of_arrays.py": "programs on an array for each entry, equation by equation",

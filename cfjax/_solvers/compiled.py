@@ -16,10 +16,8 @@ from jax import lax
 from jaxtyping import PyTree
 
 from .._control_term import is_driven
-from .._xla import are_long as are_long
 from .._xla import chosen as chosen
 from .._xla import computed_again as computed_again
-from .._xla import has_rows as has_rows
 from .._xla import invariant as invariant
 from .._xla import is_rewritten as is_rewritten
 from .._xla import limits as limits
@@ -28,6 +26,7 @@ from .._xla import materialised_in_rows as materialised_in_rows
 from .._xla import materialised_together as materialised_together
 from .._xla import over_stages as over_stages
 from .._xla import scalarised as scalarised
+from .._xla import where_scalarised as where_scalarised
 from .compensation import with_sums
 
 
@@ -44,17 +43,10 @@ def control_of(terms: diffrax.AbstractTerm, t0: Any, t1: Any, **kwargs: Any) -> 
 def by_turns(
     body: Callable[[PyTree, Any], tuple[PyTree, PyTree]], carry: PyTree, turns: Sequence[Any]
 ) -> tuple[PyTree, list[PyTree]]:
-    """What `jax.lax.scan` makes of some turns, with the outputs of each; most in one loop.
-
-    A step with leading axes that is rewritten must have no loop within. So two turns are unrolled
-    there; more would be too long, and then each turn is rewritten instead.
-    """
-    if len(turns) == 1 or (len(turns) == 2 and has_rows()):
-        outputs = []
-        for turn in turns:
-            carry, output = body(carry, turn)
-            outputs.append(output)
-        return carry, outputs
+    """What `jax.lax.scan` makes of some turns, with the outputs of each."""
+    if len(turns) == 1:
+        carry, output = body(carry, turns[0])
+        return carry, [output]
 
     def once(carry: PyTree, turn: Any) -> Any:
         return scalarised(lambda carry: body(carry, turn), carry)

@@ -1,6 +1,5 @@
 """The stages of a step rolled into one loop, so that a program has the field and its flow once."""
 
-import functools
 from collections.abc import Callable, Sequence
 from typing import Any, NamedTuple
 
@@ -19,23 +18,21 @@ from .._methods.tableau import Product, Row
 from .._numerics.matmul import matmul
 from .._numerics.vectors import pack
 from .chart import Chart
-from .compiled import are_long, chosen, has_rows, limits, over_stages, scalarised
+from .compiled import chosen, limits, over_stages, scalarised, where_scalarised
 
 
-def can_roll(unroll: bool | None, field: PyTree, point: PyTree, is_long: bool = False) -> bool:
+def can_roll(unroll: bool | None, field: PyTree, point: PyTree) -> bool:
     """Whether flows of combinations of such fields may be one loop, and where `unroll` is None
     whether that pays.
 
     Fields must combine in the usual way and have no chart of their own. Fields of far more numbers
-    than the point has are faster unrolled. So is a step within a loop that is rewritten for XLA as
-    a whole, and on leading axes, if it is not too long for that.
+    than the point has are faster unrolled.
     """
     parts = jtu.tree_leaves(field, is_leaf=is_field)
     is_possible = any(map(is_field, parts)) and _is_plain(field)
     if unroll is not None:
         return is_possible and not unroll
-    pays = is_long or not has_rows()
-    return is_possible and pays and _size(field) <= max(limits.MAX_SIZE, 4 * _size(point))
+    return is_possible and _size(field) <= max(limits.MAX_SIZE, 4 * _size(point))
 
 
 def _can_roll_in_room(
@@ -48,7 +45,7 @@ def _can_roll_in_room(
     first = known[-1]
     if unroll or not is_field(first) or type(first).room is AbstractFrozenField.room:
         return False
-    pays = unroll is False or (not has_rows() and _size(chart.start) <= limits.LARGE)
+    pays = unroll is False or _size(chart.start) <= limits.LARGE
     if not pays or any(x.span is not first.span for x in known):
         return False
     room = first.room(chart.start, num_stages)
@@ -235,11 +232,7 @@ def rolled_elements(
     def stage(c: Any, u: PyTree) -> PyTree:
         return element(u, chart.frozen_after([u], c, chart.flow(u, chart.start)))
 
-    # Before all of them are traced, only to find that they are too long together. Few are mostly
-    # short enough; to look costs a trace of one more.
-    one = functools.partial(stage, times[0])
-    is_long = len(rows) > limits.MANY and has_rows() and are_long(one, first, len(rows))
-    if can_roll(unroll, first, first, is_long) and is_uniform(chart):
+    if can_roll(unroll, first, first) and is_uniform(chart):
         fields = _Stacked.of(known, n)
         made, total = _rolled_elements(chart, fields, len(known), rows, times, element, number)
         return [*known, *made[len(known) :]], total
@@ -403,18 +396,26 @@ def _stack(tree: PyTree, n: int) -> PyTree:
 
 
 def _combination(row: _Row, fields: Array) -> Array:
-    weights, are_used = row
-    fields = fields[: len(weights)]
-    if jnp.size(fields[0]) > limits.LARGE:
-        if jnp.iscomplexobj(fields):
-            return lax.complex(_combination(row, fields.real), _combination(row, fields.imag))
-        product = matmul(weights.astype(fields.dtype), fields.reshape(len(weights), -1))
-        return product.reshape(fields.shape[1:])
-    each = len(weights), *[1] * (fields.ndim - 1)
-    terms = weights.astype(fields.dtype).reshape(each) * fields
+    fields = fields[: len(row.weights)]
+    if jnp.size(fields[0]) <= limits.LARGE:
+        return _sum(row, fields)
+    return where_scalarised(lambda: _sum(row, fields), lambda: _product(row.weights, fields))
+
+
+def _sum(row: _Row, fields: Array) -> Array:
+    each = len(fields), *[1] * (fields.ndim - 1)
+    terms = row.weights.astype(fields.dtype).reshape(each) * fields
     # Where the loop is unrolled, those that are zero are not there.
-    terms = jnp.where(are_used.reshape(each), terms, jnp.zeros((), terms.dtype))
+    terms = jnp.where(row.are_used.reshape(each), terms, jnp.zeros((), terms.dtype))
     return jnp.sum(terms, axis=0)
+
+
+def _product(weights: Array, fields: Array) -> Array:
+    """The same, faster for large fields."""
+    if jnp.iscomplexobj(fields):
+        return lax.complex(_product(weights, fields.real), _product(weights, fields.imag))
+    product = matmul(weights.astype(fields.dtype), fields.reshape(len(weights), -1))
+    return product.reshape(fields.shape[1:])
 
 
 def _at(tree: PyTree, k: Any) -> PyTree:

@@ -2,8 +2,8 @@
 
 - `scalarised`, `repeat`: a step, and many equal ones, on single numbers.
 - `over_stages`, `chosen`: a loop over the stages of a method, and a choice within it, which are
-  part of what is scalarised; `computed_again`: a value that is computed twice there. `are_long`:
-  whether stages are too long to be scalarised.
+  part of what is scalarised; `where_scalarised`, `computed_again`: what is computed otherwise
+  there.
 - `materialised_if_long`, `materialised_together`, `materialised_in_rows`: values that several
   results need, computed once.
 - `invariant`: a mark of values that may be the same in every turn of a loop; `invariants_first`: a
@@ -12,7 +12,7 @@
 - `smooth`: a mark of functions that compare numbers and yet are smooth up to rounding.
 - `materialised`, `call`: arrays and functions that XLA computes on their own.
 - `limits`: the numbers that decide.
-- `rewriting`: the switch that turns it all off; `is_rewritten`, `has_rows`: what there is around.
+- `rewriting`: the switch that turns it all off; `is_rewritten`: what there is around.
 
 Nothing outside may import from the files within. `README.md` here says what each trick buys.
 """
@@ -29,11 +29,10 @@ from .materialise import materialised_together as materialised_together
 from .over_stages import chosen as chosen
 from .over_stages import computed_again as computed_again
 from .over_stages import over_stages as over_stages
+from .over_stages import where_scalarised as where_scalarised
 from .pack import pack as pack
 from .pack import unpack as unpack
-from .program import are_long as are_long
 from .scalarise import scalarised as scalarised
-from .scope import has_rows as has_rows
 from .scope import is_rewritten as is_rewritten
 from .scope import rewriting as rewriting
 from .smooth import smooth as smooth

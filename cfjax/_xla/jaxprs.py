@@ -1,6 +1,8 @@
 """Programs of JAX as values: what they need, what reaches what, parts of them, their evaluation."""
 
+import functools
 import itertools
+import weakref
 from collections.abc import Callable, Container, Hashable, Iterable, Sequence
 from typing import Any
 
@@ -21,10 +23,6 @@ from jax.extend.core import (
 from jax.interpreters import mlir
 from jaxtyping import Array
 
-# A program within a program (`operation.py`).
-operation_p = Primitive("cfjax_operation")
-operation_p.multiple_results = True
-
 # A program as it stands, for one that is being traced.
 call_p = Primitive("cfjax_call")
 call_p.multiple_results = True
@@ -33,7 +31,6 @@ call_p.multiple_results = True
 # more, rules for that are not needed either.
 CALLS = {
     "cfjax_call": "program",
-    "cfjax_operation": "program",
     "closed_call": "call_jaxpr",
     "custom_jvp_call": "call_jaxpr",
     "custom_vmap_call": "call",
@@ -92,25 +89,9 @@ def without_dead_code(jaxpr: Jaxpr) -> Jaxpr:
     kept = []
     for eqn in reversed(jaxpr.eqns):
         if eqn.effects or not wanted.isdisjoint(eqn.outvars):
-            if eqn.primitive is operation_p:
-                eqn = _pruned(eqn, wanted)
             kept.append(eqn)
             wanted.update(variables(eqn.invars))
     return jaxpr.replace(eqns=kept[::-1])
-
-
-def _pruned(eqn: JaxprEqn, wanted: set[Any]) -> JaxprEqn:
-    """An operation that gives only what is wanted."""
-    gives = [k for k, v in enumerate(eqn.outvars) if v in wanted]
-    kind, size = eqn.params["kind"], len(eqn.invars)
-    program, takes = narrowed(eqn.params["program"], gives)
-    linear = sum(k >= size - kind.linear for k in takes)
-    kind = kind._replace(linear=linear)
-    return eqn.replace(
-        invars=[eqn.invars[k] for k in takes],
-        outvars=[eqn.outvars[k] for k in gives],
-        params={"program": program, "kind": kind, "plain": None},
-    )
 
 
 def narrowed(
@@ -138,12 +119,8 @@ def reached(jaxpr: Jaxpr, sources: Sequence[bool]) -> list[bool]:
         return [not isinstance(v, Literal) and v in found for v in atoms]
 
     for eqn in jaxpr.eqns:
-        given = are_found(eqn.invars)
-        if any(given):
-            outs = [True] * len(eqn.outvars)
-            if eqn.primitive is operation_p:
-                outs = reached(eqn.params["program"].jaxpr, given)
-            found.update(itertools.compress(eqn.outvars, outs))
+        if any(are_found(eqn.invars)):
+            found.update(eqn.outvars)
     return are_found(jaxpr.outvars)
 
 
@@ -266,6 +243,31 @@ def parameters(eqn: JaxprEqn) -> Hashable:
     except TypeError:
         return object()  # Equal to no other, so such operations are never merged.
     return values
+
+
+# Of the programs of a solve, which are differentiated one soon after the other.
+_KEPT = 32
+
+
+def once_for_each_program(fun: Callable[..., Any]) -> Callable[..., Any]:
+    """`fun(program, *rest)`, computed once while one program after the other is differentiated.
+
+    No program is held that JAX has dropped, and of those that JAX keeps, which are thousands, what
+    is derived is kept for the last ones alone.
+    """
+    kept: weakref.WeakKeyDictionary[ClosedJaxpr, dict[Any, Any]] = weakref.WeakKeyDictionary()
+
+    @functools.wraps(fun)
+    def once(program: ClosedJaxpr, *rest: Any) -> Any:
+        found = kept.setdefault(program, {})
+        if rest not in found:
+            found[rest] = fun(program, *rest)
+        result = found[rest]
+        while len(kept) > _KEPT:
+            del kept[next(iter(kept))]
+        return result
+
+    return once
 
 
 @call_p.def_impl

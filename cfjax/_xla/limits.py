@@ -4,8 +4,6 @@
 They were set on two cores with AVX-512. What follows from one of them is below it.
 """
 
-import math
-
 # Of vectors that are scalarised. A pose is a quaternion and a position. (attitude, leading_axes)
 MAX_LENGTH = 7
 # Of the products of numbers that a product of two arrays is scalarised into: those of 6 x 6
@@ -34,9 +32,6 @@ MAX_RESULTS_IN_BATCHES = 13
 # About as many operations XLA puts into one function. What is longer is cut, and materialised in
 # between: a step takes 20 ms where it is not. (attitude)
 FUNCTION = 2000
-# Of the operations of a step on single numbers. The time to compile grows with them, and more so in
-# derivatives. (compile, chain)
-MAX_OPERATIONS = 2 * FUNCTION
 # Of the operations of a step that is compiled as one program of single numbers, with loops over
 # stages unrolled, and functions with a derivative of their own opened. Longer values of one system
 # gain nothing in a loop that is not our own (compile).
@@ -46,20 +41,15 @@ FLAT_VALUES = FUNCTION
 # turn of a loop over stages begins and ends (gradients, batch).
 FLAT_DERIVATIVES = 3 * FUNCTION
 FLAT_DERIVATIVES_IN_BATCHES = 5 * FUNCTION // 2
-# Of batches, and of what is made for many steps. A gradient of this length takes some 10 s to
-# compile (gradients, batch).
+# Of batches, short vectors along leading axes, and what is made for many steps. A gradient of this
+# length takes some 10 s to compile (gradients, batch).
 FLAT_MANY = 7 * FUNCTION
 # Of a derivative that is differentiated again, and of that. (fits, gradients)
 FLAT_SECOND = 2 * FUNCTION
-# Of these what is longer is cut where a method says.
+# Of all these what is longer is cut where a method says, and a derivative on leading axes at the
+# turns of a loop: what two functions need, XLA computes in both, and in long programs exponentially
+# often. (attitude, leading_axes)
 FLAT_WHOLE = 2 * FUNCTION
-# What two functions need, XLA computes in both. In long programs it then computes single operations
-# exponentially often: in values never as measured, in derivatives from some 4000 operations on, and
-# in second ones earlier. On leading axes so many are compiled as they are, for values, first and
-# second derivatives; longer ones in groups, though to materialise what these share takes time.
-# (leading_axes)
-WHOLE = (math.inf, 7 * FUNCTION // 4, 3 * FUNCTION // 2)
-
 # Of the numbers of a point. If a loop over stages is differentiated, it keeps the points of all
 # stages for each of its turns, which is too much memory for larger ones; and unrolled, XLA keeps
 # several fields to add them up at once, which is too much for those of twice as many. Of larger

@@ -1,6 +1,6 @@
-"""Many equal steps in one loop, each of which is one operation on one vector."""
+"""Many equal steps in one loop, each of which is one operation."""
 
-import math
+import itertools
 from collections.abc import Callable, Sequence
 from typing import Any, NamedTuple
 
@@ -12,10 +12,11 @@ from jax import lax
 from jax.extend.core import jaxpr_as_fun
 from jaxtyping import Array, Int, PyTree
 
-from .jaxprs import is_inexact, program_of
-from .limits import MANY, MAX_ENTRIES
-from .operation import operation
-from .program import Reading, join, read, split, split_like, traced
+from .jaxprs import is_inexact, program_of, structs_of
+from .limits import MANY, MAX_ENTRIES, MAX_SIZE
+from .pack import pack, unpack
+from .program import read
+from .scope import is_rows
 from .step import one_of, with_parameters
 
 
@@ -33,61 +34,33 @@ def repeat(
 
     On CPU a loop of small steps is fast if XLA has few operations left after fusion, and it fuses
     towards each result all that leads to it. So the numbers of the carry travel as one vector,
-    which is kept as it is.
+    which is kept as it is. Those of short vectors along leading axes travel as one array for each
+    of their entries.
     """
     reading = read(step, carry, MAX_ENTRIES["loop"])
     if reading is None:
-        steps = None
-    elif reading.rows:
-        steps = _of_rows(step, carry, reading)
-    else:
-        is_many = not isinstance(num_steps, int) or num_steps > MANY
-        steps = _of_vector(carry, reading, is_many)
-    if steps is None:
         return _loop(jax.checkpoint(step), carry, num_steps, keep)
-    keeps = None if keep is None else lambda carried: carried
-    end, kept = _loop(steps.step, steps.start, num_steps, keeps)
-    return steps.whole(end), None if keep is None else keep(jax.vmap(steps.whole)(kept))
-
-
-class _Steps(NamedTuple):
-    """A step of what is carried, what that is at first, and the carry as it was."""
-
-    step: Callable[[PyTree], PyTree]
-    start: PyTree
-    whole: Callable[[PyTree], PyTree]
-
-
-def _of_vector(carry: PyTree, reading: Reading, is_many: bool) -> _Steps:
     leaves, structure = jtu.tree_flatten(carry)
     leaves = list(map(jnp.asarray, leaves))
     program, parameters = with_parameters(reading)
     form, n = _Form.of(leaves), len(parameters)
 
-    def on_vector(*operands: Array) -> list[Array]:
+    def of_parts(*operands: Array) -> list[Array]:
         return form.packed(jaxpr_as_fun(program)(*operands[:n], *form.unpacked(operands[n:])))
 
     start = form.packed(leaves)
-    code = program_of(on_vector, *parameters, *start)
-    return _Steps(
-        lambda arrays: one_of(code, parameters, arrays, is_many),
-        start,
-        lambda arrays: jtu.tree_unflatten(structure, form.unpacked(arrays)),
-    )
+    code = program_of(of_parts, *parameters, *start)
+    is_many = not isinstance(num_steps, int) or num_steps > MANY
 
+    def once(parts: Sequence[Array]) -> list[Array]:
+        return one_of(code, parameters, parts, reading.rows, is_many)
 
-def _of_rows(step: Callable[[PyTree], PyTree], carry: PyTree, reading: Reading) -> _Steps | None:
-    """Of a state with leading axes, whose entries stay apart from step to step."""
-    program = traced(step, carry, reading)
-    if program is None:
-        return None
-    start, parameters = split((carry, program.parameters), rows=True)
+    def whole(parts: Sequence[Array]) -> PyTree:
+        return jtu.tree_unflatten(structure, form.unpacked(parts))
 
-    def like_start(run: Callable[[PyTree, PyTree], PyTree]) -> Callable[[PyTree, PyTree], PyTree]:
-        return lambda y, parameters: split_like(start, run(y, parameters))
-
-    run, plain = map(like_start, (program.run, program.plain))
-    return _Steps(lambda y: operation(run, y, parameters, plain=plain), start, join)
+    keeps = None if keep is None else lambda parts: parts
+    end, kept = _loop(once, start, num_steps, keeps)
+    return whole(end), None if keep is None else keep(jax.vmap(whole)(kept))
 
 
 def _loop(
@@ -106,28 +79,38 @@ def _loop(
 
 
 class _Form(NamedTuple):
-    """Arrays, of which those at some places are packed into one vector, which comes first."""
+    """What is carried in the place of some arrays.
 
-    shapes: Sequence[tuple[int, ...]]
+    Those at some places are one vector, which comes first. Short vectors along leading axes are
+    apart, one array for each of their entries.
+    """
+
+    arrays: Sequence[jax.ShapeDtypeStruct]
     places: Sequence[int]
 
     @classmethod
     def of(cls, arrays: Sequence[Array]) -> "_Form":
         dtype = next((x.dtype for x in arrays if is_inexact(x)), None)
-        return cls([x.shape for x in arrays], [k for k, x in enumerate(arrays) if x.dtype == dtype])
+        places = [k for k, x in enumerate(arrays) if x.dtype == dtype and x.size <= MAX_SIZE]
+        return cls(structs_of(arrays), places)
 
     def packed(self, arrays: Sequence[Array]) -> list[Array]:
-        rest = [x for k, x in enumerate(arrays) if k not in self.places]
-        entries = [jnp.ravel(arrays[k]) for k in self.places]
-        return [jnp.concatenate(entries), *rest] if entries else rest
+        vector, rest = [jnp.ravel(arrays[k]) for k in self.places], []
+        for k, x in enumerate(arrays):
+            if k not in self.places:
+                rest += unpack(x, axis=x.ndim - 1) if is_rows(x) else [x]
+        return [jnp.concatenate(vector), *rest] if vector else rest
 
-    def unpacked(self, arrays: Sequence[Array]) -> list[Array]:
-        if not self.places:
-            return list(arrays)
-        sizes = [math.prod(self.shapes[k]) for k in self.places]
-        parts = iter(jnp.split(arrays[0], np.cumsum(sizes)[:-1]))
-        rest = iter(arrays[1:])
-        return [
-            next(parts).reshape(shape) if k in self.places else next(rest)
-            for k, shape in enumerate(self.shapes)
-        ]
+    def unpacked(self, parts: Sequence[Array]) -> list[Array]:
+        rest = iter(parts)
+        ends = np.cumsum([self.arrays[k].size for k in self.places])[:-1]
+        vector = iter(jnp.split(next(rest), ends) if self.places else ())
+
+        def whole(k: int, x: jax.ShapeDtypeStruct) -> Array:
+            if k in self.places:
+                return next(vector).reshape(x.shape)
+            if is_rows(x):
+                return pack([next(rest) for _ in range(x.shape[-1])], axis=x.ndim - 1)
+            return next(rest)
+
+        return list(itertools.starmap(whole, enumerate(self.arrays)))

@@ -8,16 +8,15 @@ import jax
 import jax.numpy as jnp
 import jax.tree_util as jtu
 import numpy as np
-from jax.core import Tracer
 from jax.experimental.xla_metadata import set_xla_metadata
 from jax.extend.core import ClosedJaxpr, Jaxpr, Literal, Primitive
 from jax.interpreters import ad, batching, mlir
 from jaxtyping import Array, PyTree
 
-from .jaxprs import altered, replaced, without_dead_code
+from .jaxprs import altered, is_inexact, replaced, without_dead_code
 from .limits import MAX_RESULTS, MAX_RESULTS_IN_BATCHES, MAX_SIZE
 from .pack import pack, sharding, unpack
-from .scope import has_rows, is_on, is_rewritten, is_short
+from .scope import is_on, is_rewritten, is_short
 
 
 def materialised(
@@ -69,7 +68,7 @@ def materialised_in_rows(tree: PyTree, alone: bool = False) -> PyTree:
     for all that follow.
     """
     is_plain = alone and is_on() and not is_rewritten()
-    if not (has_rows() or is_plain):
+    if not (is_rewritten() or is_plain):
         return tree
     leaves, structure = jtu.tree_flatten(tree)
     places = [
@@ -80,19 +79,11 @@ def materialised_in_rows(tree: PyTree, alone: bool = False) -> PyTree:
     return structure.unflatten(leaves)
 
 
-def numbers_materialised(tree: PyTree, now: bool = True) -> PyTree:
-    """The same, with all single numbers materialised together; if not `now`, where this is
-    differentiated.
-    """
-    leaves, structure = jtu.tree_flatten(tree)
-    places = [k for k, x in enumerate(leaves) if _is_number(x)]
-    numbers = [leaves[k] for k in places]
-    new = materialised(numbers, in_batches=True, now=now) if places else []
-    return structure.unflatten(replaced(leaves, places, new))
-
-
-def _is_number(x: Any) -> bool:
-    return isinstance(x, Tracer) and x.ndim == 0 and jnp.issubdtype(x.dtype, jnp.inexact)
+def together(values: Sequence[Any]) -> list[Any]:
+    """The same, but for integers materialised together."""
+    smooth = [k for k, x in enumerate(values) if is_inexact(x)]
+    new = materialised([values[k] for k in smooth], in_batches=True) if smooth else []
+    return replaced(values, smooth, new)
 
 
 def _once(tree: PyTree, **options: bool) -> PyTree:

@@ -312,11 +312,19 @@ def _scatter(operands: Sequence[Array], params: dict[str, Any]) -> np.ndarray:
 
 
 def moved(call: Call) -> StructOfArrays | None:
-    """Where indices are known, and no axis is long."""
-    if any(x.long for x in call.arrays()):
+    """Where indices are known, and long axes are whole."""
+    x, values, params = call.first(), list(call.values), call.params
+    is_update = "slice_sizes" not in params
+    part = values[1].shape if is_update else params["slice_sizes"]
+    if any(part[k] != x.shape[k] for k in x.long):
         return None
-    entries = _by_jax(call.eqn, call.values)
-    return None if entries is None else StructOfArrays(entries, call.shape)
+    if is_update:
+        values[1] = conformed(struct_of_arrays(values[1]), part, x.is_short)
+    else:
+        sizes = (n if short else 1 for n, short in zip(part, x.is_short, strict=True))
+        params = params | {"slice_sizes": tuple(sizes)}
+    entries = _by_jax(call.eqn.replace(params=params), values)
+    return None if entries is None else StructOfArrays(entries, call.shape, x.is_short)
 
 
 def padded(call: Call) -> StructOfArrays | None:

@@ -11,7 +11,7 @@ from jax.extend.core import ClosedJaxpr, JaxprEqn, Primitive
 from jax.interpreters import mlir
 from jaxtyping import Array, PyTree
 
-from .scope import has_rows, is_rewritten
+from .scope import is_rewritten
 from .understood import STAGES
 
 
@@ -37,26 +37,36 @@ def computed_again(value: PyTree, compute: Callable[[], PyTree]) -> PyTree:
 
     There XLA computes anew, for each entry of the value, all that the value is made of.
     """
-    if has_rows():
-        return compute()
-    return chosen(on_numbers_p.bind(), compute, lambda: value) if is_rewritten() else value
+    return where_scalarised(compute, lambda: value, in_derivatives=False)
 
 
-# Whether this is evaluated on single numbers, and not differentiated.
-on_numbers_p = Primitive("cfjax_on_numbers")
+def where_scalarised(
+    yes: Callable[[], PyTree], no: Callable[[], PyTree], in_derivatives: bool = True
+) -> PyTree:
+    """`yes()` where this is scalarised, with or without its derivatives, and otherwise `no()`.
+
+    Both have one value.
+    """
+    if not is_rewritten():
+        return no()
+    return chosen(is_scalarised_p.bind(in_derivatives=in_derivatives), yes, no)
 
 
-@on_numbers_p.def_impl
-def _run():
+# Whether this is evaluated on single numbers, and there also in derivatives.
+is_scalarised_p = Primitive("cfjax_is_scalarised")
+
+
+@is_scalarised_p.def_impl
+def _run(**_):
     return jnp.zeros((), bool)
 
 
-@on_numbers_p.def_abstract_eval
-def _():
+@is_scalarised_p.def_abstract_eval
+def _(**_):
     return ShapedArray((), jnp.dtype(bool))
 
 
-mlir.register_lowering(on_numbers_p, mlir.lower_fun(_run, multiple_results=False))
+mlir.register_lowering(is_scalarised_p, mlir.lower_fun(_run, multiple_results=False))
 
 
 class Loop(NamedTuple):

@@ -6,6 +6,7 @@ every small array as its entries. In a state with leading axes, many short vecto
 are arrays of these axes.
 """
 
+import functools
 import math
 from collections.abc import Callable, Sequence
 from typing import Any, NamedTuple
@@ -21,37 +22,32 @@ from jax.extend.core import (
     Jaxpr,
     JaxprEqn,
     Literal,
-    jaxpr_as_fun,
 )
-from jaxtyping import Array, PyTree
+from jaxtyping import PyTree
 
 from .jaxprs import (
     altered,
-    called,
     evaluate,
     flattened,
     replaced,
-    without_constants,
+    structs_of,
     without_dead_code,
 )
 from .limits import (
     FLAT_MANY,
     FLAT_WHOLE,
-    FUNCTION,
     MAX_ENTRIES,
     MAX_LENGTH,
-    MAX_OPERATIONS,
     MAX_SIZE,
 )
-from .materialise import materialised, materialised_p, numbers_materialised
-from .over_stages import Loop, on_numbers_p
+from .materialise import materialised, materialised_p, together
+from .over_stages import Loop, is_scalarised_p
 from .rules import on_entries
 from .scope import (
     is_numeric,
     is_on,
     is_rows,
     is_short,
-    rewriting,
     unread,
     within,
 )
@@ -66,11 +62,8 @@ from .struct_of_arrays import (
     literal,
     struct_of_arrays,
 )
-from .turns import in_parts, is_table
+from .turns import in_parts, is_table, of_tables
 from .understood import MOVES, REDUCTIONS, is_in_place, is_readable
-
-# What is longer is read once more, with its stages in a loop.
-_SHORT = FUNCTION // 2
 
 # Calls that are scalarised as a part of the program.
 _CALLS = {"jit": "jaxpr", "pjit": "jaxpr"}
@@ -109,25 +102,6 @@ def _whole(x: Any) -> Any:
     return x.whole() if _is_apart(x) else x
 
 
-def are_long(fun: Callable[[PyTree], PyTree], y: PyTree, times: int) -> bool:
-    """Whether so many of `fun(y)` are too long to be scalarised."""
-    code = without_dead_code(jax.make_jaxpr(fun)(y).jaxpr)
-    return times * operations(code) > MAX_OPERATIONS
-
-
-class Program(NamedTuple):
-    """A function that is scalarised, and what it closes over.
-
-    Its state has short vectors along leading axes. `run(y, parameters)` takes both split, returns
-    what is split and closes over nothing traced. `plain` is the same, but for how it computes: as
-    the function does.
-    """
-
-    run: Callable[[PyTree, PyTree], PyTree]
-    plain: Callable[[PyTree, PyTree], PyTree]
-    parameters: list[Array]
-
-
 class Declined(Exception):
     """A program has something that is not to be scalarised."""
 
@@ -135,39 +109,14 @@ class Declined(Exception):
 class Reading(NamedTuple):
     """The program of a function that can be scalarised.
 
-    What it closes over is in `consts`, `shape` is that of its results, `length` counts operations.
+    What it closes over is in `consts`, and `shape` is that of its results. With `rows` its state
+    has short vectors along leading axes.
     """
 
     code: Jaxpr
     consts: Sequence[Any]
     shape: PyTree
     rows: bool
-    length: float
-
-    def scalarised(self, consts: Sequence[Any], *shapes: PyTree) -> tuple[ClosedJaxpr, Any] | None:
-        """The program of rows on what is split, of the given shapes; and the tree of its results.
-
-        `consts` are the values or parameters in the place of those that it closes over.
-        """
-        structure = jtu.tree_structure(self.shape)
-
-        def apart(y: PyTree, parameters: PyTree) -> PyTree:
-            first, moving = filled(consts, parameters), jtu.tree_leaves(y, is_leaf=_is_apart)
-            fixed = [True] * len(first) + [False] * len(moving)
-            is_long = self.length > FUNCTION
-            form = _Form(True, is_long, False, has_reciprocals(self.code, fixed), _CALLS, {})
-            outs, _ = _evaluate(self.code, (*first, *moving), fixed, form)
-            # What is known before the program runs may come out as NumPy's.
-            outs = [x if _is_apart(x) else jnp.asarray(x) for x in outs]
-            return split(jtu.tree_unflatten(structure, outs), rows=True)
-
-        try:
-            made, out = jax.make_jaxpr(apart, return_shape=True)(*shapes)
-        except Declined:
-            return None
-        except Exception as error:
-            return unread(error)
-        return made, out
 
 
 def read(
@@ -183,59 +132,27 @@ def read(
     rows = _has_rows(y, most)
     if not is_on() or not (rows or _is_small_state(y, most)):
         return None
-    with within(rows):
+    with within():
         jaxpr, shape = jax.make_jaxpr(fun, return_shape=True)(y)
     try:
         code = without_dead_code(jaxpr.jaxpr)
         if jaxpr.effects or not is_readable(code):
             return None
-        num_operations = operations(code)
-        if rows:
-            is_short = num_operations <= MAX_OPERATIONS
-        else:
-            # All of it, or each turn of a loop over stages.
-            scans = (eqn for eqn in code.eqns if eqn.primitive.name == "scan")
-            loops = [eqn.params["jaxpr"].jaxpr for eqn in scans]
-            is_short = min(map(length, (code, *loops))) <= FLAT_MANY
-        if not is_short:
+        # All of it, or each turn of a loop over stages.
+        scans = (eqn for eqn in code.eqns if eqn.primitive.name == "scan")
+        loops = [eqn.params["jaxpr"].jaxpr for eqn in scans]
+        if min(map(length, (code, *loops))) > FLAT_MANY:
             return None
     except Exception as error:
         return unread(error)
-    return Reading(code, jaxpr.consts, shape, rows, num_operations)
-
-
-def traced(fun: Callable[[PyTree], PyTree], y: PyTree, reading: Reading) -> Program | None:
-    """`fun`, which has been read, as a program that is scalarised; None if that cannot be done."""
-    structure = jtu.tree_structure(reading.shape)
-    before = ClosedJaxpr(reading.code, reading.consts)
-    if reading.length > _SHORT:
-        # Where a step is not scalarised its stages may be one loop.
-        with rewriting(False):
-            rolled, shape = jax.make_jaxpr(fun, return_shape=True)(y)
-        before = rolled if jtu.tree_structure(shape) == structure else before
-    parameters, consts, first = closed_over(reading.consts, before.consts)
-    shapes = jax.eval_shape(lambda *args: split(args, rows=True), y, parameters)
-    found = reading.scalarised(consts, *shapes)
-    if found is None:
-        return None
-    (made, out), code = found, without_constants(before)
-
-    def run(y: PyTree, parameters: PyTree) -> PyTree:
-        outs = called(made, jtu.tree_leaves((y, parameters)))
-        return jtu.tree_unflatten(jtu.tree_structure(out), outs)
-
-    def plain(y: PyTree, parameters: PyTree) -> PyTree:
-        constants = map(_whole, filled(first, parameters))
-        outs = jaxpr_as_fun(code)(*constants, *jtu.tree_leaves(join(y)))
-        return split_like(out, jtu.tree_unflatten(structure, outs))
-
-    return Program(run, plain, parameters)
+    return Reading(code, jaxpr.consts, shape, rows)
 
 
 def on_numbers(
     program: ClosedJaxpr,
     fixed: Sequence[bool],
     operands: Sequence[Any],
+    rows: bool,
     is_last: bool = True,
     is_cut: bool = False,
 ) -> list[Any]:
@@ -249,35 +166,12 @@ def on_numbers(
     flags = [*[True] * len(consts), *fixed]
     is_long = length(jaxpr) > FLAT_WHOLE
     calls = _LAST_CALLS if is_last else _CALLS
-    form = _Form(False, is_long, is_cut, has_reciprocals(jaxpr, flags), calls, {})
+    form = _Form(rows, is_long, is_cut, has_reciprocals(jaxpr, flags), calls, {}, {})
     outs, _ = _evaluate(jaxpr, (*consts, *operands), flags, form)
+    like = jax.eval_shape(functools.partial(split, rows=rows), structs_of(program.out_avals))
     # What is known before the program runs may come out as NumPy's.
-    return [x if _is_apart(x) else jnp.asarray(x) for x in outs]
-
-
-class _Parameter(NamedTuple):
-    """In the place of an array that a program closes over."""
-
-    number: int
-
-
-def closed_over(
-    consts: Sequence[Any], before: Sequence[Any]
-) -> tuple[list[Array], list[Any], list[Any]]:
-    """The arrays that two programs close over; and what each has, with these as parameters.
-
-    The first program is to be scalarised. It has indices as NumPy's arrays.
-    """
-    unknown = {id(x): x for x in consts if known_constant(x) is None}
-    unknown |= {id(x): x for x in before if isinstance(x, Tracer)}
-    number = {key: _Parameter(k) for k, key in enumerate(unknown)}
-    first = [number[id(x)] if id(x) in number else known_constant(x) for x in consts]
-    return list(map(jnp.asarray, unknown.values())), first, [number.get(id(x), x) for x in before]
-
-
-def filled(consts: Sequence[Any], parameters: Sequence[Any]) -> list[Any]:
-    """What a program closes over, with the values of parameters."""
-    return [parameters[x.number] if isinstance(x, _Parameter) else x for x in consts]
+    outs = [x if _is_apart(x) else jnp.asarray(x) for x in outs]
+    return split_like(like, outs)
 
 
 def known_constant(x: Any) -> np.ndarray | None:
@@ -306,11 +200,6 @@ def _has_rows(y: PyTree, max_entries: int) -> bool:
     )
 
 
-def operations(jaxpr: Jaxpr) -> float:
-    """About how many operations on single numbers or whole arrays there will be."""
-    return sum(map(_operations_of, jaxpr.eqns))
-
-
 def length(jaxpr: Jaxpr) -> float:
     """About how many operations on single numbers there will be, where nothing is left whole.
 
@@ -327,18 +216,10 @@ def _length_of(eqn: JaxprEqn) -> float:
         return eqn.params["length"] * length(eqn.params["jaxpr"].jaxpr)
     if name == "cond":
         return max(length(branch.jaxpr) for branch in eqn.params["branches"])
-    return math.inf if name == "while" else _operations_of(eqn)
-
-
-def _operations_of(eqn: JaxprEqn) -> float:
-    name = eqn.primitive.name
-    if name in _CALLS:
-        return operations(eqn.params["jaxpr"].jaxpr)
+    if name == "while":
+        return math.inf
     if name in MOVES:
         return 0
-    if name == "scan":
-        # Of stages that are too long together to be unrolled within a loop of steps.
-        return math.inf
     terms = 1
     if name == "dot_general":
         left: Any = eqn.invars[0].aval
@@ -372,6 +253,7 @@ class _Form(NamedTuple):
     has_reciprocals: bool
     calls: dict[str, str]
     literals: dict[Any, Any]
+    kept: dict[int, Any]
 
 
 def _evaluate(
@@ -413,10 +295,11 @@ def _evaluate(
         if name in form.calls:
             inner = eqn.params[form.calls[name]]
             outs, outs_fixed = _evaluate_inner(inner, values, fixed, form)
-        elif eqn.primitive is on_numbers_p:
+        elif eqn.primitive is is_scalarised_p:
             # In a derivative, what is computed again at the end of a step that fails would be zero
             # times NaN.
-            outs = [np.asarray(form.calls is _LAST_CALLS)]
+            is_one = eqn.params["in_derivatives"] or form.calls is _LAST_CALLS
+            outs = [np.asarray(is_one)]
         elif name == "scan":
             outs, outs_fixed = _unrolled(Loop.of(eqn), values, fixed, form)
         elif name == "cond":
@@ -482,23 +365,40 @@ def _in_parts(
     jaxpr, consts = program.jaxpr, list(map(_constant, program.consts))
     code = altered(jaxpr, constvars=[], invars=[*jaxpr.constvars, *jaxpr.invars])
     values, fixed = [*consts, *values], [*[True] * len(consts), *fixed]
+    are_tables = is_table
+    if form.rows:
+        # The points along the other axes are not those of stages.
+        pairs = zip(code.invars, values, strict=True)
+        are_tables = of_tables(code, [v for v, x in pairs if _is_apart(x) and x.is_table])
 
     def core(part: Jaxpr, given: Sequence[Any], are_fixed: Sequence[bool]) -> Any:
-        outs, outs_fixed = _again(part, numbers_materialised(given), are_fixed, form)
-        moving = [k for k, v in enumerate(part.outvars) if not (outs_fixed[k] or is_table(v))]
-        new = numbers_materialised([outs[k] for k in moving])
-        return replaced(outs, moving, new), outs_fixed
+        given = _entries_materialised(given, {})
+        return _again(part, given, are_fixed, form, list(map(are_tables, part.outvars)))
 
     def rest(part: Jaxpr, given: Sequence[Any], are_fixed: Sequence[bool]) -> Any:
         return _evaluate(part, given, are_fixed, form)
 
-    made = in_parts(code, values, fixed, core, rest)
+    made = in_parts(code, values, fixed, core, rest, are_tables)
     found = [(literal(v), True) if isinstance(v, Literal) else made[v] for v in jaxpr.outvars]
     return [x for x, _ in found], [is_one for _, is_one in found]
 
 
+def _entries_materialised(values: Sequence[Any], kept: dict[int, Any]) -> list[Any]:
+    """The same, with all numbers and entries materialised together that are not `kept` already."""
+    apart = [k for k, x in enumerate(values) if not is_whole(x)]
+    leaves, structure = jtu.tree_flatten([values[k] for k in apart])
+    moving = {id(x): x for x in leaves if isinstance(x, Tracer) and id(x) not in kept}
+    new = dict(zip(moving, together(list(moving.values())), strict=True))
+    made = structure.unflatten([new.get(id(x), x) for x in leaves])
+    return replaced(values, apart, made)
+
+
 def _again(
-    jaxpr: Jaxpr, values: Sequence[Any], fixed: Sequence[bool], form: _Form
+    jaxpr: Jaxpr,
+    values: Sequence[Any],
+    fixed: Sequence[bool],
+    form: _Form,
+    are_tables: Sequence[bool],
 ) -> tuple[list[Any], list[bool]]:
     """What a program makes of values, which reverse mode computes again."""
     leaves, structure = jtu.tree_flatten(list(values))
@@ -508,8 +408,11 @@ def _again(
     def run(some: list[Any]) -> list[Any]:
         nonlocal known
         given = structure.unflatten(replaced(leaves, places, some))
-        outs, outs_fixed = _evaluate(jaxpr, given, fixed, form._replace(literals={}))
-        made, shape = jtu.tree_flatten(outs)
+        inner = form._replace(literals={}, kept={})
+        outs, outs_fixed = _evaluate(jaxpr, given, fixed, inner)
+        single = [k for k, is_one in enumerate(outs_fixed) if not (is_one or are_tables[k])]
+        new = _entries_materialised([outs[k] for k in single], inner.kept)
+        made, shape = jtu.tree_flatten(replaced(outs, single, new))
         moving = [k for k, x in enumerate(made) if isinstance(x, Tracer)]
         known = [None if k in moving else x for k, x in enumerate(made)], moving, shape, outs_fixed
         return [made[k] for k in moving]
@@ -524,7 +427,7 @@ def _entry(x: Any, k: int) -> Any:
     if not _is_apart(x):
         return x[k]
     places = x.places[k]
-    return x.at(places, x.shape[1:]) if x.shape[1:] else x.entries[int(places)]
+    return x.at(places, x.shape[1:], x.is_short[1:]) if x.shape[1:] else x.entries[int(places)]
 
 
 def _stacked(rows: Sequence[Any]) -> Any:
@@ -540,13 +443,12 @@ def _constant(x: Any) -> Any:
     if isinstance(x, jax.Array):
         found = known_constant(x)
         return x if found is None else found
-    if not is_numeric(x) or np.size(x) > _MAX_KNOWN:
-        return x
-    x = np.asarray(x)
-    if not is_inexact(x):
+    if not is_numeric(x) or not is_inexact(np.asarray(x)):
         return x
     # As JAX's, which may overflow.
-    return StructOfArrays(list(map(jnp.asarray, x.flat)), x.shape) if x.ndim else jnp.asarray(x)
+    if np.ndim(x) == 0 or np.size(x) > _MAX_KNOWN or is_rows(x):
+        return jnp.asarray(x)
+    return StructOfArrays(list(map(jnp.asarray, np.ravel(x))), np.shape(x))
 
 
 # As of the weights of a method of 16 stages.
@@ -578,6 +480,8 @@ def _apart(
             return values
         # What is whole is in memory anyway.
         groups = [jtu.tree_flatten(x) for x in values]
-        new = iter(materialised([x for group, _ in groups for x in group], **eqn.params))
+        new = materialised([x for group, _ in groups for x in group], **eqn.params)
+        form.kept.update((id(x), x) for x in new)
+        new = iter(new)
         return [shape.unflatten(next(new) for _ in group) for group, shape in groups]
     return on_entries(jaxpr, eqn, values, fixed, form.rows)

@@ -2,15 +2,11 @@
 
 from collections.abc import Callable
 
-import jax.tree_util as jtu
 from jaxtyping import PyTree
 
-from .materialise import numbers_materialised
-from .operation import operation
-from .program import join, read, split, traced
+from .program import read
 from .scope import is_rewritten
 from .step import step
-from .struct_of_arrays import StructOfArrays
 
 
 def scalarised(
@@ -27,15 +23,4 @@ def scalarised(
     reading = None if is_rewritten() else read(fun, y)
     if reading is None:
         return fun(y)
-    if not reading.rows:
-        return step(reading, y, is_pair, in_batches)
-    program = traced(fun, y, reading)
-    if program is None:
-        return fun(y)
-    y, parameters = split((y, program.parameters), rows=True)
-    # What is around may use single entries, so that XLA computes anew what these share.
-    given = numbers_materialised((y, parameters), now=False)
-    out = operation(program.run, *given, plain=program.plain)
-    # One by one: what is not used is not computed.
-    is_apart = lambda x: isinstance(x, StructOfArrays)  # noqa: E731
-    return jtu.tree_map(lambda x: join(numbers_materialised(x, now=False)), out, is_leaf=is_apart)
+    return step(reading, y, is_pair, in_batches)

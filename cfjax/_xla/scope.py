@@ -3,7 +3,7 @@
 import contextlib
 import os
 import warnings
-from typing import Any, NamedTuple
+from typing import Any
 
 import jax
 import jax.numpy as jnp
@@ -67,34 +67,20 @@ def unread(error: Exception) -> None:
     )
 
 
-class _Around(NamedTuple):
-    """What is scalarised around a function that is being traced."""
-
-    is_step: bool = False
-    has_rows: bool = False
-
-
-# JAX traces anew where it changes, so that a function that is jitted, or cached otherwise, is
-# traced for the place in which it is called.
-_around = jax.make_user_context(_Around())
+# Whether a step is scalarised around a function that is being traced. JAX traces anew where it
+# changes, so that a function that is jitted, or cached otherwise, is traced for the place in which
+# it is called.
+_is_around = jax.make_user_context(False)
 
 
-def within(rows: bool) -> contextlib.AbstractContextManager:
-    """The time in which the program of a step is traced that is to be scalarised.
-
-    With `rows` its state has short vectors along leading axes.
-    """
-    return _around(_Around(True, rows))
-
-
-def has_rows() -> bool:
-    """Whether short vectors along leading axes are scalarised around here."""
-    return _around.value.has_rows
+def within() -> contextlib.AbstractContextManager:
+    """The time in which the program of a step is traced that is to be scalarised."""
+    return _is_around(True)
 
 
 def is_rewritten() -> bool:
     """Whether this is part of a program that is scalarised."""
-    return _around.value.is_step
+    return _is_around.value
 
 
 def is_short(x: Any) -> bool:

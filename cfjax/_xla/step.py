@@ -23,7 +23,7 @@ from jax.extend.core import ClosedJaxpr, JaxprEqn, Primitive, jaxpr_as_fun
 from jax.interpreters import ad, batching, mlir
 from jaxtyping import Array, PyTree
 
-from .derivatives import once_for_each_program
+from .in_two import in_two
 from .jaxprs import (
     CALLS,
     altered,
@@ -31,6 +31,7 @@ from .jaxprs import (
     flattened,
     is_inexact,
     narrowed,
+    once_for_each_program,
     program_of,
     reached,
     replaced,
@@ -47,18 +48,11 @@ from .limits import (
     MAX_ENTRIES,
     MAX_RESULTS_IN_BATCHES,
 )
-from .materialise import not_materialised
-from .operation import in_two, together
+from .materialise import not_materialised, together
 from .program import Declined, Reading, join, known_constant, length, on_numbers, split
 from .scope import is_everywhere, unread
 from .turns import by_turns
 
-# `levels` are the axes of each `vmap` around it, the innermost first. `fixed` says which operands
-# the step closes over, and `first` how many of its results are mostly used alone. A derivative is
-# linear in its last operands, `linear` of them, and a tangent knows what it is the tangent `of`.
-# With `once` its results are materialised together, as what needs several of them would compute it
-# anew for each. `most` says how long values and derivatives of one system may be, to be scalarised
-# as a whole.
 step_p = Primitive("cfjax_step")
 step_p.multiple_results = True
 
@@ -75,6 +69,46 @@ class Of(NamedTuple):
 
     def derived(self) -> ClosedJaxpr:
         return _derived(self.program, self.derive, self.moving, self.smooth)
+
+
+class Kind(NamedTuple):
+    """What an operation is, beyond its program."""
+
+    # Which operands the step closes over.
+    fixed: tuple[bool, ...]
+    # How many of the results are mostly used alone.
+    first: int
+    # Whether the state has short vectors along leading axes.
+    rows: bool
+    # How long values and derivatives of one system may be, to be scalarised as a whole.
+    most: tuple[int, int]
+    # The axes of each `vmap` around it, the innermost first.
+    levels: tuple[tuple[int | None, ...], ...] = ()
+    # How many of the last operands it is linear in, if it is a derivative.
+    linear: int = 0
+    # Whether its results are materialised together, as what needs several of them would compute it
+    # anew for each.
+    is_once: bool = False
+    # What a derivative is derived from.
+    of: Of | None = None
+
+    @property
+    def is_batch(self) -> bool:
+        """Whether it is of many systems."""
+        return self.rows or bool(self.levels)
+
+    def limit(self) -> int:
+        """How long a program may be, to be scalarised as a whole."""
+        values, derivatives = self.most
+        if not self.linear:
+            return FLAT_MANY if self.is_batch else values
+        return FLAT_MANY if self.is_batch and derivatives > FLAT_SECOND else derivatives
+
+    def is_cut(self, num_operations: float) -> bool:
+        """Whether a derivative is cut at the turns of a loop over stages."""
+        if self.rows:
+            return num_operations > FLAT_WHOLE
+        return num_operations > (FLAT_DERIVATIVES_IN_BATCHES if self.levels else FLAT_DERIVATIVES)
 
 
 # The limits for a step of many, and for any other.
@@ -95,17 +129,22 @@ def step(reading: Reading, y: PyTree, is_pair: bool, in_batches: bool) -> PyTree
         given,
         list(map(jnp.asarray, jtu.tree_leaves(y))),
         len(jtu.tree_leaves(reading.shape[0])) if is_pair else structure.num_leaves,
+        reading.rows,
         (0, 0) if in_batches else _MANY if is_everywhere() else _USUAL,
     )
     return jtu.tree_unflatten(structure, outs)
 
 
 def one_of(
-    program: ClosedJaxpr, parameters: Sequence[Any], operands: Sequence[Any], is_many: bool
+    program: ClosedJaxpr,
+    parameters: Sequence[Any],
+    operands: Sequence[Any],
+    rows: bool,
+    is_many: bool,
 ) -> list[Any]:
     """A step of several in one loop. If they are many, it may take longer to compile."""
     most = _MANY if is_many else _USUAL
-    return _bound(program, parameters, operands, len(program.out_avals), most)
+    return _bound(program, parameters, operands, len(program.out_avals), rows, most)
 
 
 def _bound(
@@ -113,6 +152,7 @@ def _bound(
     parameters: Sequence[Any],
     operands: Sequence[Any],
     first: int,
+    rows: bool,
     most: tuple[int, int],
 ) -> list[Any]:
     given, outs = [*parameters, *operands], program.out_avals
@@ -122,13 +162,9 @@ def _bound(
     are_made = reached(program.jaxpr, list(map(is_inexact, given)))
     made = [k for k, x in enumerate(outs) if is_inexact(x) or are_made[k]]
     exact = [k for k in range(len(outs)) if k not in made]
-    params = dict(levels=(), fixed=fixed, linear=0, once=False, most=most, of=None)
-    new = step_p.bind(
-        *given,
-        program=narrowed(program, made, range(len(given)))[0],
-        first=sum(k < first for k in made),
-        **params,
-    )
+    code, _ = narrowed(program, made, range(len(given)))
+    kind = Kind(fixed, sum(k < first for k in made), rows, most)
+    new = step_p.bind(*given, program=code, kind=kind)
     counting, takes = narrowed(program, exact)
     known = map(jnp.asarray, jaxpr_as_fun(counting)(*(given[k] for k in takes)))
     return replaced(replaced([None] * len(outs), made, new), exact, list(known))
@@ -152,8 +188,8 @@ def with_parameters(reading: Reading) -> tuple[ClosedJaxpr, list[Array]]:
 
 
 @step_p.def_abstract_eval
-def _(*operands, program, levels, **_):
-    sizes = _sizes(operands, levels)
+def _(*operands, program, kind):
+    sizes = _sizes(operands, kind.levels)
     return [ShapedArray((*sizes, *aval.shape), aval.dtype) for aval in program.out_avals]
 
 
@@ -167,11 +203,11 @@ def _sizes(operands: Sequence[Any], levels: Sequence[Any]) -> list[int]:
     return sizes
 
 
-def _jvp(primals, tangents, *, program, levels, fixed, linear, most, of, **params):
-    # Several derivatives in one loop take long to compile.
-    most = (most[0], min(most[1], FLAT_SECOND)) if linear else most
-    params = params | dict(levels=levels, fixed=fixed, linear=linear, most=most, of=of)
-    outs = step_p.bind(*primals, program=program, **params)
+def _jvp(primals, tangents, *, program, kind):
+    if kind.linear:
+        # Several derivatives in one loop take long to compile.
+        kind = kind._replace(most=(kind.most[0], min(kind.most[1], FLAT_SECOND)))
+    outs = step_p.bind(*primals, program=program, kind=kind)
     ways: list[Any] = [ad.Zero(jax.typeof(x).to_tangent_aval()) for x in outs]
     given = enumerate(zip(primals, tangents, strict=True))
     moving = tuple(k for k, (x, way) in given if type(way) is not ad.Zero and is_inexact(x))
@@ -179,30 +215,32 @@ def _jvp(primals, tangents, *, program, levels, fixed, linear, most, of, **param
     smooth = tuple(k for k, x in enumerate(outs) if is_inexact(x) and are_reached[k])
     if not (moving and smooth):
         return outs, ways
-    of = Of(_tangent, program, fixed, of, moving, smooth)
-    new = step_p.bind(
-        *primals,
-        *(tangents[k] for k in moving),
-        program=of.derived(),
-        levels=tuple((*axes, *(axes[k] for k in moving)) for axes in levels),
-        fixed=(*fixed, *[False] * len(moving)),
-        first=len(smooth),
-        linear=len(moving),
-        once=True,
-        most=most,
-        of=of,
+    of = Of(_tangent, program, kind.fixed, kind.of, moving, smooth)
+    new = _derivative(
+        kind._replace(
+            levels=tuple((*axes, *(axes[k] for k in moving)) for axes in kind.levels),
+            fixed=(*kind.fixed, *[False] * len(moving)),
+            first=len(smooth),
+            linear=len(moving),
+        ),
+        of,
+        [*primals, *(tangents[k] for k in moving)],
     )
     return outs, replaced(ways, smooth, new)
 
 
-def _transpose(cotangents, *operands, program, levels, fixed, linear, most, of, **_):
+def _derivative(kind: Kind, of: Of, operands: Sequence[Any]) -> list[Any]:
+    return step_p.bind(*operands, program=of.derived(), kind=kind._replace(is_once=True, of=of))
+
+
+def _transpose(cotangents, *operands, program, kind):
     unknown = tuple(k for k, x in enumerate(operands) if ad.is_undefined_primal(x))
     coming = tuple(k for k, x in enumerate(cotangents) if type(x) is not ad.Zero)
     results: list[Any] = [None] * len(operands)
     if not coming:
         return results
     rest = [k for k in range(len(operands)) if k not in unknown]
-    first = len(operands) - linear
+    first, of = len(operands) - kind.linear, kind.of
     if of is not None and of.derive is _tangent and unknown[0] >= first:
         # By `vjp` of what this is the derivative of: a loop in it has values in its carry, and is
         # not linear.
@@ -212,18 +250,17 @@ def _transpose(cotangents, *operands, program, levels, fixed, linear, most, of, 
         # The other directions have no part in it.
         rest = [k for k in rest if k < first]
     else:
-        of = Of(_transposed, program, fixed, of, unknown, coming)
-    outs = step_p.bind(
-        *(operands[k] for k in rest),
-        *(cotangents[k] for k in coming),
-        program=of.derived(),
-        levels=tuple((*(axes[k] for k in rest), *[0] * len(coming)) for axes in levels),
-        fixed=(*(fixed[k] for k in rest), *[False] * len(coming)),
-        first=len(unknown),
-        linear=len(coming),
-        once=True,
-        most=most,
-        of=of,
+        of = Of(_transposed, program, kind.fixed, of, unknown, coming)
+    levels = kind.levels
+    outs = _derivative(
+        kind._replace(
+            levels=tuple((*(axes[k] for k in rest), *[0] * len(coming)) for axes in levels),
+            fixed=(*(kind.fixed[k] for k in rest), *[False] * len(coming)),
+            first=len(unknown),
+            linear=len(coming),
+        ),
+        of,
+        [*(operands[k] for k in rest), *(cotangents[k] for k in coming)],
     )
     for k, x in zip(unknown, outs, strict=True):
         # What all members share gets the sum of their derivatives.
@@ -303,11 +340,12 @@ def _derived(
     return program_of(fun, *given, *(outs[k] for k in smooth))
 
 
-def _batch(operands, dims, *, program, levels, **params):
+def _batch(operands, dims, *, program, kind):
     given = zip(operands, dims, strict=True)
     moved = [x if d is None else jnp.moveaxis(x, d, 0) for x, d in given]
     axes = tuple(None if d is None else 0 for d in dims)
-    outs = step_p.bind(*moved, program=program, levels=(*levels, axes), **params)
+    kind = kind._replace(levels=(*kind.levels, axes))
+    outs = step_p.bind(*moved, program=program, kind=kind)
     # What the batch does not reach is in no batch.
     are_reached = reached(program.jaxpr, [d is not None for d in dims])
     outs = [x if is_one else _one_of(x) for x, is_one in zip(outs, are_reached, strict=True)]
@@ -320,74 +358,66 @@ def _one_of(xs):
 
 
 @step_p.def_impl
-def _run(*operands, program, levels, fixed, first, linear, once, most, of):
+def _run(*operands, program, kind):
     num_operations = length(program.jaxpr)
-    if num_operations > _most(levels, linear, most):
-        return _as_traced(operands, program, levels, fixed, most)
-    for k, size in enumerate(reversed(_sizes(operands, levels))):
-        moves = [axis is not None for axis in levels[k]]
-        is_linear = linear and not any(moves[: len(moves) - linear])
+    if num_operations > kind.limit():
+        return _as_traced(operands, program, kind)
+    for k, size in enumerate(reversed(_sizes(operands, kind.levels))):
+        moves = [axis is not None for axis in kind.levels[k]]
+        is_linear = kind.linear and not any(moves[: len(moves) - kind.linear])
         if is_linear and size <= MAX_ENTRIES["step"]:
-            params = dict(fixed=fixed, first=first, linear=linear, once=once)
-            params.update(program=program, most=most, of=of)
-            return _one_by_one(operands, levels, k, params)
-    if levels and num_operations > FLAT_WHOLE:
-        operands = _without_single_numbers(operands, levels)
-    most_at_once = FLAT_DERIVATIVES_IN_BATCHES if levels else FLAT_DERIVATIVES
-    fun = _of_numbers(program, fixed, of, num_operations > most_at_once)
-    outs = _flat(operands, fun, levels, first, once)
-    return _as_traced(operands, program, levels, fixed, most) if outs is None else outs
-
-
-def _most(levels: Sequence[Any], linear: int, most: tuple[int, int]) -> int:
-    """How long a program may be, to be scalarised as a whole."""
-    values, derivatives = most
-    if not linear:
-        return FLAT_MANY if levels else values
-    return FLAT_MANY if levels and derivatives > FLAT_SECOND else derivatives
+            return _one_by_one(operands, program, kind, k)
+    if kind.is_batch and num_operations > FLAT_WHOLE:
+        operands = _without_single_numbers(operands, kind.levels)
+    outs = _flat(operands, program, kind, kind.is_cut(num_operations))
+    return _as_traced(operands, program, kind) if outs is None else outs
 
 
 def _of_numbers(
-    program: ClosedJaxpr, fixed: Sequence[bool], of: Of | None, is_cut: bool, is_last: bool = True
+    program: ClosedJaxpr,
+    fixed: Sequence[bool],
+    of: Of | None,
+    rows: bool,
+    is_cut: bool,
+    is_last: bool = True,
 ) -> Callable[..., list[Any]]:
     """The program of operands that are apart. A derivative is that of the numbers."""
     if of is None:
-        return lambda *xs: on_numbers(program, fixed, xs, is_last, is_cut and not is_last)
-    fun = _of_numbers(of.program, of.fixed, of.of, is_cut, False)
-    shapes = jax.eval_shape(split, structs_of(of.program.in_avals))
+        return lambda *xs: on_numbers(program, fixed, xs, rows, is_last, is_cut and not is_last)
+    fun = _of_numbers(of.program, of.fixed, of.of, rows, is_cut, False)
+    shapes = jax.eval_shape(functools.partial(split, rows=rows), structs_of(of.program.in_avals))
     return of.derive(fun, shapes, of.moving, of.smooth)
 
 
-def _one_by_one(operands, levels, k, params):
+def _one_by_one(operands, program, kind, k):
     """One member of a batch after the other, as of the few directions of a Jacobian.
 
     In a program for all of them single numbers meet arrays, and XLA would compute the former anew
     for every use.
     """
-    rest = [*levels[:k], *levels[k + 1 :]]
+    levels = kind.levels
+    kind = kind._replace(levels=(*levels[:k], *levels[k + 1 :]))
     moving = [n for n, axis in enumerate(levels[k]) if axis is not None]
     # What is outside of this batch comes first.
     places = [sum(axes[n] is not None for axes in levels[k + 1 :]) for n in moving]
     given = zip(moving, places, strict=True)
     outs = lax.map(
-        lambda some: step_p.bind(*replaced(operands, moving, some), levels=tuple(rest), **params),
+        lambda some: step_p.bind(*replaced(operands, moving, some), program=program, kind=kind),
         [jnp.moveaxis(operands[n], place, 0) for n, place in given],
     )
     return [jnp.moveaxis(x, 0, len(levels) - 1 - k) for x in outs]
 
 
 def _flat(
-    operands: Sequence[Any],
-    fun: Callable[..., list[Any]],
-    levels: Sequence[Any],
-    first: int,
-    once: bool,
+    operands: Sequence[Any], program: ClosedJaxpr, kind: Kind, is_cut: bool
 ) -> list[Any] | None:
     """The results, computed on single numbers; None if the program declines."""
+    levels, rows = kind.levels, kind.rows
+    fun = _of_numbers(program, kind.fixed, kind.of, rows, is_cut)
 
     def apart(k: int) -> Any:
         axes = [(axes[k],) for axes in levels if axes[k] is not None]
-        return _in_batches(split, axes)(operands[k])
+        return _in_batches(functools.partial(split, rows=rows), axes)(operands[k])
 
     given = [apart(k) for k in range(len(operands))]
     try:
@@ -398,11 +428,11 @@ def _flat(
     except Exception as error:
         return unread(error)
     leaves = jtu.tree_leaves(given)
-    if levels and first < len(out):
-        new = in_two(code, len(jtu.tree_leaves(out[:first])), leaves)
+    if levels and kind.first < len(out):
+        new = in_two(code, len(jtu.tree_leaves(out[: kind.first])), leaves)
     else:
         new = called(code, leaves)
-    if once:
+    if kind.is_once:
         # But for what is known, as the derivative by what has no part in it.
         are_made = reached(code.jaxpr, [True] * len(leaves))
         places = [k for k, is_one in enumerate(are_made) if is_one]
@@ -415,26 +445,24 @@ def _flat(
 
 def whole(eqn: JaxprEqn) -> ClosedJaxpr:
     """The program of an operation as it was traced, of all members of a batch."""
-    program, levels = eqn.params["program"], eqn.params["levels"]
+    program, levels = eqn.params["program"], eqn.params["kind"].levels
     fun = _in_batches(jaxpr_as_fun(program), levels)
     return program_of(fun, *structs(eqn.invars)) if levels else program
 
 
-def _as_traced(operands, program, levels, fixed, most) -> list[Any]:
-    if levels:
-        operands = _without_single_numbers(operands, levels)
-    fun = jaxpr_as_fun(by_turns(not_materialised(program), fixed, functools.partial(_turn, most)))
+def _as_traced(operands, program, kind) -> list[Any]:
+    if kind.levels:
+        operands = _without_single_numbers(operands, kind.levels)
+    turn = functools.partial(_turn, kind)
+    fun = jaxpr_as_fun(by_turns(not_materialised(program), kind.fixed, turn))
     # A literal comes out as NumPy's.
-    return list(map(jnp.asarray, _in_batches(fun, levels)(*operands)))
+    return list(map(jnp.asarray, _in_batches(fun, kind.levels)(*operands)))
 
 
-def _turn(
-    most: tuple[int, int], operands: Sequence[Any], program: ClosedJaxpr, fixed: Sequence[bool]
-):
+def _turn(kind: Kind, operands: Sequence[Any], program: ClosedJaxpr, fixed: Sequence[bool]):
     """A turn of a loop as an operation."""
-    first = len(program.out_avals)
-    params = dict(levels=(), first=first, linear=0, once=True, most=most, of=None)
-    return step_p.bind(*operands, program=program, fixed=tuple(fixed), **params)
+    kind = Kind(tuple(fixed), len(program.out_avals), kind.rows, kind.most, is_once=True)
+    return step_p.bind(*operands, program=program, kind=kind)
 
 
 def _in_batches(fun: Callable[..., Any], levels: Sequence[Any]) -> Callable[..., Any]:

@@ -55,7 +55,7 @@ def _turn(jaxpr: Jaxpr, operands: Sequence[Any], fixed: Sequence[bool], run: Run
     def rest(part: Jaxpr, given: Sequence[Any], _: Sequence[bool]) -> Any:
         return jaxpr_as_fun(ClosedJaxpr(part, []))(*given), [False] * len(part.outvars)
 
-    made = in_parts(jaxpr, operands, fixed, core, rest)
+    made = in_parts(jaxpr, operands, fixed, core, rest, is_table)
     values = {v: x for v, (x, _) in made.items()}
     return [value_of(v, values) for v in jaxpr.outvars]
 
@@ -65,7 +65,12 @@ Part = Callable[[Jaxpr, Sequence[Any], Sequence[bool]], tuple[Sequence[Any], Seq
 
 
 def in_parts(
-    jaxpr: Jaxpr, operands: Sequence[Any], fixed: Sequence[bool], core: Part, rest: Part
+    jaxpr: Jaxpr,
+    operands: Sequence[Any],
+    fixed: Sequence[bool],
+    core: Part,
+    rest: Part,
+    is_table: Callable[[Any], bool],
 ) -> dict[Any, tuple[Any, bool]]:
     """The values of a turn, and whether each is fixed.
 
@@ -73,16 +78,16 @@ def in_parts(
     """
     values = zip(operands, fixed, strict=True)
     made: dict[Any, tuple[Any, bool]] = dict(zip(jaxpr.invars, values, strict=True))
-    for part, run in zip(_parts_of(jaxpr), (rest, core, rest), strict=True):
+    for part, run in zip(_parts_of(jaxpr, is_table), (rest, core, rest), strict=True):
         given = [made[v] for v in part.invars]
         outs = run(part, [x for x, _ in given], [is_one for _, is_one in given])
         made.update(zip(part.outvars, zip(*outs, strict=True), strict=True))
     return made
 
 
-def _parts_of(jaxpr: Jaxpr) -> tuple[Jaxpr, Jaxpr, Jaxpr]:
+def _parts_of(jaxpr: Jaxpr, is_table: Callable[[Any], bool]) -> tuple[Jaxpr, Jaxpr, Jaxpr]:
     """What a turn reads of tables, what it makes of short vectors, and the tables of that."""
-    before, within, after = _apart(jaxpr)
+    before, within, after = _apart(jaxpr, is_table)
     end = _part(jaxpr, after, variables(jaxpr.outvars))
     core = _part(jaxpr, within, variables((*jaxpr.outvars, *end.invars)))
     start = _part(jaxpr, before, variables((*jaxpr.outvars, *end.invars, *core.invars)))
@@ -100,7 +105,9 @@ def _part(jaxpr: Jaxpr, eqns: Sequence[JaxprEqn], wanted: Sequence[Any]) -> Jaxp
     return altered(code, invars=list(taken))
 
 
-def _apart(jaxpr: Jaxpr) -> tuple[list[JaxprEqn], list[JaxprEqn], list[JaxprEqn]]:
+def _apart(
+    jaxpr: Jaxpr, is_table: Callable[[Any], bool]
+) -> tuple[list[JaxprEqn], list[JaxprEqn], list[JaxprEqn]]:
     """What reads tables, what is on short vectors, and what makes tables of that."""
     available = {*jaxpr.constvars, *jaxpr.invars}
     tables = {v for v in jaxpr.invars if is_table(v)}
@@ -143,3 +150,16 @@ def _apart(jaxpr: Jaxpr) -> tuple[list[JaxprEqn], list[JaxprEqn], list[JaxprEqn]
 def is_table(v: Any) -> bool:
     """Whether this is an array of vectors of all stages, or of what a loop made in all turns."""
     return len(v.aval.shape) > 1 and v.aval.size > MAX_LENGTH
+
+
+def of_tables(jaxpr: Jaxpr, tables: Sequence[Any]) -> Callable[[Any], bool]:
+    """Whether a value of a program is one of some tables, or a table that is made of them."""
+    found, ranks = set(tables), {v.aval.ndim for v in tables}
+
+    def is_one(v: Any) -> bool:
+        return v.aval.ndim in ranks and v.aval.shape[0] > 1
+
+    for eqn in jaxpr.eqns:
+        if not found.isdisjoint(variables(eqn.invars)):
+            found.update(filter(is_one, eqn.outvars))
+    return found.__contains__

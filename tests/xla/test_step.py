@@ -191,6 +191,13 @@ def test_a_derivative_in_two_operands_is_transposed_in_one():
     check(found, jax.jacfwd(lambda s: as_it_is(X, s)["x"])(SCALE) @ X[::-1])
 
 
+def test_constants_that_agree_in_nine_digits_stay_apart():
+    fun = lambda x, p: x * (1 / 3 + 1e-10) - x * (1 / 3)  # noqa: E731
+    found = quick(random_programs.rewritten(fun))(X, 0.0)
+    # The rounding of two numbers of size 0.4.
+    np.testing.assert_allclose(found, 1e-10 * X, rtol=0, atol=1e-16)
+
+
 def test_reverse_mode_keeps_the_operands_alone():
     _, back = jax.vjp(lambda x: rewritten(x, SCALE)["x"], X)
     # And 1 / 3 for each k as constants of the program.
