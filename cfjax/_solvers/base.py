@@ -25,7 +25,6 @@ from .compensation import added, at, no_compensation, zeros
 from .compiled import (
     computed_again,
     control_of,
-    is_rewritten,
     materialised_in_rows,
     scalarised,
     shared_end,
@@ -161,9 +160,8 @@ class AbstractChartSolver(AbstractLieSolver):
         return path
 
     def step(self, terms, t0, t1, y0, args, solver_state, made_jump):
-        # Not in a loop that is scalarised, which JAX does not know of, nor where times are known.
-        is_usual = isinstance(t0, Tracer) and not is_rewritten()
-        step = _step_once if is_usual else AbstractChartSolver._step
+        # Not where times are known.
+        step = _step_once if isinstance(t0, Tracer) else AbstractChartSolver._step
         solver: Any = self.for_terms(terms)
         return step(solver, terms, t0, t1, y0, args, solver_state, made_jump)
 

@@ -12,14 +12,13 @@ import jax
 import jax.numpy as jnp
 import jax.tree_util as jtu
 import numpy as np
-from jax import lax
 from jaxtyping import PyTree
 
 from .._control_term import is_driven
 from .._xla import chosen as chosen
 from .._xla import computed_again as computed_again
+from .._xla import computed_once as computed_once
 from .._xla import invariant as invariant
-from .._xla import is_rewritten as is_rewritten
 from .._xla import limits as limits
 from .._xla import materialised_if_long as materialised_if_long
 from .._xla import materialised_in_rows as materialised_in_rows
@@ -33,11 +32,8 @@ from .compensation import with_sums
 def control_of(terms: diffrax.AbstractTerm, t0: Any, t1: Any, **kwargs: Any) -> PyTree:
     """The control of a step, whose random numbers are drawn once."""
     control = terms.contr(t0, t1, **kwargs)
-    if not is_driven(terms):
-        return control
-    # Otherwise XLA makes normal numbers of the random bits again for each flow that uses them. A
-    # barrier in what is rewritten would keep arrays whole.
-    return materialised_in_rows(control) if is_rewritten() else lax.optimization_barrier(control)
+    # Otherwise XLA makes normal numbers of the random bits again for each flow that uses them.
+    return computed_once(control) if is_driven(terms) else control
 
 
 def by_turns(

@@ -4,8 +4,8 @@
 - `over_stages`, `chosen`: a loop over the stages of a method, and a choice within it, which are
   part of what is scalarised; `where_scalarised`, `computed_again`: what is computed otherwise
   there.
-- `materialised_if_long`, `materialised_together`, `materialised_in_rows`: values that several
-  results need, computed once.
+- `materialised_if_long`, `materialised_together`, `materialised_in_rows`, `computed_once`: values
+  that several results need, computed once.
 - `invariant`: a mark of values that may be the same in every turn of a loop; `invariants_first`: a
   turn with those computed before.
 - `pack`, `unpack`: `jnp.stack` and `jnp.unstack` in a form that XLA fuses.
@@ -22,6 +22,7 @@ from .call import call as call
 from .invariant import invariant as invariant
 from .invariant import invariants_first as invariants_first
 from .loop import repeat as repeat
+from .materialise import computed_once as computed_once
 from .materialise import materialised as materialised
 from .materialise import materialised_if_long as materialised_if_long
 from .materialise import materialised_in_rows as materialised_in_rows

@@ -8,6 +8,7 @@ import jax
 import jax.numpy as jnp
 import jax.tree_util as jtu
 import numpy as np
+from jax import lax
 from jax.experimental.xla_metadata import set_xla_metadata
 from jax.extend.core import ClosedJaxpr, Jaxpr, Literal, Primitive
 from jax.interpreters import ad, batching, mlir
@@ -77,6 +78,12 @@ def materialised_in_rows(tree: PyTree, alone: bool = False) -> PyTree:
     for k in places:
         (leaves[k],) = materialised([leaves[k]], in_batches=True)
     return structure.unflatten(leaves)
+
+
+def computed_once(tree: PyTree) -> PyTree:
+    """The same arrays, computed once in any program."""
+    # A barrier in what is rewritten would keep arrays whole.
+    return materialised_in_rows(tree) if is_rewritten() else lax.optimization_barrier(tree)
 
 
 def together(values: Sequence[Any]) -> list[Any]:
