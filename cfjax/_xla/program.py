@@ -244,7 +244,7 @@ class _Form(NamedTuple):
 
     Whether arrays have leading axes, the program is long, is cut into pieces, and products with
     reciprocals take the place of divisions by what is fixed; which calls are a part of it, and
-    under which parameter; and its literals, each of which is made once.
+    under which parameter; its literals, each of which is made once; and what is materialised.
     """
 
     rows: bool

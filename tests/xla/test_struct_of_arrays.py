@@ -10,7 +10,7 @@ from jax import lax
 from xla.interpreter import lowered
 
 import cfjax
-from cfjax._xla import program, scalarised
+from cfjax._xla import limits, program, scalarised
 from cfjax._xla.program import join, split
 from cfjax._xla.scope import is_rows
 from cfjax._xla.struct_of_arrays import StructOfArrays, struct_of_arrays
@@ -55,6 +55,11 @@ def split_up(y):
     a, b, c = jnp.split(y, 3, -1)
     first, rest = jnp.split(y, [4], 0)
     return jnp.concatenate([b, c, a], -1) + jnp.concatenate([rest, first], 0) + y[:, :1]
+
+
+def windows(y):
+    part = lax.dynamic_slice(y, (0, 0, 1), (9, 8, 2))
+    return lax.dynamic_update_slice(y * W, part * part, (3, 3, 3))
 
 
 def picked(y):
@@ -104,8 +109,8 @@ def parameters(y):
     return sites * scale / (1 + scale) + y / scale + y / sites * jnp.asarray(W)
 
 
-FUNCTIONS = [crosses, lengths, moved, swapped, joined, split_up, picked, added_at, sums, products,
-             frames, chosen, waves, parameters]  # fmt: skip
+FUNCTIONS = [crosses, lengths, moved, swapped, joined, split_up, picked, windows, added_at, sums,
+             products, frames, chosen, waves, parameters]  # fmt: skip
 
 
 @pytest.fixture(autouse=True)
@@ -178,6 +183,16 @@ def test_what_has_no_rule_gets_arrays_whole(leftover):
     slope = lambda f: jax.jvp(f, (jnp.asarray(Y),), (jnp.ones_like(Y),))[1]  # noqa: E731
     # Sums of three numbers, in another order. The rule of `odd` survives.
     np.testing.assert_allclose(slope(lambda y: scalarised(fun, y)), slope(fun), atol=1e-14)
+
+
+@pytest.mark.parametrize("place", [2, jnp.asarray(2)])
+def test_windows_of_leading_axes_stay_whole(place):
+    def fun(y):
+        part = lax.dynamic_slice(jnp.sin(y), (place, 0, 0), (4, 8, 3))
+        return y + jnp.sum(part, 0), lax.dynamic_update_slice(y * W, part, (3, place, 0))
+
+    for a, b in zip(jax.jit(lambda y: scalarised(fun, y))(Y), fun(jnp.asarray(Y)), strict=True):
+        np.testing.assert_allclose(a, b, rtol=1e-14, atol=1e-14)
 
 
 def test_a_matrix_is_no_lattice():
@@ -289,6 +304,17 @@ def test_derivatives_of_a_solve_in_batches():
         plain = jit()
     for a, b in zip(rewritten, plain, strict=True):
         np.testing.assert_allclose(a, b, rtol=1e-11, atol=1e-11)
+
+
+def test_a_solve_of_many_vectors():
+    """Their combinations are products of matrices where they are not rewritten."""
+    y = np.random.default_rng(1).normal(size=(40, 20, 3))
+    assert y.size > limits.LARGE
+    term = cfjax.LieTerm(lambda t, y, args: cfjax.Rotation(jnp.roll(y, 1, 0) + jnp.cos(t)))
+    end = lambda y: cfjax.integrate(term, cfjax.CF4(), 0.0, 0.4, y, num_steps=3).ys[-1]  # noqa: E731
+    rewritten = jax.jit(end)(y)
+    with cfjax.rewriting(False):
+        np.testing.assert_allclose(rewritten, jax.jit(end)(y), rtol=1e-13, atol=1e-13)
 
 
 def test_a_linear_solve_is_transposed():
