@@ -196,6 +196,7 @@ def test_messages_that_are_explained_are_those_that_are_raised():
     others = {
         "can't apply forward-mode autodiff (jvp) to a custom_vjp function",
         "missing 2 required keyword-only arguments: 'frame' and 'layout'",
+        "is not found in mesh: ()",
     }
     page = (ROOT / "docs" / "errors.md").read_text()
     rows = re.findall(r"^\| (.*?) \|", page, flags=re.MULTILINE)[2:]
