@@ -42,8 +42,10 @@ FLAT_VALUES = FUNCTION
 FLAT_DERIVATIVES = 3 * FUNCTION
 FLAT_DERIVATIVES_IN_BATCHES = 5 * FUNCTION // 2
 # Of batches, short vectors along leading axes, and what is made for many steps. A gradient of this
-# length takes some 12 s to compile (gradients, batch, chain).
-FLAT_MANY = 8 * FUNCTION
+# length takes some 12 s to compile (gradients, batch, chain). Values are not cut: those of 16 000
+# operations, a step of `RKMK8` on a heavy top, did not end in a batch.
+FLAT_MANY = 7 * FUNCTION
+FLAT_MANY_DERIVATIVES = 8 * FUNCTION
 # Of a derivative that is differentiated again, and of that. (fits, gradients)
 FLAT_SECOND = 2 * FUNCTION
 # Of all these what is longer is cut where a method says, and a derivative on leading axes at the

@@ -42,6 +42,7 @@ from .limits import (
     FLAT_DERIVATIVES,
     FLAT_DERIVATIVES_IN_BATCHES,
     FLAT_MANY,
+    FLAT_MANY_DERIVATIVES,
     FLAT_SECOND,
     FLAT_VALUES,
     FLAT_WHOLE,
@@ -102,7 +103,8 @@ class Kind(NamedTuple):
         values, derivatives = self.most
         if not self.linear:
             return FLAT_MANY if self.is_batch else values
-        return FLAT_MANY if self.is_batch and derivatives > FLAT_SECOND else derivatives
+        is_first = derivatives > FLAT_SECOND
+        return FLAT_MANY_DERIVATIVES if self.is_batch and is_first else derivatives
 
     def is_cut(self, num_operations: float) -> bool:
         """Whether a derivative is cut at the turns of a loop over stages."""
@@ -112,7 +114,7 @@ class Kind(NamedTuple):
 
 
 # The limits for a step of many, and for any other.
-_MANY = FLAT_MANY, FLAT_MANY
+_MANY = FLAT_MANY, FLAT_MANY_DERIVATIVES
 _USUAL = FLAT_VALUES, FLAT_DERIVATIVES
 
 

@@ -41,7 +41,12 @@ def lengths(request, monkeypatch):
     # Those of the other way, of the same functions.
     jax.clear_caches()
     if request.param == "as traced":
-        for name, limit in (("_USUAL", (0, 0)), ("_MANY", (0, 0)), ("FLAT_MANY", 0)):
+        for name, limit in (
+            ("_USUAL", (0, 0)),
+            ("_MANY", (0, 0)),
+            ("FLAT_MANY", 0),
+            ("FLAT_MANY_DERIVATIVES", 0),
+        ):
             monkeypatch.setattr(random_programs.lowering, name, limit)
     return request.param
 
