@@ -229,9 +229,6 @@ def rolled_elements(
     if len(rows) < 2 or not all(map(any, rows)):
         return None
 
-    def stage(c: Any, u: PyTree) -> PyTree:
-        return element(u, chart.frozen_after([u], c, chart.flow(u, chart.start)))
-
     if can_roll(unroll, first, first) and is_uniform(chart):
         fields = _Stacked.of(known, n)
         made, total = _rolled_elements(chart, fields, len(known), rows, times, element, number)

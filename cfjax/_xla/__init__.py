@@ -33,7 +33,7 @@ from .over_stages import over_stages as over_stages
 from .over_stages import where_scalarised as where_scalarised
 from .pack import pack as pack
 from .pack import unpack as unpack
-from .scalarise import scalarised as scalarised
 from .scope import is_rewritten as is_rewritten
 from .scope import rewriting as rewriting
 from .smooth import smooth as smooth
+from .step import scalarised as scalarised

@@ -1,7 +1,6 @@
 """Programs of JAX as values: what they need, what reaches what, parts of them, their evaluation."""
 
 import functools
-import itertools
 import weakref
 from collections.abc import Callable, Container, Hashable, Iterable, Sequence
 from typing import Any
@@ -37,10 +36,6 @@ CALLS = {
     "jit": "jaxpr",
     "pjit": "jaxpr",
 }
-_FREE = frozenset(
-    "broadcast_in_dim cfjax_pack cfjax_unpack convert_element_type copy reshape slice squeeze "
-    "transpose".split()
-)
 
 
 def program_of(fun: Callable[..., Sequence[Array]], *structs: Any) -> ClosedJaxpr:
@@ -74,13 +69,6 @@ def replaced(values: Sequence[Any], places: Sequence[int], new: Sequence[Any]) -
 
 def is_inexact(x: Any) -> bool:
     return jnp.issubdtype(x.dtype, jnp.inexact)
-
-
-def num_operations(eqn: JaxprEqn) -> int:
-    """How many operations on numbers or whole arrays."""
-    if eqn.primitive.name in CALLS:
-        return sum(map(num_operations, eqn.params[CALLS[eqn.primitive.name]].eqns))
-    return int(eqn.primitive.name not in _FREE)
 
 
 def without_dead_code(jaxpr: Jaxpr) -> Jaxpr:
@@ -122,36 +110,6 @@ def reached(jaxpr: Jaxpr, sources: Sequence[bool]) -> list[bool]:
         if any(are_found(eqn.invars)):
             found.update(eqn.outvars)
     return are_found(jaxpr.outvars)
-
-
-def by_parts(
-    program: ClosedJaxpr,
-    ends: Sequence[int],
-    run: Callable[[ClosedJaxpr, Sequence[Any], bool], Sequence[Any]],
-    *operands: Any,
-) -> list[Any]:
-    """The results of a program whose parts, from one end to the next, `run` computes.
-
-    It gets a part, what that takes from those before, and whether it is the last. It returns what
-    later ones and the results need.
-    """
-    jaxpr, env = program.jaxpr, _environment(program, operands)
-    for start, stop in itertools.pairwise(ends):
-        eqns = jaxpr.eqns[start:stop]
-        made = {v for e in eqns for v in e.outvars}
-        taken = dict.fromkeys(v for e in eqns for v in variables(e.invars) if v not in made)
-        later = [v for e in jaxpr.eqns[stop:] for v in variables(e.invars)]
-        given = dict.fromkeys(v for v in (*later, *variables(jaxpr.outvars)) if v in made)
-        part = altered(jaxpr, eqns=eqns, constvars=[], invars=list(taken), outvars=list(given))
-        outs = run(ClosedJaxpr(part, []), [env[v] for v in taken], stop == len(jaxpr.eqns))
-        env.update(zip(given, outs, strict=True))
-    return [value_of(v, env) for v in jaxpr.outvars]
-
-
-def _environment(program: ClosedJaxpr, operands: Sequence[Any]) -> dict[Any, Any]:
-    jaxpr = program.jaxpr
-    names, values = (*jaxpr.constvars, *jaxpr.invars), (*program.consts, *operands)
-    return dict(zip(names, values, strict=True))
 
 
 def value_of(v: Any, env: dict[Any, Any]) -> Any:

@@ -17,7 +17,7 @@ from .limits import MANY, MAX_ENTRIES, MAX_SIZE
 from .pack import pack, unpack
 from .program import read
 from .scope import is_rows
-from .step import one_of, with_parameters
+from .step import one_of
 
 
 def repeat(
@@ -42,7 +42,7 @@ def repeat(
         return _loop(jax.checkpoint(step), carry, num_steps, keep)
     leaves, structure = jtu.tree_flatten(carry)
     leaves = list(map(jnp.asarray, leaves))
-    program, parameters = with_parameters(reading)
+    program, parameters = reading.program, reading.parameters
     form, n = _Form.of(leaves), len(parameters)
 
     def of_parts(*operands: Array) -> list[Array]:

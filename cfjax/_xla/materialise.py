@@ -25,16 +25,15 @@ def materialised(
     *,
     in_batches: bool = False,
     alone: bool = True,
-    now: bool = True,
     is_cut: bool = False,
 ) -> list[Array]:
     """The same arrays, materialised: sent through memory.
 
     Otherwise XLA may compute them anew for every use. In a batch, where memory is what
-    takes time, only if asked for, on CPU; outside of batches only if `alone`; and if not `now`,
-    only where this is differentiated; and if `is_cut`, only in a program that is long.
+    takes time, only if asked for, on CPU; outside of batches only if `alone`; and if `is_cut`, only
+    in a program that is long.
     """
-    return materialised_p.bind(*entries, in_batches=in_batches, alone=alone, now=now, is_cut=is_cut)
+    return materialised_p.bind(*entries, in_batches=in_batches, alone=alone, is_cut=is_cut)
 
 
 def materialised_if_long(tree: PyTree) -> PyTree:
@@ -143,10 +142,8 @@ materialised_p.multiple_results = True
 
 
 @materialised_p.def_impl
-def _materialised_impl(*entries, in_batches, alone, now, is_cut, has_calls=False):
+def _materialised_impl(*entries, in_batches, alone, is_cut, has_calls=False):
     outs = list(entries)
-    if not now:
-        return outs
     groups: dict[Any, list[int]] = {}
     for k, x in enumerate(entries):
         if jnp.issubdtype(x.dtype, jnp.inexact):
@@ -190,14 +187,10 @@ def _(*entries, **params):
     return list(entries)
 
 
-def _materialised_jvp(entries, tangents, *, now, **params):
+def _materialised_jvp(entries, tangents, **params):
     moving = [k for k, tangent in enumerate(tangents) if type(tangent) is not ad.Zero]
-    outs = list(tangents)
-    if moving:
-        new = materialised_p.bind(*(tangents[k] for k in moving), now=True, **params)
-        for k, tangent in zip(moving, new, strict=True):
-            outs[k] = tangent
-    return materialised_p.bind(*entries, now=True, **params), outs
+    new = materialised_p.bind(*(tangents[k] for k in moving), **params) if moving else []
+    return materialised_p.bind(*entries, **params), replaced(tangents, moving, new)
 
 
 def _materialised_transpose(cotangents, *entries, **params):

@@ -23,7 +23,7 @@ from jax.extend.core import (
     JaxprEqn,
     Literal,
 )
-from jaxtyping import PyTree
+from jaxtyping import Array, PyTree
 
 from .jaxprs import (
     altered,
@@ -109,12 +109,12 @@ class Declined(Exception):
 class Reading(NamedTuple):
     """The program of a function that can be scalarised.
 
-    What it closes over is in `consts`, and `shape` is that of its results. With `rows` its state
-    has short vectors along leading axes.
+    It takes what the function closes over first, but for what is known now. `shape` is that of its
+    results. With `rows` its state has short vectors along leading axes.
     """
 
-    code: Jaxpr
-    consts: Sequence[Any]
+    program: ClosedJaxpr
+    parameters: Sequence[Array]
     shape: PyTree
     rows: bool
 
@@ -145,7 +145,17 @@ def read(
             return None
     except Exception as error:
         return unread(error)
-    return Reading(code, jaxpr.consts, shape, rows)
+    return Reading(*_with_parameters(code, jaxpr.consts), shape, rows)
+
+
+def _with_parameters(code: Jaxpr, consts: Sequence[Any]) -> tuple[ClosedJaxpr, list[Array]]:
+    known, given = [], []
+    for pair in zip(code.constvars, consts, strict=True):
+        is_known = not isinstance(pair[1], jax.Array) or _known_constant(pair[1]) is not None
+        (known if is_known else given).append(pair)
+    variables = [v for v, _ in given]
+    code = altered(code, constvars=[v for v, _ in known], invars=[*variables, *code.invars])
+    return ClosedJaxpr(code, [x for _, x in known]), [jnp.asarray(x) for _, x in given]
 
 
 def on_numbers(
@@ -174,7 +184,7 @@ def on_numbers(
     return split_like(like, outs)
 
 
-def known_constant(x: Any) -> np.ndarray | None:
+def _known_constant(x: Any) -> np.ndarray | None:
     """An array of indices that is known now."""
     if isinstance(x, Tracer) or not isinstance(x, jax.Array | np.ndarray | np.generic):
         return None
@@ -441,7 +451,7 @@ def _stacked(rows: Sequence[Any]) -> Any:
 def _constant(x: Any) -> Any:
     """What a program closes over: known, if it is no array of JAX's."""
     if isinstance(x, jax.Array):
-        found = known_constant(x)
+        found = _known_constant(x)
         return x if found is None else found
     if not is_numeric(x) or not is_inexact(np.asarray(x)):
         return x

@@ -21,12 +21,11 @@ from jax import lax
 from jax.core import ShapedArray
 from jax.extend.core import ClosedJaxpr, JaxprEqn, Primitive, jaxpr_as_fun
 from jax.interpreters import ad, batching, mlir
-from jaxtyping import Array, PyTree
+from jaxtyping import PyTree
 
 from .in_two import in_two
 from .jaxprs import (
     CALLS,
-    altered,
     called,
     flattened,
     is_inexact,
@@ -50,8 +49,8 @@ from .limits import (
     MAX_RESULTS_IN_BATCHES,
 )
 from .materialise import not_materialised, together
-from .program import Declined, Reading, join, known_constant, length, on_numbers, split
-from .scope import is_everywhere, unread
+from .program import Declined, join, length, on_numbers, read, split
+from .scope import is_everywhere, is_rewritten, unread
 from .turns import by_turns
 
 step_p = Primitive("cfjax_step")
@@ -118,17 +117,25 @@ _MANY = FLAT_MANY, FLAT_MANY_DERIVATIVES
 _USUAL = FLAT_VALUES, FLAT_DERIVATIVES
 
 
-def step(reading: Reading, y: PyTree, is_pair: bool, in_batches: bool) -> PyTree:
-    """What the function that has been read makes of `y`, as one operation.
+def scalarised(
+    fun: Callable[[PyTree], PyTree], y: PyTree, is_pair: bool = False, in_batches: bool = False
+) -> PyTree:
+    """`fun(y)`, computed on single numbers where `y` is a small state of short vectors.
 
-    With `is_pair` it returns a pair, of which mostly the first part alone is used. Reverse mode
-    keeps `y` and what the function closes over, and computes the step again.
+    The result agrees with that of `fun` to rounding. `fun` may close over traced values. Operations
+    that have no rule get the array whole. Where `y` is another state or the program cannot be
+    scalarised, and within another one that is scalarised, this is `fun(y)`. With `is_pair` the
+    function returns a pair, of which mostly the first part alone is used. With `in_batches` values
+    of one system and derivatives are left as they are. Reverse mode keeps `y` and what the function
+    closes over, and computes the step again.
     """
-    program, given = with_parameters(reading)
+    reading = None if is_rewritten() else read(fun, y)
+    if reading is None:
+        return fun(y)
     structure = jtu.tree_structure(reading.shape)
     outs = _bound(
-        program,
-        given,
+        reading.program,
+        reading.parameters,
         list(map(jnp.asarray, jtu.tree_leaves(y))),
         len(jtu.tree_leaves(reading.shape[0])) if is_pair else structure.num_leaves,
         reading.rows,
@@ -170,23 +177,6 @@ def _bound(
     counting, takes = narrowed(program, exact)
     known = map(jnp.asarray, jaxpr_as_fun(counting)(*(given[k] for k in takes)))
     return replaced(replaced([None] * len(outs), made, new), exact, list(known))
-
-
-def with_parameters(reading: Reading) -> tuple[ClosedJaxpr, list[Array]]:
-    """A program that has been read, as one of what it closes over too; and that.
-
-    What is known now stays within.
-    """
-    known, given = [], []
-    for pair in zip(reading.code.constvars, reading.consts, strict=True):
-        is_known = not isinstance(pair[1], jax.Array) or known_constant(pair[1]) is not None
-        (known if is_known else given).append(pair)
-    code = altered(
-        reading.code,
-        constvars=[v for v, _ in known],
-        invars=[*(v for v, _ in given), *reading.code.invars],
-    )
-    return ClosedJaxpr(code, [x for _, x in known]), [jnp.asarray(x) for _, x in given]
 
 
 @step_p.def_abstract_eval

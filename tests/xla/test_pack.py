@@ -72,9 +72,9 @@ def weighted(stack):
         lambda entries: pack(entries, sums=True),
         lambda entries: pack(materialised(entries)),
         lambda entries: pack(materialised(entries, in_batches=True)),
-        lambda entries: pack(materialised(entries, in_batches=True, alone=False, now=False)),
+        lambda entries: pack(materialised(entries, in_batches=True, alone=False)),
     ],
-    ids=["pack", "pack with sums", "materialised", "in batches", "in derivatives"],
+    ids=["pack", "pack with sums", "materialised", "in batches", "in batches alone"],
 )
 def test_transformations(transform, stack):
     x, y = jnp.asarray(0.7), jnp.asarray(RNG.normal(size=3))
