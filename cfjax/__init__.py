@@ -45,6 +45,7 @@ from ._solvers.commutator_free import CommutatorFree as CommutatorFree
 from ._solvers.commutator_free import LieEuler as LieEuler
 from ._solvers.error_control import ErrorNorm as ErrorNorm
 from ._solvers.error_control import starting_step as starting_step
+from ._solvers.solver import AbstractSolver as AbstractSolver
 from ._term import LieTerm as LieTerm
 from ._xla import rewriting as rewriting
 

@@ -92,7 +92,7 @@ class AbstractFrozenField(eqx.Module):
         """`flow(point) - point`, with a rounding error as small as the increment, or None.
 
         A class that defines it gets compensated summation over the steps
-        (`_solvers/compensation.py`). Do not define it for a field whose flow keeps signs or
+        (`_solvers/sums.py`). Do not define it for a field whose flow keeps signs or
         relative accuracy: the sum of point and increment keeps absolute accuracy only. None, the
         default, means no compensation.
         """

@@ -1,7 +1,6 @@
 """Integration with a fixed number of steps, as one compiled loop."""
 
-from collections.abc import Callable
-from typing import Any, cast
+from typing import Any
 
 import diffrax
 import equinox as eqx
@@ -25,8 +24,9 @@ from ._control_term import is_driven
 from ._numerics.checks import Fault, error_if, needing
 from ._numerics.squaring import max_over_batch
 from ._solvers.base import is_finite, result_of
+from ._solvers.solver import AbstractSolver, as_own
 from ._step_back import repeat_and_undo
-from ._xla import invariants_first, repeat
+from ._xla import repeat
 
 _NOT_FINITE = "y0 must be finite, got an entry that is not."
 _BLOW_UP = (
@@ -99,7 +99,7 @@ def integrate(
     check_term_and_solver(term, solver)
     check_own_tolerances(solver)
     y0 = as_state(y0)
-    solver = without_estimate(solver)
+    own = as_own(solver).without_estimate()
     num_steps = count("num_steps", num_steps)
     save_every = None if save_every is None else count("save_every", save_every)
     if save_every is not None and num_steps % save_every:
@@ -114,7 +114,7 @@ def integrate(
         raise ValueError(
             "step_back needs no checkpoints: give either step_back or checkpoint_every, got both."
         )
-    if step_back and not getattr(solver, "is_symmetric", False):
+    if step_back and not own.is_symmetric:
         raise ValueError(
             "step_back takes a symmetric solver, such as cfjax.Strang(), cfjax.ImplicitMidpoint() "
             f"or cfjax.Magnus4(), got {type(solver).__name__}. With others use checkpoint_every."
@@ -136,7 +136,7 @@ def integrate(
     is_compiled = any(isinstance(x, Tracer) for x in (jnp.zeros(()), *jtu.tree_leaves((t0, y0))))
     solution, fault = equal_steps(
         term,
-        solver,
+        own,
         t0,
         t1,
         y0,
@@ -157,7 +157,7 @@ def integrate(
 @eqx.filter_jit
 def equal_steps(
     term: PyTree[diffrax.AbstractTerm],
-    solver: diffrax.AbstractSolver,
+    solver: AbstractSolver,
     t0: Real[Array, ""],
     t1: Real[Array, ""],
     y0: PyTree,
@@ -198,19 +198,14 @@ def equal_steps(
         y, _, _, solver_state, step_result = solver.step(
             term, time(n), time(n + by), y, args, solver_state, made_jump=False
         )
-        # Our own fail where the state is not finite, which the last one shows as well. A loop of
-        # small steps feels every operation.
-        if not is_ours and step_result is not diffrax.RESULTS.successful:
+        # What the last state shows as well need not be in the loop: one of small steps feels every
+        # operation.
+        if not solver.shows_failure and step_result is not diffrax.RESULTS.successful:
             is_first = result == diffrax.RESULTS.successful
             result = diffrax.RESULTS.where(is_first, step_result, result)
         return (n + by, y, solver_state, result)
 
-    # For diffrax a wrapped solver is an instance of what it wraps.
-    is_ours = getattr(solver, "shows_failure", False)
-    if hasattr(solver, "start"):
-        solver_state, fault = cast(Any, solver).start(term, t0, time(n + 1), y0, args)
-    else:
-        solver_state, fault = solver.init(term, t0, time(n + 1), y0, args), Fault.none()
+    solver_state, fault = solver.start(term, t0, time(n + 1), y0, args)
     fault = fault.with_case(
         is_short,
         "num_steps must leave each step longer than the rounding of t0 and t1, and the times of so "
@@ -223,28 +218,25 @@ def equal_steps(
     # Not the times: if these are constants, CF54 on a heavy top takes less than half the time.
     start = needing(zero, y0)
     carry = (n, start, solver_state, diffrax.RESULTS.successful)
-    forward: Callable[[Any], Any] = step
-    if hasattr(solver, "for_equal_steps"):
-        solver = cast(Any, solver).for_equal_steps((t1 - t0) / intervals)
-        forward = invariants_first(step, carry)
+    solver = solver.for_equal_steps(term, (t1 - t0) / intervals, t0, y0, args)
 
     def advance(carry, number):
         if step_back:
             back = lambda carry: step(carry, -1)  # noqa: E731
             # What a function closes over becomes an argument, which has a derivative.
-            there = eqx.filter_closure_convert(forward, carry)
+            there = eqx.filter_closure_convert(step, carry)
             back = eqx.filter_closure_convert(back, carry)
             several = lambda step, carry, number: repeat(step, carry, number)[0]  # noqa: E731
             return repeat_and_undo(several, there, back, carry, number, throw_in_reverse)
         # XLA would scalarise a loop of one turn, and compute the step anew for each of its uses.
         if isinstance(number, int) and number == 1:
-            return forward(carry)
+            return step(carry)
         if checkpoint_every is None:
-            return repeat(forward, carry, number)[0]
+            return repeat(step, carry, number)[0]
         length, rest = checkpoint_every, number % checkpoint_every
-        block = jax.checkpoint(lambda carry: repeat(forward, carry, length)[0])
+        block = jax.checkpoint(lambda carry: repeat(step, carry, length)[0])
         carry, _ = lax.scan(lambda x, _: (block(x), None), carry, length=number // length)
-        return repeat(forward, carry, rest)[0]
+        return repeat(step, carry, rest)[0]
 
     def steps_and_save(carry, _):
         carry = advance(carry, length if save_every is None else save_every)
@@ -252,7 +244,7 @@ def equal_steps(
 
     num_saves: Any = 1 if save_every is None else num_steps // save_every
     if save_every == 1 and num_saves > 1 and not step_back:
-        carry, ys = repeat(forward, carry, num_saves, lambda carry: carry[1])
+        carry, ys = repeat(step, carry, num_saves, lambda carry: carry[1])
     else:
         carry, ys = lax.scan(steps_and_save, carry, length=num_saves)
     ts = time(
@@ -267,7 +259,7 @@ def equal_steps(
     # Of the saved states alone, outside the loop: sums and products keep infinity and NaN, so a
     # blow-up shows in what is saved after it.
     result = result_of(ys)
-    if is_ours:
+    if solver.shows_failure:
         ys = error_if(ys, lambda ys: ~is_finite(ys), _BLOW_UP) if throw else ys
     else:
         is_known = carry[3] != diffrax.RESULTS.successful
@@ -330,9 +322,3 @@ def _error_of(result: diffrax.RESULTS) -> Real[Array, ""]:
     # equinox takes the largest number of a result, and an empty batch has none.
     worst = jtu.tree_map(max_over_batch, result)
     return worst.error_if(jnp.zeros(()), result != diffrax.RESULTS.successful)
-
-
-def without_estimate(solver: Any) -> diffrax.AbstractSolver:
-    """The same method for steps that nobody controls, where the solver offers it."""
-    # Not by the class: for diffrax a wrapped solver is an instance of what it wraps.
-    return solver.without_estimate() if hasattr(solver, "without_estimate") else solver

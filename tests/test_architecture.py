@@ -53,7 +53,6 @@ PRIVATE = {
     ("scenes.wilson_flow", "_xla"): "its field in the form that XLA vectorises",
     ("_paper", "_measure"): "reports, charts and flops are what it shows",
     ("_paper", "scenes"): "its problems",
-    ("_paper", "_integrate"): "counts a step without what estimates its error",
     ("_paper.stiefel", "_solvers.munthe_kaas"): "measures its element and its flow apart",
 }
 

@@ -88,6 +88,7 @@ PROMISED = [
     "ExponentialTableau",
     "ExponentialRungeKutta",
     "AbstractSemilinearField",
+    "AbstractSolver",
 ]
 SOLVERS = [*PROMISED[PROMISED.index("LieEuler") : PROMISED.index("RKMK")], "CayleyRK4"]
 PUBLIC = [

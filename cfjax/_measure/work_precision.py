@@ -25,8 +25,9 @@ from .._arguments import (
     time_scalar,
 )
 from .._batch.progress import progress_bar
-from .._integrate import equal_steps, without_estimate
+from .._integrate import equal_steps
 from .._numerics.checks import needing
+from .._solvers.solver import as_own
 from .cost import Problem, cost_of_steps
 from .result import WorkPrecision
 
@@ -140,7 +141,7 @@ def work_precision(
         for name, (own_term, solver) in solvers.items():
             update(description=f"Compiling {name}")
             with _about(name):
-                solver = solver if is_adaptive else without_estimate(solver)
+                solver = solver if is_adaptive else as_own(solver).without_estimate()
                 problem = Problem(own_term, solver, t0, t1, dt0, y0, args)
                 cost = cost_of_steps(problem, is_adaptive)
                 executable, seconds = compiled(solve, problem, values[0])
@@ -218,7 +219,7 @@ def take_turns(
 def _equal_steps(problem: Problem, num_steps: Int[Array, ""]) -> tuple:
     term, solver, t0, t1, _, y0, args = problem
     solution, fault = equal_steps(
-        term, solver, t0, t1, y0, args, num_steps, None, False, None, False, throw=False
+        term, as_own(solver), t0, t1, y0, args, num_steps, None, False, None, False, throw=False
     )
     y, *rest = _end(solution, num_steps, 0)
     return needing(fault.error(jnp.zeros(())), y), *rest

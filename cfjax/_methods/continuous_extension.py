@@ -16,8 +16,7 @@ from typing import Any, NamedTuple, TypeAlias
 import numpy as np
 
 from .coefficients import ContinuousExtension
-from .order_conditions import exact_tree_weight, exact_weight, trees, word_weights, words
-from .proved import order_of
+from .order_conditions import exact_tree_weight, exact_weight, order, trees, word_weights, words
 from .tableau import Tableau
 
 # The conditions of one order: what they multiply the coefficients of one power of theta with, and
@@ -50,7 +49,7 @@ def derived_extension(tableau: Tableau) -> ContinuousExtension:
     weight is half the square of a letter's. Nor do the powers of theta mix.
     """
     found, reached = _solve(tableau.beta, _flow_conditions(tableau), _MAX_ORDER)
-    if reached < _MAX_ORDER and reached < order_of(tableau) - 1:
+    if reached < _MAX_ORDER and reached < order(tableau) - 1:
         with_end = Tableau((*tableau.alpha, tableau.beta), tableau.beta)
         found, _ = _solve(with_end.beta, _flow_conditions(with_end), _MAX_ORDER)
     return found

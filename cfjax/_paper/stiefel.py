@@ -18,7 +18,6 @@ from rich.progress import Progress
 from rich.table import Table
 
 from .. import CF4, RKMK4, CayleyRK4, LieTerm, WorkPrecision, combine, work_precision
-from .._integrate import without_estimate
 from .._measure.flops import count_flops
 from .._measure.report import Report
 from .._measure.style import STYLES, finish, new_figure
@@ -74,7 +73,7 @@ def flops_of_step(method: str, problem: str, n: int, num_steps: int) -> int:
     term, (y0, args) = LieTerm(PROBLEMS[problem]), _start(problem, n)
     t0, t1 = jnp.asarray(0.0), jnp.asarray(1 / num_steps)
     # Each stage is counted where it stands by itself.
-    solver = cast(Any, without_estimate(METHODS[method])).unrolled()
+    solver = cast(Any, METHODS[method]).without_estimate().unrolled()
     # Not counted: the checks of the start are none of the step.
     state, _ = solver.start(term, t0, t1, y0, args)
 

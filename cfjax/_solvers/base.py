@@ -1,35 +1,23 @@
 """What all Lie group methods are to diffrax: one-step maps made of flows."""
 
-import abc
 import copy
-import functools
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from typing import Any, ClassVar
 
 import diffrax
 import equinox as eqx
-import jax
 import jax.numpy as jnp
 import jax.tree_util as jtu
 import numpy as np
 from jax import lax
-from jax.core import Tracer
 from jaxtyping import Array, Bool, PyTree, Real
 
 from .._control_term import fault_of_increments, is_driven
 from .._field import is_field
 from .._numerics.checks import Fault
 from .._term import product, velocity
-from .chart import Chart
-from .compensation import added, at, no_compensation, zeros
-from .compiled import (
-    computed_again,
-    control_of,
-    materialised_in_rows,
-    scalarised,
-    shared_end,
-)
-from .dense import AbstractPath, Interpolation
+from .solver import AbstractSolver
+from .sums import Sums
 
 
 class _OfInstances(property):
@@ -45,13 +33,13 @@ class _OfInstances(property):
         return super().__get__(instance, owner)
 
 
-class AbstractLieSolver(diffrax.AbstractSolver):
+class AbstractLieSolver(AbstractSolver):
     """A method with fixed coefficients that moves along flows.
 
     It takes the geometry from what the term's vector field returns: `cfjax.LieTerm` for frozen
     fields, any other diffrax term for a linear space.
 
-    Where the field offers increments, the sum over the steps is compensated (`compensation.py`).
+    Where the field offers increments, the sum over the steps is compensated (`sums.py`).
     """
 
     term_structure: ClassVar = diffrax.AbstractTerm
@@ -59,13 +47,7 @@ class AbstractLieSolver(diffrax.AbstractSolver):
     term_compatible_contr_kwargs = _OfInstances(lambda self: {})
 
     @property
-    def is_symmetric(self) -> bool:
-        """Whether a step backwards in time undoes one forwards, but for rounding."""
-        return False
-
-    @property
     def shows_failure(self) -> bool:
-        """Whether a step that fails ends in what is not finite, so that its result says no more."""
         return True
 
     def strong_order(self, terms) -> float:
@@ -88,18 +70,16 @@ class AbstractLieSolver(diffrax.AbstractSolver):
         return State(state.compensation, state.first, zero)
 
     def start(self, terms, t0, t1, y0, args) -> tuple["State", Fault]:
-        """The state of the solver, whose steps carry no checks, and what is wrong with the start.
-
-        That is for a loop which reports it itself, with no call of the host.
-        """
+        # Steps of this state carry no checks: a loop reports what is wrong with the start itself,
+        # with no call of the host.
         self = self.for_terms(terms)
 
         def at_start(y0):
             field = product(terms, terms.vf(t0, y0, args), terms.contr(t0, t1))
-            return field, no_compensation(field, y0)
+            return field, Sums.of(field, y0).compensation
 
         field, compensation = eqx.filter_eval_shape(at_start, y0)
-        compensation = zeros(compensation, y0)
+        compensation = Sums(y0, compensation).zeros()
         first = terms.vf(t0, y0, args) if self.first_same_as_last else None
         fault = fault_of_start(t0, t1, (field,), y0)
         fault = fault_of_increments(fault, terms, t0, t1, y0, args)
@@ -116,7 +96,6 @@ class AbstractLieSolver(diffrax.AbstractSolver):
         return self.without_estimate() if is_driven(terms) else self
 
     def without_estimate(self) -> "AbstractLieSolver":
-        """The same method for steps that nobody controls: it keeps nothing for an estimate."""
         return self._with(estimate=None) if hasattr(self, "estimate") else self
 
     def unrolled(self) -> "AbstractLieSolver":
@@ -133,85 +112,6 @@ class AbstractLieSolver(diffrax.AbstractSolver):
     def func(self, terms, t0, y0, args) -> Any:
         """The velocity at `y0`, shaped like it. A control that is not time has diffrax's own."""
         return velocity(terms, terms.vf(t0, y0, args), y0)
-
-
-class AbstractChartSolver(AbstractLieSolver):
-    """A method whose step is one chart: flows of combinations of the fields in it."""
-
-    # Whether it evaluates the field at points of the step.
-    is_of_state: ClassVar[bool] = True
-
-    interpolation_cls: ClassVar[Callable[..., diffrax.AbstractLocalInterpolation]] = Interpolation
-
-    @abc.abstractmethod
-    def step_in(self, chart: Chart) -> "Step":
-        """A step from `chart.start`, with the fields that `chart.frozen` evaluates."""
-
-    def interval(self, t0: Any, t1: Any) -> tuple[Any, Any]:
-        """Two times that are as far apart as the ends of the step."""
-        return t0, t1
-
-    def extended(self, path: Any, field: Callable[[Any, PyTree], PyTree]) -> AbstractPath:
-        """The way of a step with what only output within it takes.
-
-        `field(c, y)` is `h f(t + c h, y)`. Apart from `step_in`, which is compiled whether anybody
-        asks for that or not.
-        """
-        return path
-
-    def step(self, terms, t0, t1, y0, args, solver_state, made_jump):
-        # Not where times are known.
-        step = _step_once if isinstance(t0, Tracer) else AbstractChartSolver._step
-        solver: Any = self.for_terms(terms)
-        return step(solver, terms, t0, t1, y0, args, solver_state, made_jump)
-
-    def _step(self, terms, t0, t1, y0, args, solver_state, made_jump):
-        compensation = solver_state.compensation
-        t0, first = begun(solver_state, t0, lambda t0: terms.vf(t0, y0, args), made_jump)
-
-        def evaluate(c: float | Real[Array, ""], y: PyTree) -> PyTree:
-            return materialised_in_rows(terms.vf(time_at(c, t0, t1), y, args))
-
-        def stepped(y0):
-            control = control_of(terms, *self.interval(t0, t1))
-            values = []
-
-            def field(c: float | Real[Array, ""], y: PyTree) -> PyTree:
-                if values or first is None:
-                    values.append(evaluate(c, y))
-                else:
-                    values.append(first)
-                return product(terms, values[-1], control)
-
-            step = self.step_in(Chart(field, y0, compensation))
-            end, error = step.end, step.error
-            if not step.is_shared:
-                end, error = shared_end(compensation, end, error, is_followed=first is not None)
-            if first is None:
-                last = None
-            elif self.is_of_state:
-                # From the end alone, which is one evaluation more.
-                there = functools.partial(evaluate, 1.0, at(y0, end, compensation))
-                last = computed_again(values[-1], there)
-            else:
-                last = values[-1]
-            return (end, last, error), step.path
-
-        y1, error, path, state, result = ended(solver_state, stepped, y0)
-        path = self.extended(path, lambda c, y: product(terms, evaluate(c, y), terms.contr(t0, t1)))
-        return y1, error, dict(path=path), state, result
-
-
-class Step(eqx.Module):
-    """A step: where it ends, the way there for output within it, and an estimate of its error.
-
-    `is_shared` says that the end is materialised, with all that the estimate is made of.
-    """
-
-    end: PyTree
-    path: AbstractPath
-    error: PyTree = None
-    is_shared: bool = eqx.field(static=True, default=False)
 
 
 def check_choice(name: str, value: Any, *choices: Any) -> None:
@@ -236,44 +136,6 @@ def result_of(y: PyTree) -> diffrax.RESULTS:
         return diffrax.RESULTS.successful
     nonfinite: Any = diffrax.RESULTS.nonfinite
     return diffrax.RESULTS.where(is_finite(y), diffrax.RESULTS.successful, nonfinite)
-
-
-def time_at(c: float | Real[Array, ""], t0: Any, t1: Any) -> Any:
-    """The time at a part c of the step, at its end exactly: the field may jump there."""
-    if isinstance(c, float):
-        return t1 if c == 1 else t0 + c * (t1 - t0)
-    c = jnp.asarray(c, jnp.result_type(t0))
-    return jnp.where(c == 1, t1, t0 + c * (t1 - t0))
-
-
-def begun(
-    solver_state: "State", t0: Any, evaluate: Callable[[Any], PyTree], made_jump: Any
-) -> tuple[Any, PyTree]:
-    """The time of a step, NaN if the start was wrong, and the field there if that is known."""
-    first = solver_state.first
-    if solver_state.zero is not None:
-        # Of a weak type, if the time is.
-        t0 = jnp.where(solver_state.zero == 0, t0, jnp.nan)
-    if first is None or made_jump is False:
-        return t0, first
-    if made_jump is True:
-        return t0, evaluate(t0)
-    return t0, lax.cond(made_jump, evaluate, lambda _: first, t0)
-
-
-def ended(
-    solver_state: "State", stepped: Callable[[PyTree], Any], y0: PyTree
-) -> tuple[PyTree, PyTree, Any, "State", diffrax.RESULTS]:
-    """The state after a step, the estimate of its error, what output within it takes, the solver's
-    state, and the result.
-
-    `stepped(y0)` is a pair. First is the end, an increment where the state is a compensated sum,
-    with the field that the next step begins with and the estimate, or None for these. Second is
-    what output takes.
-    """
-    (end, first, error), within = scalarised(stepped, y0, is_pair=True)
-    y1, compensation = added(y0, end, solver_state.compensation)
-    return y1, error, within, State(compensation, first, solver_state.zero), result_of(y1)
 
 
 class State(eqx.Module):
@@ -320,11 +182,3 @@ def _off_manifold(fault: Fault, part: Any, place: str, point: PyTree) -> Fault:
             f"must have {expected}, and is off by more than {x:.1g}.",
         )
     return fault
-
-
-# diffrax traces a step three times, which takes longer than all else that it traces. Inline, the
-# program is as if traced anew. Newer JAX has two ways for that, and with True it leaves a call in
-# the program. (equinox hands on what it does not know to `jax.jit`.)
-_kinds = getattr(jax, "Inline", None)
-_inline: Any = True if _kinds is None else _kinds.JAX_EARLY
-_step_once = eqx.filter_jit(AbstractChartSolver._step, inline=_inline)  # pyright: ignore[reportCallIssue]

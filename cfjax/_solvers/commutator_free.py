@@ -1,6 +1,6 @@
 """Commutator-free methods: one step for every tableau."""
 
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from typing import ClassVar, Literal
 
 import diffrax
@@ -15,13 +15,13 @@ from .._field import combine, tangent
 from .._methods import pairs as _pairs
 from .._methods import tableau as _tableau
 from .._methods.continuous_extension import continuous_extension
-from .._methods.proved import order_of
+from .._methods.order_conditions import order
 from .._methods.tableau import Product, Row, Tableau
 from .._numerics.vectors import smooth
-from .base import AbstractChartSolver, Step, check_choice
-from .chart import Chart
+from .base import check_choice
 from .dense import Path
-from .stages import rolled
+from .stages import Stages, rolled
+from .step import AbstractChartSolver, Chart, Step, narrow, shared
 
 
 class AbstractCommutatorFree(AbstractChartSolver):
@@ -47,6 +47,9 @@ class AbstractCommutatorFree(AbstractChartSolver):
     """
 
     tableau: eqx.AbstractVar[Tableau]
+    # Those of the method and of its embedded one, of a named method that takes longer to prove than
+    # a small step to trace. Tests prove them.
+    orders: ClassVar[tuple[int, int | None] | None] = None
     estimate: Literal["group", "algebra"] | None = eqx.field(
         static=True, default="group", kw_only=True
     )
@@ -65,85 +68,85 @@ class AbstractCommutatorFree(AbstractChartSolver):
         return any(map(tableau.uses_last, (tableau.embedded, *continuous_extension(tableau))))
 
     def order(self, terms) -> int:
-        return order_of(self.tableau)
+        return self.orders[0] if self.orders else order(self.tableau)
 
     def error_order(self, terms):
         if is_driven(terms):
             return super().error_order(terms)
         embedded = self.tableau.embedded_method
-        return None if embedded is None else order_of(embedded) + 1
-
-    def direction(self, rows: Product, chart: Chart, kept: dict[int, PyTree]) -> PyTree:
-        """The field of the last of some rows; `kept` is for what is used again in the step."""
-        return _combined(rows[-1], chart.fields)
+        if embedded is None:
+            return None
+        known = self.orders and self.orders[1]
+        return (known or order(embedded)) + 1
 
     def step_in(self, chart):
         tableau = self.tableau
-        alpha, beta = [trimmed(rows) for rows in tableau.alpha], trimmed(tableau.beta)
-        reach = _Reach(chart, self.direction)
-        if not chart.fields:
-            chart.frozen(0.0, chart.start)
-        # Two stages at one point would be one flow with two times.
-        if self._is_usual and len(set(alpha)) == len(alpha):
-            reach.points |= rolled(self.unroll, chart, [*alpha, beta], tableau.c)
-        prefixes = {rows[:n] for rows in (*alpha, beta) for n in range(1, len(rows))}
-        for c, rows in list(zip(tableau.c, alpha, strict=True))[len(chart.fields) :]:
-            point = reach(rows)
-            if rows in prefixes:
-                point = reach.points[rows] = chart.branching(point)
-            chart.frozen(float(c), point)
-        end = reach(beta)
+        beta, embedded = trimmed(tableau.beta), self._embedded
+        chart, fields, points = self.stages(chart)
+        end = points[beta]
         if self.first_same_as_last:
             # The end, the last field and the error are made of it.
-            end = reach.points[beta] = chart.narrow(end)
+            end = narrow(end)
+        points = {**points, beta: end}
         # All that follows is for error control and output within the step. The compiler leaves it
         # out where the caller asks for neither.
-        within = continuous_extension(tableau)
-        if any(map(tableau.uses_last, (self._embedded or (), *within))):
-            chart.frozen(1.0, end)
-        path = Path.of(within, chart.without_sums(chart.start), chart.fields)
-        if self._embedded is None:
-            return Step(chart.from_start(end), path)
+        within, last = continuous_extension(tableau), None
+        if any(map(tableau.uses_last, (embedded or (), *within))):
+            last = chart.value_at(1.0, end)
+            fields = [*fields, chart.frozen(last, end, fields)]
+        path = Path.of(within, chart.origin, fields)
+        if embedded is None:
+            return Step(chart.end(end), path, last=last)
         if self.estimate == "algebra":
-            difference = _combined(_difference(self._embedded, tableau.beta), chart.fields)
+            difference = _combined(_difference(embedded, tableau.beta), fields)
             error = tangent(difference, chart.state(end))
         else:
-            error = chart.difference(end, reach(trimmed(self._embedded)))
-        if not tableau.uses_last(self._embedded):
-            return Step(chart.from_start(end), path, error)
-        apart = chart.difference(end, reach(alpha[-1]))
+            points = reached(trimmed(embedded), Stages(chart, fields, points))
+            error = chart.difference(end, points[trimmed(embedded)])
+        if not tableau.uses_last(embedded):
+            return Step(chart.end(end), path, error, last)
+        before = trimmed(tableau.alpha[-1])
+        apart = chart.difference(end, reached(before, Stages(chart, fields, points))[before])
         # All of them are needed before the ratio of their sizes.
-        end, error, apart = chart.shared((chart.from_start(end), error, apart))
-        error = jtu.tree_map(_seen, error, apart, chart.way(end))
-        return Step(end, path, error, is_shared=True)
+        end, error, apart = shared((chart.end(end), error, apart))
+        error = jtu.tree_map(_seen, error, apart, chart.sums.way(end))
+        return Step(end, path, error, last, is_shared=True)
+
+    def stages(self, chart: Chart) -> Stages:
+        """The fields of the stages, and the points at them and at the end."""
+        tableau = self.tableau
+        alpha, beta = [trimmed(rows) for rows in tableau.alpha], trimmed(tableau.beta)
+        # Two stages at one point would be one flow with two times.
+        if len(set(alpha)) == len(alpha):
+            stages = rolled(self.unroll, chart, [*alpha, beta], tableau.c)
+            if stages is not None:
+                return stages
+        prefixes = {rows[:n] for rows in (*alpha, beta) for n in range(1, len(rows))}
+        fields, points = [chart.first], {(): chart.start}
+        for c, rows in list(zip(tableau.c, alpha, strict=True))[1:]:
+            points = reached(rows, Stages(chart, fields, points))
+            if rows in prefixes:
+                points = {**points, rows: chart.branching(points[rows])}
+            fields = [*fields, chart.field(float(c), points[rows], fields)]
+        return Stages(chart, fields, reached(beta, Stages(chart, fields, points)))
 
     @property
     def _embedded(self) -> Product | None:
         return None if self.estimate is None else self.tableau.embedded
 
-    @property
-    def _is_usual(self) -> bool:
-        return type(self).direction is AbstractCommutatorFree.direction
 
+def reached(rows: Product, stages: Stages) -> dict[Product, PyTree]:
+    """The points of the stages, and that where a product of flows leads.
 
-class _Reach:
-    """Where products of flows lead. Rows that begin alike share their flows.
-
-    (The paper's "reusing flow calculations".)
+    Rows that begin alike share their flows. (The paper's "reusing flow calculations".)
     """
-
-    def __init__(self, chart: Chart, direction: Callable[..., PyTree]):
-        self.chart, self.direction = chart, direction
-        self.points: dict[Product, PyTree] = {}
-        self.kept: dict[int, PyTree] = {}
-
-    def __call__(self, rows: Product) -> PyTree:
-        if not rows:
-            return self.chart.start
-        if rows not in self.points:
-            direction = self.direction(rows, self.chart, self.kept)
-            self.points[rows] = self.chart.flow(direction, self(rows[:-1]))
-        return self.points[rows]
+    chart, fields, points = stages
+    if rows in points:
+        return points
+    if not rows:
+        return {**points, rows: chart.start}
+    points = reached(rows[:-1], stages)
+    return {**points, rows: chart.flow(_combined(rows[-1], fields), points[rows[:-1]])}
 
 
 def _combined(row: Row, fields: Sequence[PyTree]) -> PyTree:
@@ -283,6 +286,7 @@ class CF43(
     """
 
     tableau: ClassVar[Tableau] = _pairs.CF43
+    orders: ClassVar = (4, 3)
 
 
 class CF54(
@@ -305,6 +309,7 @@ class CF54(
     """
 
     tableau: ClassVar[Tableau] = _pairs.CF54
+    orders: ClassVar = (5, 4)
 
 
 class CG3(
@@ -333,6 +338,7 @@ class CG4(AbstractCommutatorFree, diffrax.AbstractStratonovichSolver):
     """
 
     tableau: ClassVar[Tableau] = _tableau.CG4
+    orders: ClassVar = (4, None)
 
 
 class CG5(AbstractCommutatorFree, diffrax.AbstractStratonovichSolver):
@@ -346,3 +352,4 @@ class CG5(AbstractCommutatorFree, diffrax.AbstractStratonovichSolver):
     """
 
     tableau: ClassVar[Tableau] = _tableau.CG5
+    orders: ClassVar = (5, None)

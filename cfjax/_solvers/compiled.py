@@ -18,7 +18,6 @@ from .._control_term import is_driven
 from .._xla import chosen as chosen
 from .._xla import computed_again as computed_again
 from .._xla import computed_once as computed_once
-from .._xla import invariant as invariant
 from .._xla import limits as limits
 from .._xla import materialised_if_long as materialised_if_long
 from .._xla import materialised_in_rows as materialised_in_rows
@@ -26,7 +25,6 @@ from .._xla import materialised_together as materialised_together
 from .._xla import over_stages as over_stages
 from .._xla import scalarised as scalarised
 from .._xla import where_scalarised as where_scalarised
-from .compensation import with_sums
 
 
 def control_of(terms: diffrax.AbstractTerm, t0: Any, t1: Any, **kwargs: Any) -> PyTree:
@@ -52,18 +50,3 @@ def by_turns(
     many = jtu.tree_map(lambda *xs: (np if is_known(xs) else jnp).asarray(xs), *turns)
     carry, stacked = over_stages(once, carry, many)
     return carry, [jtu.tree_map(lambda x: x[k], stacked) for k in range(len(turns))]  # noqa: B023
-
-
-def shared_end(
-    compensation: PyTree, end: PyTree, error: PyTree, is_followed: bool
-) -> tuple[PyTree, PyTree]:
-    """The end of a step and its error, which XLA would otherwise compute for each use of an entry.
-
-    A compensated sum uses each increment several times, and so does what follows from the end.
-    """
-    is_used = is_followed or error is not None
-    moving = with_sums(lambda c, z: z if is_used or c is not None else None, compensation, end)
-    moving, error = materialised_together((moving, error))
-    return with_sums(
-        lambda c, z, new: new if is_used or c is not None else z, compensation, end, moving
-    ), error

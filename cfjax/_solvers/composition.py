@@ -9,9 +9,9 @@ from jax import lax
 
 from .._control_term import is_driven
 from .._methods.splitting import COMPOSITIONS
-from .base import AbstractLieSolver, State, result_of, time_at
-from .compiled import by_turns
-from .dense import Pieces, as_part
+from .base import AbstractLieSolver, State, result_of
+from .dense import Interpolation, Pieces
+from .substeps import substeps
 
 
 class _Turn(NamedTuple):
@@ -46,7 +46,7 @@ class Composition(AbstractLieSolver):
     solver: AbstractLieSolver
     composition_order: int = eqx.field(static=True)
 
-    interpolation_cls: ClassVar[Any] = Pieces
+    interpolation_cls: ClassVar[Any] = Interpolation
 
     def __init__(self, solver: AbstractLieSolver, order: int):
         if not isinstance(solver, AbstractLieSolver) or not solver.is_symmetric:
@@ -91,19 +91,15 @@ class Composition(AbstractLieSolver):
             )
             solver_state = State(solver_state.compensation, first, solver_state.zero)
         ends = [0.0, *itertools.accumulate(COMPOSITIONS[self.composition_order][:-1]), 1.0]
-
-        def follow(carry: Any, turn: _Turn) -> Any:
-            y, state, result = carry
-            start, end = (time_at(c, t0, t1) for c in turn)
-            y, _, dense_info, state, new = self.solver.step(
-                terms, start, end, y, args, state, False
-            )
-            if not self.shows_failure:
-                result = diffrax.RESULTS.where(diffrax.is_okay(result), new, result)
-            return (y, state, result), as_part(self.solver, dense_info, t0)
-
         turns = list(itertools.starmap(_Turn, itertools.pairwise(ends)))
-        carry = y0, solver_state, diffrax.RESULTS.successful
-        (y1, state, result), parts = by_turns(follow, carry, turns)
+        (y1, state, result), parts = substeps(
+            self.solver,
+            lambda _: terms,
+            turns,
+            t0,
+            t1,
+            args,
+            (y0, solver_state, diffrax.RESULTS.successful),
+        )
         result = result_of(y1) if self.shows_failure else result
-        return y1, None, dict(parts=parts), state, result
+        return y1, None, dict(path=Pieces(parts)), state, result

@@ -15,9 +15,9 @@ from jaxtyping import Array, Float, PyTree, Real
 
 from .._field import combine, from_chart
 from .._methods.tableau import ContinuousExtension
-from .chart import carried
 from .compiled import scalarised
-from .stages import can_roll, rolled_flows
+from .stacked import can_roll, rolled_flows
+from .sums import flow_once
 
 
 class Interpolation(diffrax.AbstractLocalInterpolation):
@@ -36,26 +36,27 @@ class Interpolation(diffrax.AbstractLocalInterpolation):
         if t1 is not None:
             start, end = self.evaluate(t0), self.evaluate(t1)
             return jtu.tree_map(jnp.subtract, end, start)
-        return self.path.point(part_of_step(self, t0))
+        with jax.numpy_dtype_promotion("standard"):
+            length = jnp.asarray(self.t1 - self.t0)
+            # A solve from a time to the same time makes no step, and asks for its end.
+            return self.path.point((t0 - self.t0) / jnp.where(length == 0, 1, length))
 
 
-class Pieces(diffrax.AbstractLocalInterpolation):
-    """The outputs of several steps that one is made of, each for the same part of its time.
+class AbstractPath(eqx.Module):
+    """The way of a step, for output within it."""
 
-    Each of `parts` is for times from 0 to 1.
-    """
+    @abc.abstractmethod
+    def point(self, theta: Any) -> PyTree:
+        """The solution at a part `theta` of the step."""
 
-    t0: Any
-    t1: Any
+
+class Pieces(AbstractPath):
+    """The way of a step that is made of several, of which each has the same part of its time."""
+
     parts: Sequence[diffrax.AbstractLocalInterpolation]
 
-    def evaluate(self, t0: Any, t1: Any = None, left: bool = True) -> PyTree:
-        """The solution at time `t0`, or what is added to it from `t0` to `t1`."""
-        del left
-        if t1 is not None:
-            start, end = self.evaluate(t0), self.evaluate(t1)
-            return jtu.tree_map(jnp.subtract, end, start)
-        theta = part_of_step(self, t0) * len(self.parts)
+    def point(self, theta: Any) -> PyTree:
+        theta = theta * len(self.parts)
         now = jnp.clip(jnp.ceil(theta) - 1, 0, len(self.parts) - 1)
         # Output takes longer to compile than to choose what it is made of: once for all alike.
         kinds: dict[Any, list[int]] = {}
@@ -71,33 +72,23 @@ class Pieces(diffrax.AbstractLocalInterpolation):
         """The output of the part at `now`, and whether it is one of these."""
         here = jnp.asarray(places, theta.dtype)
         nearest = jnp.argmin(jnp.abs(here - now))
-        stacked = jtu.tree_map(lambda *xs: jnp.stack(xs), *(self.parts[k] for k in places))
-        part, place = jtu.tree_map(lambda x: x[nearest], (stacked, here))
-        is_now = place == now
-        inner = theta - place
-        return part.evaluate(jnp.where(is_now, inner, jnp.clip(inner, 0, 1))), is_now
+        arrays, rest = zip(
+            *(eqx.partition(self.parts[k], eqx.is_array) for k in places), strict=True
+        )
+        arrays = jtu.tree_map(lambda *xs: jnp.stack(xs)[nearest], *arrays)
+        part, place = eqx.combine(arrays, rest[0]), here[nearest]
+        is_now, c = place == now, theta - place
+        # Other parts are asked at a time of their own: another may be an error there.
+        c = jnp.where(is_now, c, jnp.clip(c, 0, 1))
+        return part.evaluate(time_at(c, part.t0, part.t1)), is_now
 
 
-def as_part(solver: Any, dense_info: dict[str, Any], t: Any) -> Any:
-    """The output of a step for times from 0 to 1, which are arrays, as diffrax stores them."""
-    zero = jnp.zeros((), jnp.result_type(t))
-    return solver.interpolation_cls(t0=zero, t1=zero + 1, **dense_info)
-
-
-def part_of_step(step: Any, t: Any) -> Real[Array, ""]:
-    """The part of a step at a time."""
-    with jax.numpy_dtype_promotion("standard"):
-        length = jnp.asarray(step.t1 - step.t0)
-        # A solve from a time to the same time makes no step, and asks for its end.
-        return (t - step.t0) / jnp.where(length == 0, 1, length)
-
-
-class AbstractPath(eqx.Module):
-    """The way of a step, for output within it."""
-
-    @abc.abstractmethod
-    def point(self, theta: Any) -> PyTree:
-        """The solution at a part `theta` of the step."""
+def time_at(c: Any, t0: Any, t1: Any) -> Any:
+    """The time at a part c of the step, at its end exactly: the field may jump there."""
+    if isinstance(c, float):
+        return t1 if c == 1 else t0 + c * (t1 - t0)
+    c = jnp.asarray(c, jnp.result_type(t0))
+    return jnp.where(c == 1, t1, t0 + c * (t1 - t0))
 
 
 class Path(AbstractPath):
@@ -122,7 +113,7 @@ class Path(AbstractPath):
         continuous_extension: ContinuousExtension,
         start: PyTree,
         fields: list[PyTree],
-        apply_flow: Callable[[PyTree, PyTree], PyTree] = carried,
+        apply_flow: Callable[[PyTree, PyTree], PyTree] = flow_once,
     ) -> "Path":
         leaves, structure = jtu.tree_flatten((start, fields))
         arrays = {id(leaf): leaf for leaf in leaves}
@@ -141,11 +132,11 @@ class Path(AbstractPath):
         point, fields = self.parts(self.arrays)
         # Of small states too: an event's root finder differentiates it, and a loop of flows on
         # short vectors is as fast in batches.
-        if self.apply_flow is carried and num_flows > 1 and can_roll(None, fields[0], point):
+        if self.apply_flow is flow_once and num_flows > 1 and can_roll(None, fields[0], point):
             # There may be no field at the end of the step, where it has no weight.
             rows = powers.swapaxes(0, 1)[..., : len(fields)].astype(theta.dtype)
             weights = functools.partial(_polynomials, theta=theta)
-            return rolled_flows(rows, fields, point, carried, weights)
+            return rolled_flows(rows, fields, point, flow_once, weights)
 
         weights = _polynomials(powers, theta)
 

@@ -14,39 +14,52 @@ from .._field import is_field, to_chart
 
 def depending_on_state(field: Callable[[PyTree], PyTree], y0: PyTree) -> list[tuple[str, Any]]:
     """The parts of `field(y)` that depend on y or on being frozen there, each with its place."""
-    return _depending(lambda y: (field(y), y), y0)
+    return _parts_depending(lambda y: (field(y), y), y0)
 
 
 def depending_on_time(field: Callable[[Any], PyTree], t: Any, y: PyTree) -> list[tuple[str, Any]]:
     """The parts of `field(t)` that depend on t, each with its place; y is any state."""
-    return _depending(lambda t: (field(t), y), t)
+    return _parts_depending(lambda t: (field(t), y), t)
 
 
-def _depending(fun: Callable[[PyTree], tuple[PyTree, PyTree]], x: PyTree) -> list[tuple[str, Any]]:
-    """The parts of a field that depend on x, where `fun(x)` is the field and its state.
+def _parts_depending(
+    fun: Callable[[PyTree], tuple[PyTree, PyTree]], x: PyTree
+) -> list[tuple[str, Any]]:
+    """The parts of a field that depend on x, where `fun(x)` is the field and its state."""
 
-    Under `jax.vmap` over x alone, what does not depend on it has no axis of the batch. That sees
-    through every operation, and takes shapes and dtypes of x for what they are. (A derivative would
-    not see comparisons.) What has no rule for batches, such as a function of the host, may depend
-    on all that it gets: then the only part is None.
-
-    **Raises** what `fun(x)` itself raises.
-    """
-    found = []
-
-    def look(x: PyTree) -> PyTree:
+    def parts(x: PyTree) -> list[tuple[Any, PyTree]]:
         frozen, y = fun(x)
         parts, treedef = jtu.tree_flatten_with_path(frozen, is_leaf=is_field)
         charted = treedef.flatten_up_to(to_chart(frozen, y, ())[0])
-        for (path, part), coordinates in zip(parts, charted, strict=True):
+        names = [(jtu.keystr(path), part) for path, part in parts]
+        return list(zip(names, charted, strict=True))
 
-            def rule(size, is_mapped, leaves, path=path, part=part):
-                found.append((jtu.keystr(path), part))
+    found = depending(parts, x)
+    return [("", None)] if found is None else found
+
+
+def depending(fun: Callable[[PyTree], list[tuple[Any, PyTree]]], x: PyTree) -> list[Any] | None:
+    """The names of those values of `fun(x)`, pairs of a name and a value, that depend on x.
+
+    Under `jax.vmap` over x alone, what does not depend on it has no axis of the batch. That sees
+    through every operation, and takes shapes and dtypes of x for what they are. (A derivative would
+    not see comparisons.) None where something has no rule for batches, such as a function of the
+    host: it may depend on all that it gets.
+
+    **Raises** what `fun(x)` itself raises.
+    """
+    found: list[Any] = []
+
+    def look(x: PyTree) -> PyTree:
+        for name, value in fun(x):
+
+            def rule(size, is_mapped, leaves, name=name):
+                found.append(name)
                 return leaves, is_mapped[0]
 
             probe = jax.custom_batching.custom_vmap(lambda leaves: leaves)
             probe.def_vmap(rule)
-            probe(jtu.tree_leaves(coordinates))
+            probe(jtu.tree_leaves(value))
         return x
 
     if jtu.tree_leaves(x):
@@ -58,7 +71,7 @@ def _depending(fun: Callable[[PyTree], tuple[PyTree, PyTree]], x: PyTree) -> lis
         except Exception:
             # What is wrong with the field itself, it says itself.
             eqx.filter_eval_shape(fun, x)
-            return [("", None)]
+            return None
     return found
 
 

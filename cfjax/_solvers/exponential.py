@@ -13,14 +13,16 @@ import jax.tree_util as jtu
 from jaxtyping import Array, PyTree, Real
 
 from .._control_term import is_driven
-from .._field import Rest, combine, from_chart, is_field
+from .._field import Rest, combine, from_chart, is_field, to_chart
 from .._fields.semilinear import AbstractSemilinearField
 from .._methods import exponential as _exponential
 from .._methods.exponential import Columns, Combination, ExponentialTableau
-from .._methods.proved import order_of, proved
-from .base import AbstractChartSolver, Step, check_choice
-from .chart import Chart
+from .._methods.order_conditions import order
+from .._term import product
+from .base import check_choice
 from .dense import AbstractPath
+from .dependence import depending
+from .step import AbstractChartSolver, Step, narrow
 
 
 class AbstractExponential(AbstractChartSolver):
@@ -47,9 +49,15 @@ class AbstractExponential(AbstractChartSolver):
     """
 
     tableau: eqx.AbstractVar[ExponentialTableau]
+    # Those of the method and of its embedded one, of a named method that takes longer to prove than
+    # a small step to trace. Tests prove them.
+    orders: ClassVar[tuple[int, int | None] | None] = None
     estimate: Literal["group"] | None = eqx.field(static=True, default="group", kw_only=True)
-    # Differences of times would differ from step to step by their rounding.
+    # Of steps that are equal: their length, as differences of times would differ from step to step
+    # by their rounding, and for each part of the field the coefficients of its linear part, where
+    # that is the same in all steps.
     equal_length: Real[Array, ""] | None = eqx.field(default=None, kw_only=True)
+    known: tuple[Any, ...] | None = eqx.field(default=None, kw_only=True)
 
     def __check_init__(self):
         check_choice("estimate", self.estimate, "group", None)
@@ -59,11 +67,14 @@ class AbstractExponential(AbstractChartSolver):
         return self.estimate is not None and self.tableau.uses_last
 
     def order(self, terms) -> int:
-        return order_of(self.tableau)
+        return self.orders[0] if self.orders else order(self.tableau)
 
     def error_order(self, terms) -> int | None:
         embedded = self.tableau.embedded_method
-        return None if embedded is None else order_of(embedded) + 1
+        if embedded is None:
+            return None
+        known = self.orders and self.orders[1]
+        return (known or order(embedded)) + 1
 
     def for_terms(self, terms):
         if is_driven(terms):
@@ -73,9 +84,23 @@ class AbstractExponential(AbstractChartSolver):
             )
         return self
 
-    def for_equal_steps(self, length: Real[Array, ""]) -> Any:
-        """The same method for steps of this length alone."""
-        return self._with(equal_length=length)
+    def for_equal_steps(self, terms, length, t0, y0, args) -> Any:
+        """The same method for steps of this length alone, with the coefficients of all linear parts
+        that depend on neither time nor state.
+        """
+        solver: Any = self._with(equal_length=length)
+
+        def coefficients(at: tuple[Any, PyTree]) -> list[tuple[Any, Any]]:
+            t, y = at
+            control = terms.contr(*solver.interval(t, t))
+            first, _ = to_chart(product(terms, terms.vf(t, y, args), control), y, ())
+            return list(enumerate(solver._linear_part(first).coefficients))
+
+        changing = depending(coefficients, (t0, y0))
+        if changing is None:
+            return solver
+        made = coefficients((t0, y0))
+        return solver._with(known=tuple(None if k in changing else part for k, part in made))
 
     def interval(self, t0: Any, t1: Any) -> tuple[Any, Any]:
         if self.equal_length is None:
@@ -83,37 +108,45 @@ class AbstractExponential(AbstractChartSolver):
         return jnp.zeros_like(self.equal_length), self.equal_length
 
     def step_in(self, chart):
-        tableau = self.tableau
-        first, start = chart.frozen(0.0, chart.start), chart.without_sums(chart.start)
-        linear = _LinearPart(type(self).__name__, first, [*self._rows, self._error or ()], chart)
+        tableau, first = self.tableau, chart.first
+        linear = self._linear_part(first)
         # The velocity at the start, and by how much g differs there and at each later stage.
-        changes = {1: _rest(first, combine([0.0], [first]), start)}
-        g = _rest(first, first, start)
+        changes = {1: _rest(first, combine([0.0], [first]), chart.origin)}
+        g = _rest(first, first, chart.origin)
 
-        def reach(row: Columns) -> PyTree:
+        def reach(row: Columns, changes: dict[int, PyTree]) -> PyTree:
             point = jtu.tree_map(jnp.add, chart.start, linear.increment(row, changes))
             return chart.branching(point)
 
-        def evaluate(stage: int, c: float, point: PyTree) -> None:
-            later = _rest(chart.frozen(c, point), first, chart.without_sums(point))
-            changes[stage] = jtu.tree_map(jnp.subtract, later, g)
+        def change(field: PyTree, point: PyTree) -> PyTree:
+            return jtu.tree_map(jnp.subtract, _rest(field, first, chart.sums.state(point)), g)
 
-        *rows, last = self._rows
+        *rows, last_row = self._rows
+        fields = [first]
         for stage, row in enumerate(rows, 2):
-            evaluate(stage, float(tableau.c[stage - 1]), reach(row))
-        end = reach(last)
+            point = reach(row, changes)
+            fields = [*fields, chart.field(float(tableau.c[stage - 1]), point, fields)]
+            changes = {**changes, stage: change(fields[-1], point)}
+        end = reach(last_row, changes)
         powers = [
             combine([float(w) for _, w in power], [changes[j] for j, _ in power])
             for power in tableau.powers
         ]
-        path = _Path(type(self).__name__, first, start, changes[1], powers)
+        path = _Path(type(self).__name__, first, chart.origin, changes[1], powers)
         if self._error is None:
-            return Step(chart.from_start(end), path)
+            return Step(chart.end(end), path)
+        last = None
         if tableau.uses_last:
-            end = chart.narrow(end)
-            evaluate(tableau.num_stages + 1, 1.0, end)
+            end = narrow(end)
+            last = chart.value_at(1.0, end)
+            field = chart.frozen(last, end, fields)
+            changes = {**changes, tableau.num_stages + 1: change(field, end)}
         error = from_chart(first, linear.increment(self._error, changes))
-        return Step(chart.from_start(end), path, error)
+        return Step(chart.end(end), path, error, last)
+
+    def _linear_part(self, first: PyTree) -> "_LinearPart":
+        rows = [*self._rows, self._error or ()]
+        return _LinearPart(type(self).__name__, first, rows, self.known)
 
     @property
     def _error(self) -> Columns | None:
@@ -128,27 +161,36 @@ class AbstractExponential(AbstractChartSolver):
 
 
 class _LinearPart:
-    """The coefficients of a step: functions of the linear part of its first field."""
+    """The coefficients of a step: functions of the linear part of its first field.
 
-    def __init__(self, solver: str, first: PyTree, rows: Sequence[Columns], chart: Chart | None):
+    `known` has those of each part of the field, or None for a part whose linear part may change.
+    """
+
+    def __init__(
+        self,
+        solver: str,
+        first: PyTree,
+        rows: Sequence[Columns],
+        known: Sequence[Any] | None = None,
+    ):
         paths, self.structure = jtu.tree_flatten_with_path(first, is_leaf=is_field)
         for path, part in paths:
             if is_field(part) and not isinstance(part, AbstractSemilinearField | Rest):
                 raise TypeError(_has_no_linear_part(solver, jtu.keystr(path), part))
         self.parts = [part for _, part in paths]
-        combinations = list(dict.fromkeys(terms for row in rows for _, terms in row))
-        self.coefficients = [_coefficients(part, combinations) for part in self.parts]
-        if chart is not None:
-            self.coefficients = [chart.constant(each) for each in self.coefficients]
+        self.combinations = list(dict.fromkeys(terms for row in rows for _, terms in row))
+        self.coefficients = [
+            _coefficients(part, self.combinations) if made is None else made
+            for part, made in zip(self.parts, known or [None] * len(self.parts), strict=True)
+        ]
 
     def increment(self, row: Columns, changes: dict[int, PyTree]) -> PyTree:
         """The sum over the columns of a row, of which each multiplies a change."""
         flat = {j: self.structure.flatten_up_to(changes[j]) for j, _ in row}
 
         def of_part(k: int, part: Any) -> PyTree:
-            coefficients = self.coefficients[k]
-            terms = [_times(part, coefficients[terms], flat[j][k]) for j, terms in row]
-            return _sum(terms)
+            coefficients = dict(zip(self.combinations, self.coefficients[k], strict=True))
+            return _sum([_times(part, coefficients[terms], flat[j][k]) for j, terms in row])
 
         return self.structure.unflatten(of_part(k, part) for k, part in enumerate(self.parts))
 
@@ -157,10 +199,10 @@ def _sum(trees: Sequence[PyTree]) -> PyTree:
     return functools.reduce(lambda a, b: jtu.tree_map(jnp.add, a, b), trees)
 
 
-def _coefficients(part: Any, combinations: Sequence[Combination]) -> dict[Combination, Any]:
+def _coefficients(part: Any, combinations: Sequence[Combination]) -> list[Any]:
     if not isinstance(part, AbstractSemilinearField):
         # phi_k(0) is 1 / k!.
-        return {terms: float(sum(w / factorial(k) for k, _, w in terms)) for terms in combinations}
+        return [float(sum(w / factorial(k) for k, _, w in terms)) for terms in combinations]
     pairs = list(dict.fromkeys((float(c), k) for terms in combinations for k, c, _ in terms))
     functions = dict(zip(pairs, part.functions(pairs), strict=True))
 
@@ -168,7 +210,7 @@ def _coefficients(part: Any, combinations: Sequence[Combination]) -> dict[Combin
         used = [(float(w), functions[float(c), k]) for k, c, w in terms]
         return _sum([jtu.tree_map(lambda x: w * x, function) for w, function in used])  # noqa: B023
 
-    return {terms: combined(terms) for terms in combinations}
+    return list(map(combined, combinations))
 
 
 def _times(part: Any, coefficient: Any, x: PyTree) -> PyTree:
@@ -215,7 +257,7 @@ class _Path(AbstractPath):
         }
         # The flow of s^(m-1) is (m-1)! phi_m.
         row = tuple((m, ((m, Fraction(1), Fraction(factorial(m - 1))),)) for m in changes)
-        linear = _LinearPart(self.solver, combine([theta], [self.first]), [row], None)
+        linear = _LinearPart(self.solver, combine([theta], [self.first]), [row])
         point = jtu.tree_map(jnp.add, self.start, linear.increment(row, changes))
         return from_chart(self.first, point)
 
@@ -250,7 +292,8 @@ class ETDRK4(AbstractExponential):
     (2002), doi:10.1006/jcph.2002.6995.
     """
 
-    tableau: ClassVar[ExponentialTableau] = proved(_exponential.ETDRK4, 4)
+    tableau: ClassVar[ExponentialTableau] = _exponential.ETDRK4
+    orders: ClassVar = (4, None)
 
 
 class ETD43(AbstractExponential, diffrax.AbstractAdaptiveSolver):
@@ -264,7 +307,8 @@ class ETD43(AbstractExponential, diffrax.AbstractAdaptiveSolver):
     (2005), doi:10.1137/040611434.
     """
 
-    tableau: ClassVar[ExponentialTableau] = proved(_exponential.ETD43, 4, 3)
+    tableau: ClassVar[ExponentialTableau] = _exponential.ETD43
+    orders: ClassVar = (4, 3)
 
 
 class ETD54(AbstractExponential, diffrax.AbstractAdaptiveSolver):
@@ -276,4 +320,5 @@ class ETD54(AbstractExponential, diffrax.AbstractAdaptiveSolver):
     the stiff case, SIAM J. Numer. Anal. 51 (2013), doi:10.1137/130920204.
     """
 
-    tableau: ClassVar[ExponentialTableau] = proved(_exponential.ETD54, 5, 4)
+    tableau: ClassVar[ExponentialTableau] = _exponential.ETD54
+    orders: ClassVar = (5, 4)

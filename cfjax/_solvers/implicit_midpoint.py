@@ -4,19 +4,17 @@ from typing import Any
 
 import diffrax
 import equinox as eqx
-import jax.numpy as jnp
 import jax.tree_util as jtu
 from jaxtyping import PyTree
 
 from .._control_term import is_driven
-from .._field import is_field, to_chart
+from .._field import is_field
 from .._term import product
-from .base import AbstractLieSolver, begun, ended, time_at
-from .chart import moved
-from .compensation import with_sums
-from .compiled import shared_end
-from .dense import Interpolation, Path
+from .base import AbstractLieSolver
+from .dense import Interpolation, Path, time_at
 from .fixed_point import fixed_point
+from .step import Step, begun, ended
+from .sums import Sums
 
 # The flow of the step's one field, for a part of the step.
 _EXTENSION = (((1.0,),),)
@@ -77,7 +75,6 @@ class ImplicitMidpoint(AbstractLieSolver):
         return self
 
     def step(self, terms, t0, t1, y0, args, solver_state, made_jump):
-        compensation = solver_state.compensation
         t0, _ = begun(solver_state, t0, lambda t0: None, made_jump)
         control, middle = terms.contr(t0, t1), time_at(0.5, t0, t1)
 
@@ -86,17 +83,16 @@ class ImplicitMidpoint(AbstractLieSolver):
 
         y, has_converged = fixed_point(lambda y: _mean(field(y), y0), y0, self.rtol, self.max_steps)
 
-        def stepped(y0: PyTree) -> Any:
-            frozen = field(y)
-            start = with_sums(lambda c, y: y if c is None else jnp.zeros_like(y), compensation, y0)
-            end, _ = shared_end(compensation, moved(frozen, start, y0, compensation), None, True)
-            charted, point = to_chart(frozen, y0, ())
-            return (end, None, None), Path.of(_EXTENSION, point, [charted])
+        def stepped(y0: PyTree) -> Step:
+            frozen, sums = field(y), Sums(y0, solver_state.compensation)
+            end, _ = sums.shared(sums.moved(frozen, sums.start), None, is_followed=True)
+            charted, point = Sums(y0).entered(frozen, y0)
+            return Step(end, Path.of(_EXTENSION, point, [charted]))
 
-        y1, error, path, state, result = ended(solver_state, stepped, y0)
+        y1, error, dense_info, state, result = ended(solver_state, stepped, y0)
         failed: Any = diffrax.RESULTS.nonlinear_divergence
         result = diffrax.RESULTS.where(has_converged, result, failed)
-        return y1, error, dict(path=path), state, result
+        return y1, error, dense_info, state, result
 
 
 def _mean(field: PyTree, y0: PyTree) -> PyTree:

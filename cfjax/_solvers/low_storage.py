@@ -12,14 +12,11 @@ from jax import lax
 from jaxtyping import PyTree
 
 from .._field import combine
-from .._methods.continuous_extension import continuous_extension
-from .._methods.proved import proved
 from .._methods.tableau import Product, Row, Tableau
-from .base import Step
 from .commutator_free import AbstractCommutatorFree, trimmed
 from .compiled import limits
-from .dense import Path
-from .stages import is_uniform
+from .stages import Stages, is_uniform
+from .step import Chart
 
 
 class AbstractLowStorage(AbstractCommutatorFree, diffrax.AbstractStratonovichSolver):
@@ -33,44 +30,46 @@ class AbstractLowStorage(AbstractCommutatorFree, diffrax.AbstractStratonovichSol
     a: ClassVar[Row]
     b: ClassVar[Row]
 
-    def direction(self, rows, chart, kept):
-        i = len(rows) - 1
-        if trimmed(self.tableau.beta)[: i + 1] != rows:
-            # A flow of the embedded method's own.
-            return super().direction(rows, chart, kept)
-        if i not in kept:
-            both = (float(self.a[i]), 1.0)
-            kept[i] = combine(both, (kept[i - 1], chart.fields[i])) if i else chart.fields[0]
-        return combine((float(self.b[i]),), (kept[i],))
-
-    def step_in(self, chart):
+    def stages(self, chart):
+        rows = trimmed(self.tableau.beta)
         embedded = None if self.estimate is None else self.tableau.embedded
-        penultimate = embedded is not None and trimmed(embedded) == trimmed(self.tableau.beta[:-1])
+        penultimate = embedded is not None and trimmed(embedded) == rows[:-1]
+        # All fields are in an estimate but that of the point before the end.
         other = embedded is not None and not (penultimate and self.estimate == "group")
-        if other or self._is_unrolled(chart.start):
-            return super().step_in(chart)
-        first = chart.frozen(0.0, chart.start)
-        if not is_uniform(chart):
-            return super().step_in(chart)
+        if not (other or self._is_unrolled(chart.start)) and is_uniform(chart):
+            return self._stages_in_loop(chart)
+        fields: list[PyTree] = [chart.first]
+        points: dict[Product, PyTree] = {(): chart.start}
+        total, point = chart.first, chart.start
+        for k, (a, b, c) in enumerate(zip(self.a, self.b, self.tableau.c, strict=True)):
+            if k:
+                points[rows[:k]] = point = chart.branching(point)
+                fields = [*fields, chart.field(float(c), point, fields)]
+                total = combine((float(a), 1.0), (total, fields[-1]))
+            point = chart.flow(combine((float(b),), (total,)), point)
+        points[rows] = point
+        return Stages(chart, fields, points)
+
+    def _stages_in_loop(self, chart: Chart) -> Stages:
+        """With no more than the last two points."""
 
         def stage(carry, coefficients):
             a, b, c = coefficients
             total, point, _ = carry
-            here = chart.frozen_after([total], c, point)
+            here = chart.field(c, point, [total])
             total = combine((a, 1.0), (total, here))
             return (total, chart.flow(combine((b,), (total,)), point), point), here
 
-        start = chart.start
-        after = chart.flow(combine((float(self.b[0]),), (first,)), start)
+        start, rows = chart.start, trimmed(self.tableau.beta)
+        after = chart.flow(combine((float(self.b[0]),), (chart.first,)), start)
         coefficients = tuple(
             jnp.asarray([float(x) for x in row[1:]]) for row in (self.a, self.b, self.tableau.c)
         )
-        (_, end, before), later = lax.scan(stage, (first, after, start), coefficients)
+        (_, end, before), later = lax.scan(stage, (chart.first, after, start), coefficients)
         # The compiler drops them where the caller asks for no output within the step.
-        fields = [first, *(jtu.tree_map(itemgetter(i), later) for i in range(len(self.b) - 1))]
-        path = Path.of(continuous_extension(self.tableau), chart.without_sums(start), fields)
-        error = chart.difference(end, before) if penultimate else None
-        return Step(chart.from_start(end), path, error)
+        fields = [chart.first]
+        fields += [jtu.tree_map(itemgetter(i), later) for i in range(len(self.b) - 1)]
+        return Stages(chart, fields, {(): start, rows[:-1]: before, rows: end})
 
     def _is_unrolled(self, point: PyTree) -> bool:
         if self.unroll is not None:
@@ -178,7 +177,8 @@ class CK54(AbstractLowStorage):
         3134564353537 / 4481467310338,
         2277821191437 / 14882151754819,
     )
-    tableau: ClassVar[Tableau] = proved(_tableau(a, b), 4)
+    tableau: ClassVar[Tableau] = _tableau(a, b)
+    orders: ClassVar = (4, None)
 
 
 class Luscher3(AbstractLowStorage, diffrax.AbstractAdaptiveSolver):
@@ -232,7 +232,8 @@ class YRK135(AbstractLowStorage):
         0.07729613386515187,
         0.054301254676908335,
     )
-    tableau: ClassVar[Tableau] = proved(_tableau(a, b), 5)
+    tableau: ClassVar[Tableau] = _tableau(a, b)
+    orders: ClassVar = (5, None)
 
 
 class CFEES25(AbstractLowStorage, diffrax.AbstractAdaptiveSolver):

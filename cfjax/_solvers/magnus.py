@@ -14,11 +14,11 @@ from .._methods.magnus import MagnusTableau
 from .._methods.tableau import Product
 from .._numerics.checks import Fault
 from .._term import product
-from .base import AbstractChartSolver, State, Step, check_choice
-from .chart import Chart
+from .base import State, check_choice
 from .dense import Path
 from .dependence import depending_on_state, unseen
-from .stages import can_roll, rolled_flows
+from .stacked import can_roll, rolled_flows
+from .step import AbstractChartSolver, Chart, Step
 
 
 class AbstractMagnus(AbstractChartSolver):
@@ -85,28 +85,33 @@ class AbstractMagnus(AbstractChartSolver):
             raise TypeError(_depends_on_state(type(self).__name__, *found[0]))
         return super().start(terms, t0, t1, y0, args)
 
+    @property
+    def first_time(self) -> float:
+        return self.tableau.nodes[0]
+
     def step_in(self, chart):
-        tableau = self.tableau
-        for c in tableau.nodes:
-            # Any point will do.
-            chart.frozen(c, chart.start)
+        tableau, start = self.tableau, chart.start
+        # Any point will do.
+        values = [chart.first_value, *(chart.value_at(c, start) for c in tableau.nodes[1:])]
+        fields = [chart.first]
+        for value in values[1:]:
+            fields = [*fields, chart.frozen(value, start, fields)]
         embedded = None if self.estimate is None else tableau.embedded
         num_shared = 0 if embedded is None else _num_shared(tableau.rows, embedded)
-        middle = self._flows(tableau.rows[:num_shared], chart, chart.start)
-        end = self._flows(tableau.rows[num_shared:], chart, middle)
+        middle = self._flows(tableau.rows[:num_shared], chart, fields, start)
+        end = self._flows(tableau.rows[num_shared:], chart, fields, middle)
         error = None
         if embedded is not None:
-            error = chart.difference(end, self._flows(embedded[num_shared:], chart, middle))
-        start = chart.without_sums(chart.start)
-        path = Path.of(tableau.continuous_extension, start, chart.fields)
-        return Step(chart.from_start(end), path, error)
+            error = chart.difference(end, self._flows(embedded[num_shared:], chart, fields, middle))
+        path = Path.of(tableau.continuous_extension, chart.origin, fields)
+        return Step(chart.end(end), path, error, values[-1])
 
-    def _flows(self, rows: Product, chart: Chart, point: PyTree) -> PyTree:
+    def _flows(self, rows: Product, chart: Chart, fields: list[PyTree], point: PyTree) -> PyTree:
         weights = [list(map(float, row)) for row in rows]
-        if len(weights) > 1 and can_roll(self.unroll, chart.fields[0], point):
-            return rolled_flows(np.array(weights), chart.fields, point, chart.flow)
+        if len(weights) > 1 and can_roll(self.unroll, fields[0], point):
+            return rolled_flows(np.array(weights), fields, point, chart.flow)
         for row in weights:
-            used = [(a, f) for a, f in zip(row, chart.fields, strict=True) if a != 0]
+            used = [(a, f) for a, f in zip(row, fields, strict=True) if a != 0]
             point = chart.flow(combine(*zip(*used, strict=True)), point)
         return point
 

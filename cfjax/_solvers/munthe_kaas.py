@@ -27,11 +27,12 @@ from .._methods.continuous_extension import RungeKuttaExtension, runge_kutta_ext
 from .._methods.order_conditions import runge_kutta_order
 from .._methods.tableau import ContinuousExtension, Row
 from .._numerics.vectors import smooth
-from .base import AbstractChartSolver, Step, check_choice
-from .chart import Chart
+from .base import check_choice
 from .compiled import scalarised
 from .dense import Path
 from .stages import rolled_elements
+from .step import AbstractChartSolver, Chart, Step, shared
+from .sums import Sums
 
 # The rows of the stages after the first, and the weights.
 _RungeKutta = tuple[tuple[tuple[float, ...], ...], tuple[float, ...]]
@@ -78,21 +79,20 @@ class AbstractMuntheKaas(AbstractChartSolver, diffrax.AbstractStratonovichSolver
 
     def logarithm(self, field: Callable[[Any, PyTree], PyTree], y0: PyTree) -> PyTree:
         """The element v, where `field(c, y)` is `h f(t + c h, y)`."""
-        return _combine_nonzero(self.b, self.elements(Chart(field, y0)).elements)
+        chart = Chart.at_start(field, lambda field: field, Sums(y0), field(0.0, y0))
+        return _combine_nonzero(self.b, self.elements(chart).elements)
 
     def step_in(self, chart):
         found = self.elements(chart)
-        elements = found.elements
-        v = _combine_nonzero(self.b, elements)
+        v = _combine_nonzero(self.b, found.elements)
         end = chart.flow(v, chart.start)
-        y1 = found.or_nan(chart.from_start(end))
+        y1 = found.or_nan(chart.end(end))
         error = None
         # All that follows is for error control and output within the step. The compiler leaves it
         # out where the caller asks for neither.
         if self.estimate is not None and self.b_error is not None:
             found = self.estimating(found, v, end, chart)
-            elements = found.elements
-            off = _combine_nonzero(self.b_error, elements)
+            off = _combine_nonzero(self.b_error, found.elements)
             if self.estimate == "algebra":
                 error = tangent(off, chart.state(end))
             else:
@@ -101,20 +101,23 @@ class AbstractMuntheKaas(AbstractChartSolver, diffrax.AbstractStratonovichSolver
             # NaN is an infinite error to diffrax, so that the step is taken again, shorter.
             error = found.or_nan(error)
         # All of them are results then, and XLA would compute the step anew for each.
-        elements = chart.shared(elements)
-        path = Path.of(self.continuous_extension, chart.without_sums(chart.start), elements)
-        return Step(y1, path, error)
+        elements = shared(found.elements)
+        return Step(
+            y1, Path.of(self.continuous_extension, chart.origin, elements), error, found.last
+        )
 
 
 class _Elements(NamedTuple):
     """Elements of the algebra, and zero, or NaN if some `dexpinv` among them had no value.
 
     The elements then mean nothing, but they are finite: of a step that is not kept the derivative
-    must be zero, and that of NaN is NaN. None if nothing is known.
+    must be zero, and that of NaN is NaN. None if nothing is known. `last` is the value of the field
+    at the end of the step, if it has been evaluated.
     """
 
     elements: list[PyTree]
     missing: Real[Array, ""] | None = None
+    last: PyTree = None
 
     def and_known(self, *missing: Real[Array, ""] | None) -> "_Elements":
         known = [x for x in (self.missing, *missing) if x is not None]
@@ -139,17 +142,20 @@ def _missing(u: PyTree) -> Real[Array, ""] | None:
     return jnp.where(found, jnp.zeros((), dtype), jnp.nan)
 
 
-def _frozen(chart: Chart, c: float, u: PyTree) -> PyTree:
-    """The field at the point where u leads from the start of the step; None is zero.
+def _first(chart: Chart) -> PyTree:
+    """The field at the start.
 
     **Raises** `TypeError` for a field without a bracket.
     """
-    point = chart.start if u is None else chart.flow(u, chart.start)
-    field = chart.frozen(c, point)
-    for part in jtu.tree_leaves(field, is_leaf=is_field):
+    for part in jtu.tree_leaves(chart.first, is_leaf=is_field):
         if is_field(part) and not isinstance(part, AbstractAlgebraElement):
             raise TypeError(without_bracket(part))
-    return field
+    return chart.first
+
+
+def _frozen(chart: Chart, c: float, u: PyTree, earlier: Sequence[PyTree]) -> PyTree:
+    """The field at the point where u leads from the start of the step."""
+    return chart.field(c, chart.flow(u, chart.start), earlier)
 
 
 def _sixths(*numerators: int | Fraction) -> Row:
@@ -176,9 +182,9 @@ class RKMK3(AbstractMuntheKaas, diffrax.AbstractAdaptiveSolver):
         return 3
 
     def elements(self, chart):
-        k1 = _frozen(chart, 0.0, None)
-        k2 = _frozen(chart, 0.5, combine((1 / 2,), (k1,)))
-        k3 = _frozen(chart, 1.0, combine((-1.0, 2.0), (k1, k2)))
+        k1 = _first(chart)
+        k2 = _frozen(chart, 0.5, combine((1 / 2,), (k1,)), [k1])
+        k3 = _frozen(chart, 1.0, combine((-1.0, 2.0), (k1, k2)), [k1, k2])
         return _Elements([k1, k2, k3, bracket(k1, k2)])
 
 
@@ -206,10 +212,10 @@ class RKMK4(AbstractMuntheKaas):
         return 4
 
     def elements(self, chart):
-        k1 = _frozen(chart, 0.0, None)
-        k2 = _frozen(chart, 0.5, combine((1 / 2,), (k1,)))
-        k3 = _frozen(chart, 0.5, combine((1 / 2, -1 / 8), (k2, bracket(k1, k2))))
-        k4 = _frozen(chart, 1.0, k3)
+        k1 = _first(chart)
+        k2 = _frozen(chart, 0.5, combine((1 / 2,), (k1,)), [k1])
+        k3 = _frozen(chart, 0.5, combine((1 / 2, -1 / 8), (k2, bracket(k1, k2))), [k1, k2])
+        k4 = _frozen(chart, 1.0, k3, [k1, k2, k3])
         return _Elements([k1, k2, k3, k4, bracket(k1, k4)])
 
 
@@ -299,18 +305,21 @@ class RKMK(AbstractMuntheKaas, diffrax.AbstractAdaptiveSolver):
 
     def elements(self, chart):
         n = len(self.b)
-        return self._stages([_frozen(chart, 0.0, None)], self.a[1:n], self.c[1:n], chart)
+        return self._stages([_first(chart)], self.a[1:n], self.c[1:n], chart)
 
     def estimating(self, found, v, end, chart):
-        n, elements = len(self.b), list(found.elements)
+        n = len(self.b)
         for c, row in zip(self.c[n:], self.a[n:], strict=True):
             u, here = v, end
             if row != self.b:
-                u = _combine_nonzero(row, elements)
+                u = _combine_nonzero(row, found.elements)
                 here = chart.flow(u, chart.start)
-            elements.append(dexpinv(u, chart.frozen_after(elements, c, here), self._degree))
-            found = found.and_known(_missing(u))
-        return found._replace(elements=elements)
+            value = chart.value_at(c, here)
+            field = chart.frozen(value, here, found.elements)
+            found = found.and_known(_missing(u))._replace(
+                elements=[*found.elements, dexpinv(u, field, self._degree)], last=value
+            )
+        return found
 
     def extended(self, path: Any, field: Callable[[Any, PyTree], PyTree]):
         n = len(self.b)
@@ -320,7 +329,8 @@ class RKMK(AbstractMuntheKaas, diffrax.AbstractAdaptiveSolver):
         start, elements = path.parts(path.arrays)
 
         def later(start: PyTree) -> list[PyTree]:
-            chart = Chart.at_path(field, start, elements)
+            same = lambda field: field  # noqa: E731
+            chart = Chart(field, same, Sums(start), None, elements[0], start)
             found = self._stages(elements[:n], rows, times, chart)
             return found.or_nan(found.elements[n:])
 
@@ -344,14 +354,17 @@ class RKMK(AbstractMuntheKaas, diffrax.AbstractAdaptiveSolver):
         made = rolled_elements(self.unroll, chart, known, rows, times, inverse, _missing)
         if made is not None:
             return _Elements(*made)
-        stages, missing = list(known), []
+        found = _Elements(known)
         for c, row in zip(times, rows, strict=True):
-            # Rows may be shorter than what is known.
-            u = _combine_nonzero(row, stages) if any(row) else None
-            field = _frozen(chart, c, u)
-            stages.append(field if u is None else inverse(u, field))
-            missing.append(None if u is None else _missing(u))
-        return _Elements(stages).and_known(*missing)
+            if not any(row):
+                stage = chart.field(c, chart.start, found.elements)
+            else:
+                # Rows may be shorter than what is known.
+                u = _combine_nonzero(row, found.elements)
+                stage = inverse(u, _frozen(chart, c, u, found.elements))
+                found = found.and_known(_missing(u))
+            found = found._replace(elements=[*found.elements, stage])
+        return found
 
 
 class RKMK5(RKMK):

@@ -6,6 +6,7 @@ normal of variance h/12 and independent of W. So a method is rows of numbers (a,
 """
 
 import abc
+import functools
 import itertools
 from math import sqrt
 from typing import Any, ClassVar, NamedTuple
@@ -18,20 +19,23 @@ from jaxtyping import PyTree
 
 from .._control_term import is_driven, paths
 from .._term import product
-from .base import AbstractChartSolver, AbstractLieSolver, result_of, time_at
+from .base import AbstractLieSolver, result_of
 from .commutator_free import CF4, LieEuler
-from .compiled import by_turns, control_of
-from .dense import Pieces, as_part
+from .compiled import control_of
+from .dense import Interpolation, Pieces
 from .dependence import depending_on_state
+from .step import AbstractChartSolver
+from .substeps import substeps
 
 
 class _Piece(NamedTuple):
-    """The parts of the step's time, of W and of H in a piece, and the time before it."""
+    """The parts of the step's time, of W and of H in a piece, and where it starts and ends."""
 
     time: Any
     increment: Any
     area: Any
     start: Any = 0.0
+    end: Any = 0.0
 
 
 class AbstractPieces(AbstractLieSolver, diffrax.AbstractStratonovichSolver):
@@ -45,7 +49,7 @@ class AbstractPieces(AbstractLieSolver, diffrax.AbstractStratonovichSolver):
     # Their times, increments and areas.
     rows: ClassVar[tuple[tuple[float, float, float], ...]]
 
-    interpolation_cls: ClassVar[Any] = Pieces
+    interpolation_cls: ClassVar[Any] = Interpolation
 
     def __check_init__(self):
         _check_solver("solver", self.solver)
@@ -76,26 +80,21 @@ class AbstractPieces(AbstractLieSolver, diffrax.AbstractStratonovichSolver):
     def step(self, terms, t0, t1, y0, args, solver_state, made_jump):
         control = control_of(terms, t0, t1, use_levy=True)
         is_constant = _is_constant(terms, t0, t1, y0, args)
-        before = itertools.accumulate((a for a, *_ in self.rows), initial=0.0)
-        pieces = [_Piece(*row, start) for row, start in zip(self.rows, before, strict=False)]
+        ends = itertools.accumulate((a for a, *_ in self.rows), initial=0.0)
+        pieces = [
+            _Piece(*row, *of) for row, of in zip(self.rows, itertools.pairwise(ends), strict=True)
+        ]
 
         def kind(piece: _Piece) -> tuple[AbstractChartSolver, bool]:
             return self.solver_of(piece, is_constant), piece.time > 0
 
-        carry, parts = (y0, solver_state), []
+        progress, parts = (y0, solver_state, diffrax.RESULTS.successful), []
         for (solver, _), alike in itertools.groupby(pieces, kind):
-
-            def follow(carry: Any, piece: _Piece, solver: AbstractChartSolver = solver) -> Any:
-                y, state = carry
-                start, end = (time_at(c, t0, t1) for c in (piece.start, piece.start + piece.time))
-                along = _along(terms, control, piece)
-                y, _, dense_info, state, _ = solver.step(along, start, end, y, args, state, False)
-                return (y, state), as_part(solver, dense_info, t0)
-
-            carry, more = by_turns(follow, carry, list(alike))
+            along = functools.partial(_along, terms, control)
+            progress, more = substeps(solver, along, list(alike), t0, t1, args, progress)
             parts += more
-        y1, state = carry
-        return y1, None, dict(parts=parts), state, result_of(y1)
+        y1, state, _ = progress
+        return y1, None, dict(path=Pieces(parts)), state, result_of(y1)
 
 
 class WeakOrder2(AbstractPieces):

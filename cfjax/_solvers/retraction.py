@@ -13,8 +13,8 @@ from .._fields.low_rank import BorderedSkew, LowRankSkew
 from .._fields.sphere import SphereRotation
 from .._methods.continuous_extension import runge_kutta_extension
 from .._numerics.matmul import matmul
-from .base import AbstractChartSolver, Step
 from .dense import Path
+from .step import AbstractChartSolver, Step
 
 _EXTENSION = runge_kutta_extension(
     ((), (0.5,), (0.0, 0.5), (0.0, 0.0, 1.0)), (1 / 6, 1 / 3, 1 / 3, 1 / 6), 4
@@ -44,10 +44,8 @@ class CayleyRK4(AbstractChartSolver, diffrax.AbstractStratonovichSolver):
 
     def step_in(self, chart):
         # It has coordinates of its own, and takes states.
-        field, y0 = chart.field, chart.start
-        first = field(0.0, y0)
+        y0, first = chart.sums.y0, chart.product(chart.first_value)
         num_axes = jtu.tree_map(_num_axes, first, is_leaf=is_field)
-
         end = _End(tuple(jtu.tree_leaves(num_axes)))
 
         def rate(c: float, v: PyTree) -> PyTree:
@@ -57,7 +55,7 @@ class CayleyRK4(AbstractChartSolver, diffrax.AbstractStratonovichSolver):
                 num_axes,
                 y0,
                 v,
-                tangent(field(c, y), y),
+                tangent(chart.product(chart.value(c, y)), y),
             )
 
         k1 = tangent(first, y0)
@@ -66,6 +64,8 @@ class CayleyRK4(AbstractChartSolver, diffrax.AbstractStratonovichSolver):
         k4 = rate(1.0, k3)
         rates = [k1, k2, k3, k4]
         y1 = end(combine((1 / 6, 1 / 3, 1 / 3, 1 / 6), rates), y0)
+        # A part at rest may be a sum.
+        y1 = chart.sums.map(lambda c, y, z: z if c is None else z - y, y1)
         return Step(y1, Path.of(_EXTENSION, y0, rates, end))
 
 

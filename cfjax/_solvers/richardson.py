@@ -12,9 +12,12 @@ from jax import lax
 from jaxtyping import Array, PyTree
 
 from .._control_term import is_driven
+from .dense import Interpolation, Pieces
+from .solver import AbstractSolver, as_own
+from .substeps import first_failure
 
 
-class Richardson(diffrax.AbstractAdaptiveSolver, diffrax.AbstractWrappedSolver):
+class Richardson(AbstractSolver, diffrax.AbstractAdaptiveSolver, diffrax.AbstractWrappedSolver):
     """Any solver with an error estimate, by step doubling (Richardson extrapolation).
 
     Every step is made twice: as one step, to `y1`, and as two half steps, to `y2`. For a solver of
@@ -120,10 +123,8 @@ class Richardson(diffrax.AbstractAdaptiveSolver, diffrax.AbstractWrappedSolver):
         # diffrax takes the power of h that the estimate behaves like.
         return self.order(terms) + (1 if self.as_in_paper else 0)
 
-    @property
-    def start(self) -> Any:
-        """That of a solver of this package: see `AbstractLieSolver`."""
-        return cast(Any, self.solver).start
+    def start(self, terms, t0, t1, y0, args):
+        return as_own(self.solver).start(terms, t0, t1, y0, args)
 
     def init(self, terms, t0, t1, y0, args) -> PyTree:
         return self.solver.init(terms, t0, t1, y0, args)
@@ -142,7 +143,7 @@ class Richardson(diffrax.AbstractAdaptiveSolver, diffrax.AbstractWrappedSolver):
         error = jtu.tree_map(lambda a, b: (a - b) / (2**order - 1), y1, y2)
         if not self.as_in_paper:
             error = jtu.tree_map(partial(_added_up, order), error, y0, y2)
-        result = _first_failure(result, result_1, result_2)
+        result = first_failure(result, result_1, result_2)
         if result is not diffrax.RESULTS.successful:
             # What a failed step returns may look like a small error. As in diffrax, it is rejected.
             okay = diffrax.is_okay(result)
@@ -164,49 +165,13 @@ def _added_up(order: int, error: Array, y0: Array, y2: Array) -> Array:
     return error * jnp.maximum(steps, 1).astype(error.dtype)
 
 
-def _first_failure(*results: diffrax.RESULTS) -> diffrax.RESULTS:
-    first, *rest = results
-    for result in rest:
-        # Left out where no step can fail: a loop of small steps feels every operation.
-        if result is not diffrax.RESULTS.successful:
-            is_first = first == diffrax.RESULTS.successful
-            first = diffrax.RESULTS.where(is_first, result, first)
-    return first
-
-
 class _HalvesFactory(NamedTuple):
     """Equal to itself and hashable, as diffrax keeps it as a static field."""
 
     interpolation_cls: Callable[..., diffrax.AbstractLocalInterpolation]
 
-    def __call__(self, *, t0, t1, first, second) -> "_HalvesInterpolation":
+    def __call__(self, *, t0, t1, first, second) -> Interpolation:
         middle = t0 + (t1 - t0) / 2
-        return _HalvesInterpolation(
-            t0=t0,
-            t1=t1,
-            middle=middle,
-            first=self.interpolation_cls(t0=t0, t1=middle, **first),
-            second=self.interpolation_cls(t0=middle, t1=t1, **second),
-        )
-
-
-class _HalvesInterpolation(diffrax.AbstractLocalInterpolation):
-    """The output of two half steps."""
-
-    t0: Any
-    t1: Any
-    middle: Any
-    first: diffrax.AbstractLocalInterpolation
-    second: diffrax.AbstractLocalInterpolation
-
-    def evaluate(self, t0: Any, t1: Any = None, left: bool = True) -> PyTree:
-        """The solution at time `t0`, or its increment from `t0` to `t1`."""
-        if t1 is not None:
-            start, end = self.evaluate(t0, left=left), self.evaluate(t1, left=left)
-            return jtu.tree_map(jnp.subtract, end, start)
-        backwards = self.t1 < self.t0
-        in_first = jnp.where(backwards, t0 >= self.middle, t0 <= self.middle)
-        # Each half is asked at a time of its own only: others may be an error there.
-        a = self.first.evaluate(jnp.where(in_first, t0, self.middle), left=left)
-        b = self.second.evaluate(jnp.where(in_first, self.middle, t0), left=left)
-        return jtu.tree_map(lambda a, b: jnp.where(in_first, a, b), a, b)
+        halves = (t0, middle, first), (middle, t1, second)
+        parts = [self.interpolation_cls(t0=t0, t1=t1, **info) for t0, t1, info in halves]
+        return Interpolation(t0=t0, t1=t1, path=Pieces(parts))

@@ -13,42 +13,28 @@ from .._control_term import fault_of_increments, is_driven
 from .._field import Rest, combine, is_field
 from .._methods.splitting import BLANES_MOAN_4, BLANES_MOAN_6, STRANG, splitting_order
 from .._term import product
-from .base import (
-    AbstractLieSolver,
-    State,
-    begun,
-    ended,
-    fault_of_start,
-    time_at,
-)
-from .chart import flow_at, moved
-from .compensation import at, no_compensation, with_sums, zeros
-from .compiled import by_turns, control_of, shared_end
-from .dense import part_of_step
+from .base import AbstractLieSolver, State, fault_of_start
+from .compiled import by_turns, control_of
+from .dense import AbstractPath, Interpolation, time_at
 from .dependence import depending_on_time, unseen
+from .step import Step, begun, ended
+from .sums import Sums
 
 
-class _Replay(diffrax.AbstractLocalInterpolation):
+class _Replay(AbstractPath):
     """The flows of a step again, each for a part of its time: on the manifold, of order 1."""
 
-    t0: Any
-    t1: Any
     start: PyTree
     first: PyTree
     # Those of each pair of stages.
     later: list[tuple[PyTree, ...]]
 
-    def evaluate(self, t0: Any, t1: Any = None, left: bool = True) -> PyTree:
-        """The solution at time `t0`, or what is added to it from `t0` to `t1`."""
-        del left
-        if t1 is not None:
-            start, end = self.evaluate(t0), self.evaluate(t1)
-            return jtu.tree_map(jnp.subtract, end, start)
-        theta = part_of_step(self, t0)
+    def point(self, theta: Any) -> PyTree:
+        sums = Sums(self.start)
 
         def pair(y: PyTree, fields: tuple[PyTree, ...]) -> tuple[PyTree, None]:
             for field in fields:
-                y = flow_at(combine((theta,), (field,)), y)
+                y = sums.moved(combine((theta,), (field,)), y)
             return y, None
 
         y, _ = pair(self.start, (self.first,))
@@ -61,7 +47,7 @@ class AbstractSplitting(AbstractLieSolver, diffrax.AbstractStratonovichSolver):
     stages: eqx.AbstractVar[tuple[float, ...]]
 
     term_structure: ClassVar = diffrax.MultiTerm
-    interpolation_cls: ClassVar[Any] = _Replay
+    interpolation_cls: ClassVar[Any] = Interpolation
 
     @property
     def is_symmetric(self):
@@ -103,27 +89,29 @@ class AbstractSplitting(AbstractLieSolver, diffrax.AbstractStratonovichSolver):
         def at_start(y0: PyTree) -> tuple[list[PyTree], PyTree]:
             parts = zip(terms.terms, control, strict=True)
             fields = [product(term, term.vf(t0, y0, args), x) for term, x in parts]
-            return fields, _no_compensation(fields, y0)
+            return fields, _compensation(fields, y0)
 
         fields, compensation = eqx.filter_eval_shape(at_start, y0)
-        compensation = zeros(compensation, y0)
+        compensation = Sums(y0, compensation).zeros()
         first = terms.terms[0].vf(t0, y0, args)
         fault = fault_of_start(t0, t1, fields, y0)
         fault = fault_of_increments(fault, terms, t0, t1, y0, args)
         return State(compensation, first, None), fault
 
     def step(self, terms, t0, t1, y0, args, solver_state, made_jump):
-        parts, compensation = terms.terms, solver_state.compensation
+        parts = terms.terms
         t0, known = begun(solver_state, t0, lambda t0: parts[0].vf(t0, y0, args), made_jump)
         controls = control_of(terms, t0, t1)
 
-        def stepped(y0: PyTree) -> Any:
+        def stepped(y0: PyTree) -> Step:
+            sums = Sums(y0, solver_state.compensation)
+
             def value(k: int, c: Any, z: PyTree) -> PyTree:
-                return parts[k].vf(time_at(c, t0, t1), at(y0, z, compensation), args)
+                return parts[k].vf(time_at(c, t0, t1), sums.state(z), args)
 
             def apply_flow(k: int, value: PyTree, s: Any, z: PyTree) -> tuple[PyTree, PyTree]:
                 field = product(parts[k], value, _scaled(s, controls[k]))
-                return field, moved(field, z, y0, compensation)
+                return field, sums.moved(field, z)
 
             def pair(carry: tuple[PyTree, PyTree], x: _Pair) -> Any:
                 z, _ = carry
@@ -138,14 +126,12 @@ class AbstractSplitting(AbstractLieSolver, diffrax.AbstractStratonovichSolver):
                 field, z = apply_flow(0, new, x.kick, z)
                 return (z, new), (*fields, field)
 
-            start = with_sums(lambda c, y: y if c is None else jnp.zeros_like(y), compensation, y0)
-            field, z = apply_flow(0, known, self.stages[0], start)
-            (z, first), later = by_turns(pair, (z, known), _pairs(self.stages))
-            end, _ = shared_end(compensation, z, None, is_followed=True)
-            return (end, first, None), (field, later)
+            field, z = apply_flow(0, known, self.stages[0], sums.start)
+            (z, last), later = by_turns(pair, (z, known), _pairs(self.stages))
+            end, _ = sums.shared(z, None, is_followed=True)
+            return Step(end, _Replay(y0, field, later), last=last)
 
-        y1, error, (field, later), state, result = ended(solver_state, stepped, y0)
-        return y1, error, dict(start=y0, first=field, later=later), state, result
+        return ended(solver_state, stepped, y0)
 
 
 class Splitting(AbstractSplitting):
@@ -247,13 +233,13 @@ def _scaled(s: Any, control: PyTree) -> PyTree:
     return jtu.tree_map(lambda x: jnp.asarray(s, jnp.result_type(x)) * x, control)
 
 
-def _no_compensation(fields: Sequence[PyTree], y0: PyTree) -> PyTree:
+def _compensation(fields: Sequence[PyTree], y0: PyTree) -> PyTree:
     """Zeros for each array of the state that one term moves by increments and the others can."""
 
     def kind(f: Any, y: PyTree) -> PyTree:
         if not is_field(f) or isinstance(f, Rest):
             return jtu.tree_map(lambda _: "any", y)
-        is_sum = jtu.tree_leaves(no_compensation(f, y)) != []
+        is_sum = jtu.tree_leaves(Sums.of(f, y).compensation) != []
         return jtu.tree_map(lambda _: "sum" if is_sum else "state", y)
 
     def part(y: Array, *kinds: str) -> Array | None:

@@ -6,8 +6,6 @@
   there.
 - `materialised_if_long`, `materialised_together`, `materialised_in_rows`, `computed_once`: values
   that several results need, computed once.
-- `invariant`: a mark of values that may be the same in every turn of a loop; `invariants_first`: a
-  turn with those computed before.
 - `pack`, `unpack`: `jnp.stack` and `jnp.unstack` in a form that XLA fuses.
 - `smooth`: a mark of functions that compare numbers and yet are smooth up to rounding.
 - `materialised`, `call`: arrays and functions that XLA computes on their own.
@@ -19,8 +17,6 @@ Nothing outside may import from the files within. `README.md` here says what eac
 
 from . import limits as limits
 from .call import call as call
-from .invariant import invariant as invariant
-from .invariant import invariants_first as invariants_first
 from .loop import repeat as repeat
 from .materialise import computed_once as computed_once
 from .materialise import materialised as materialised

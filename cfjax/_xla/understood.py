@@ -89,14 +89,6 @@ _CONTROL = frozenset(("cond", "scan", "while"))
 # The name of loops over stages (`stages.py`), and of choices within them.
 STAGES = "cfjax_stages"
 
-# The name of marks (`invariant.py`).
-INVARIANT = "cfjax_invariant"
-
-
-def is_invariant(eqn: JaxprEqn) -> bool:
-    """Whether this marks a value that may be the same in every turn of a loop."""
-    return eqn.primitive.name == "name" and eqn.params.get("name") == INVARIANT
-
 
 def is_readable(jaxpr: Jaxpr) -> bool:
     """Whether a program can be scalarised.
@@ -105,7 +97,6 @@ def is_readable(jaxpr: Jaxpr) -> bool:
       of a method. They would stay whole, and what is around them, scalarised, XLA would compute
       anew for each of the entries that go in.
     - It has no function with a rule for reverse mode only.
-    - It has no marked values, as of a step with functions of an operator. It would be long.
     - It is on one device, as far as the types of its values say, in no `jax.shard_map`.
     - It says nothing to the compiler about some of its operations.
     """
@@ -113,7 +104,6 @@ def is_readable(jaxpr: Jaxpr) -> bool:
         (eqn.primitive.name not in _CONTROL or _is_of_stages(eqn))
         and "custom_vjp" not in eqn.primitive.name
         and not _has_advice(eqn)
-        and not is_invariant(eqn)
         and all(_is_on_one_device(v.aval) for v in (*eqn.invars, *eqn.outvars))
         and all(map(is_readable, jaxprs_in_params(eqn.params)))
         for eqn in jaxpr.eqns

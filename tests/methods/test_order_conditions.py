@@ -22,7 +22,6 @@ from cfjax._methods.order_conditions import (
     trees,
     words,
 )
-from cfjax._methods.proved import PROVED, order_of
 from cfjax._methods.tableau import crouch_grossman
 
 HALF = Fraction(1, 2)
@@ -301,13 +300,26 @@ def test_a_small_mistake_in_a_long_tableau_is_seen():
     assert order(changed(YRK135, (13, 12, 12), 1e-10)) < 5
 
 
-def test_stored_orders_are_those_that_the_conditions_prove():
-    # The import of a low-storage method stores its order.
-    assert cfjax.YRK135.tableau in PROVED and cfjax.CK54.tableau in PROVED
-    assert {tableau: order(tableau) for tableau in PROVED} == PROVED
-    assert all(order_of(tableau) == q for tableau, q in PROVED.items())
-    # Of others it is proved.
-    assert order_of(changed(CG5, (4, 0, 2), 1e-10)) < 5
+STORED = [
+    solver
+    for name in dir(cfjax)
+    if isinstance(solver := getattr(cfjax, name), type) and getattr(solver, "orders", None)
+]
+
+
+@pytest.mark.parametrize("solver", STORED)
+def test_stored_orders_are_those_that_the_conditions_prove(solver):
+    method, embedded = solver(), solver.tableau.embedded_method
+    lower = None if embedded is None else order(embedded)
+    assert solver.orders == (order(solver.tableau), lower)
+    assert method.order(None) == solver.orders[0]
+    assert method.error_order(None) == (None if lower is None else lower + 1)
+
+
+def test_orders_are_stored_where_a_proof_takes_long():
+    assert {cfjax.CG5, cfjax.YRK135, cfjax.CF54, cfjax.ETD54} <= set(STORED)
+    # Of others they are proved.
+    assert cfjax.CommutatorFree(changed(CG5, (4, 0, 2), 1e-10)).order(None) < 5
 
 
 @pytest.mark.parametrize(("solver", "q", "embedded"), [(diffrax.Dopri8, 8, 7)])

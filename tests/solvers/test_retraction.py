@@ -77,6 +77,23 @@ def test_in_a_linear_space_it_is_the_classical_method():
     np.testing.assert_allclose(found["place"], expected, rtol=0, atol=1e-15 * 10)
 
 
+def test_a_field_that_reads_a_part_at_rest():
+    """It is a sum of nothing, and its state is the same at all stages."""
+
+    def field(t, y, args):
+        return {"q": cfjax.LowRankSkew(y["scale"] * (jnp.cos(t) * A @ y["q"] + B)), "scale": None}
+
+    y0 = {"q": jnp.asarray(Q), "scale": jnp.asarray(0.7)}
+    t1 = 0.4
+    found = cfjax.integrate(cfjax.LieTerm(field), cfjax.CayleyRK4(), 0.0, t1, y0, num_steps=20).ys
+    # The same with a number.
+    alone = cfjax.LieTerm(lambda t, y, args: cfjax.LowRankSkew(0.7 * (jnp.cos(t) * A @ y + B)))
+    expected = cfjax.integrate(alone, cfjax.CayleyRK4(), 0.0, t1, jnp.asarray(Q), num_steps=20).ys
+    assert float(found["scale"][-1]) == 0.7
+    # Small solves, 20 times.
+    np.testing.assert_allclose(found["q"], expected, rtol=0, atol=1e-14)
+
+
 @pytest.mark.slow
 def test_gradients():
     weight = np.arange(14.0).reshape(7, 2)

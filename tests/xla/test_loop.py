@@ -10,7 +10,6 @@ import numpy as np
 import pytest
 from jax import lax
 
-from cfjax._xla.invariant import invariant, invariants_first
 from cfjax._xla.loop import repeat
 
 VECTOR = jnp.asarray([0.3, -0.7, 1.1])
@@ -186,25 +185,3 @@ def test_an_entry_that_is_known_before():
     for found, x in zip(repeat(step, start, NUM_STEPS)[0], expected, strict=True):
         # The same operations, which XLA may fuse in other ways.
         np.testing.assert_allclose(found, x, rtol=1e-15, atol=1e-15)
-
-
-def test_marked_values_that_do_not_change_are_computed_before_a_loop():
-    """Also beside one that changes, one that is given, and one of several results."""
-    given = jnp.arange(3.0)
-
-    def turn(x):
-        once, both = jnp.exp(given), jax.lax.top_k(given, 2)
-        changing = jnp.cosh(x)
-        marked = [invariant(value) for value in (once, given, both[0], changing)]
-        return x + 0.1 * (marked[0] + marked[1] + marked[2][0] + both[0][1] + marked[3])
-
-    x = jnp.ones(3)
-    first = invariants_first(turn, x)
-    names = {eqn.primitive.name for eqn in jax.make_jaxpr(first)(x).jaxpr.eqns}
-    assert "exp" not in names
-    assert {"cosh", "top_k"} <= names
-    # To a unit of rounding: XLA's exponential depends on what is compiled with it.
-    np.testing.assert_allclose(first(x), turn(x), rtol=2.0**-52)
-    # The derivative by what is closed over goes through what was computed before.
-    slope = jax.grad(lambda a: jnp.sum(invariants_first(lambda x: x * invariant(jnp.exp(a)), x)(x)))
-    assert float(slope(0.5)) == pytest.approx(3 * np.exp(0.5), rel=1e-15)

@@ -1,0 +1,232 @@
+"""A step: from `solver.step` of diffrax to the flows of frozen fields."""
+
+import abc
+from collections.abc import Callable, Sequence
+from typing import Any, ClassVar, NamedTuple
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import jax.tree_util as jtu
+from jax import lax
+from jax.core import Tracer
+from jaxtyping import Array, PyTree, Real
+
+from .._field import from_chart, is_field
+from .._term import product
+from .base import AbstractLieSolver, State, result_of
+from .compiled import (
+    computed_again,
+    control_of,
+    materialised_if_long,
+    materialised_in_rows,
+    materialised_together,
+    scalarised,
+)
+from .dense import AbstractPath, Interpolation, time_at
+from .sums import Sums
+
+# A part of the step.
+Time = float | Real[Array, ""]
+
+
+class Step(eqx.Module):
+    """A step: where it ends, the way there for output within it, and an estimate of its error.
+
+    The end is a point of the step, see `Sums`. `last` is the value of the field with which the next
+    step begins, if the step has it. `is_shared` says that the end is materialised, with all that
+    the estimate is made of.
+    """
+
+    end: PyTree
+    path: AbstractPath
+    error: PyTree = None
+    last: PyTree = None
+    is_shared: bool = eqx.field(static=True, default=False)
+
+
+class Chart(NamedTuple):
+    """The coordinates of a step: where it starts, and how fields are evaluated at its points.
+
+    A part of a point is in the coordinates that its field chooses
+    (`AbstractFrozenField.to_chart`), or, if it is a compensated sum, the increment from the start
+    (`Sums`). A method need not know which. The field `h f(t + c h, y)` of a step of length h is
+    made in two steps, as the next step may begin with what the first of them gives: its *value*,
+    what the term's `vf` returns, and the frozen field, `product` of the value.
+    """
+
+    value: Callable[[Time, PyTree], PyTree]
+    product: Callable[[PyTree], PyTree]
+    sums: Sums
+    # What has been evaluated first, and where.
+    first_value: PyTree
+    first: PyTree
+    start: PyTree
+
+    @classmethod
+    def at_start(
+        cls,
+        value: Callable[[Time, PyTree], PyTree],
+        product: Callable[[PyTree], PyTree],
+        sums: Sums,
+        first_value: PyTree,
+    ) -> "Chart":
+        """With the first field, from whose point all flows start. It may correct a drift."""
+        first, start = sums.entered(product(first_value), sums.start)
+        return cls(value, product, sums, first_value, first, start)
+
+    def value_at(self, c: Time, point: PyTree) -> PyTree:
+        """The value of the field at a point."""
+        return self.value(c, from_chart(self.first, self.sums.state(point)))
+
+    def frozen(self, value: PyTree, point: PyTree, earlier: Sequence[PyTree]) -> PyTree:
+        """The field with this value at a point, after `earlier` ones, in the same coordinates."""
+        return self.sums.entered(self.product(value), point, earlier)[0]
+
+    def field(self, c: Time, point: PyTree, earlier: Sequence[PyTree]) -> PyTree:
+        """The field at a point, `h f(t + c h, point)`, after `earlier` ones."""
+        return self.frozen(self.value_at(c, point), point, earlier)
+
+    def flow(self, field: PyTree, point: PyTree) -> PyTree:
+        """Where a combination of fields of the step carries a point in unit time."""
+        return self.sums.flow(field, point)
+
+    def end(self, point: PyTree) -> PyTree:
+        """The state at a point, or its increment from the start where it is a compensated sum."""
+        return from_chart(self.first, point)
+
+    def state(self, point: PyTree) -> PyTree:
+        """The state at a point."""
+        return self.sums.state(self.end(point))
+
+    def difference(self, a: PyTree, b: PyTree) -> PyTree:
+        """How far two points are apart in the ambient space."""
+        return jtu.tree_map(jnp.subtract, self.end(a), self.end(b))
+
+    @property
+    def origin(self) -> PyTree:
+        """The start in the coordinates of the fields, without sums: for output within the step."""
+        return self.sums.state(self.start)
+
+    def branching(self, point: PyTree) -> PyTree:
+        """The same point, where the field is evaluated and from where flows go on.
+
+        Otherwise XLA would compute flows that are arithmetic entry by entry anew for each of both,
+        back to the start.
+        """
+
+        def part(f: Any, p: PyTree) -> PyTree:
+            return materialised_in_rows(p, alone=True) if is_field(f) and f.is_entrywise else p
+
+        return jtu.tree_map(part, self.first, point, is_leaf=is_field)
+
+
+# The same arrays, of each of which several results are made. XLA computes them once then, and not
+# anew for each result.
+shared = materialised_together
+# The same point, on which all depends that follows: where a long step may be cut.
+narrow = materialised_if_long
+
+
+class AbstractChartSolver(AbstractLieSolver):
+    """A method whose step is one chart: flows of combinations of the fields in it."""
+
+    # Whether the fields depend on where in the state they are evaluated.
+    is_of_state: ClassVar[bool] = True
+
+    interpolation_cls: ClassVar[Any] = Interpolation
+
+    @abc.abstractmethod
+    def step_in(self, chart: Chart) -> Step:
+        """A step from `chart.start`, where the field is `chart.first`."""
+
+    @property
+    def first_time(self) -> float:
+        """The part of the step at which the field is evaluated first."""
+        return 0.0
+
+    def interval(self, t0: Any, t1: Any) -> tuple[Any, Any]:
+        """Two times that are as far apart as the ends of the step."""
+        return t0, t1
+
+    def extended(self, path: Any, field: Callable[[Any, PyTree], PyTree]) -> AbstractPath:
+        """The way of a step with what only output within it takes.
+
+        `field(c, y)` is `h f(t + c h, y)`. Apart from `step_in`, which is compiled whether anybody
+        asks for that or not.
+        """
+        return path
+
+    def step(self, terms, t0, t1, y0, args, solver_state, made_jump):
+        # Not where times are known.
+        step = _step_once if isinstance(t0, Tracer) else AbstractChartSolver._step
+        solver: Any = self.for_terms(terms)
+        return step(solver, terms, t0, t1, y0, args, solver_state, made_jump)
+
+    def _step(self, terms, t0, t1, y0, args, solver_state, made_jump):
+        compensation = solver_state.compensation
+        t0, first = begun(solver_state, t0, lambda t0: terms.vf(t0, y0, args), made_jump)
+
+        def value(c: Time, y: PyTree) -> PyTree:
+            return materialised_in_rows(terms.vf(time_at(c, t0, t1), y, args))
+
+        def stepped(y0: PyTree) -> Step:
+            control = control_of(terms, *self.interval(t0, t1))
+            sums = Sums(y0, compensation)
+            known = value(self.first_time, y0) if first is None else first
+            step = self.step_in(
+                Chart.at_start(value, lambda value: product(terms, value, control), sums, known)
+            )
+            end, error, last = step.end, step.error, None if first is None else step.last
+            if not step.is_shared:
+                end, error = sums.shared(end, error, is_followed=first is not None)
+            if last is not None and self.is_of_state:
+                # From the end alone, which is one evaluation more.
+                last = computed_again(last, lambda: value(1.0, sums.state(end)))
+            return Step(end, step.path, error, last)
+
+        y1, error, dense_info, state, result = ended(solver_state, stepped, y0)
+        path = self.extended(
+            dense_info["path"], lambda c, y: product(terms, value(c, y), terms.contr(t0, t1))
+        )
+        return y1, error, dict(path=path), state, result
+
+
+def begun(
+    solver_state: State, t0: Any, evaluate: Callable[[Any], PyTree], made_jump: Any
+) -> tuple[Any, PyTree]:
+    """The time of a step, NaN if the start was wrong, and the field there if that is known."""
+    first = solver_state.first
+    if solver_state.zero is not None:
+        # Of a weak type, if the time is.
+        t0 = jnp.where(solver_state.zero == 0, t0, jnp.nan)
+    if first is None or made_jump is False:
+        return t0, first
+    if made_jump is True:
+        return t0, evaluate(t0)
+    return t0, lax.cond(made_jump, evaluate, lambda _: first, t0)
+
+
+def ended(
+    solver_state: State, stepped: Callable[[PyTree], Step], y0: PyTree
+) -> tuple[PyTree, PyTree, dict[str, Any], State, Any]:
+    """What diffrax takes of a step: the state after it, the estimate of its error, what output
+    within it takes, the solver's state, and the result.
+    """
+
+    def parts(y0: PyTree) -> tuple[PyTree, PyTree]:
+        step = stepped(y0)
+        return (step.end, step.last, step.error), step.path
+
+    (end, last, error), path = scalarised(parts, y0, is_pair=True)
+    y1, compensation = Sums(y0, solver_state.compensation).ended(end)
+    state = State(compensation, last, solver_state.zero)
+    return y1, error, dict(path=path), state, result_of(y1)
+
+
+# diffrax traces a step three times, which takes longer than all else that it traces. Inline, the
+# program is as if traced anew. Newer JAX has two ways for that, and with True it leaves a call in
+# the program. (equinox hands on what it does not know to `jax.jit`.)
+_kinds = getattr(jax, "Inline", None)
+_inline: Any = True if _kinds is None else _kinds.JAX_EARLY
+_step_once = eqx.filter_jit(AbstractChartSolver._step, inline=_inline)  # pyright: ignore[reportCallIssue]
