@@ -102,8 +102,12 @@ class Kind(NamedTuple):
         values, derivatives = self.most
         if not self.linear:
             return FLAT_MANY if self.is_batch else values
-        is_first = derivatives > FLAT_SECOND
-        return FLAT_MANY_DERIVATIVES if self.is_batch and is_first else derivatives
+        return FLAT_MANY_DERIVATIVES if self.is_batch and self.is_first else derivatives
+
+    @property
+    def is_first(self) -> bool:
+        """Whether it is no derivative of a derivative."""
+        return self.most[1] > FLAT_SECOND
 
     def is_cut(self, num_operations: float) -> bool:
         """Whether a derivative is cut at the turns of a loop over stages."""
@@ -351,18 +355,25 @@ def _one_of(xs):
 
 @step_p.def_impl
 def _run(*operands, program, kind):
-    num_operations = length(program.jaxpr)
+    num_operations, few = length(program.jaxpr), _few_directions(operands, kind)
+    if few is not None and (kind.is_first or num_operations <= kind.limit()):
+        return _one_by_one(operands, program, kind, few)
     if num_operations > kind.limit():
         return _as_traced(operands, program, kind)
-    for k, size in enumerate(reversed(_sizes(operands, kind.levels))):
-        moves = [axis is not None for axis in kind.levels[k]]
-        is_linear = kind.linear and not any(moves[: len(moves) - kind.linear])
-        if is_linear and size <= MAX_ENTRIES["step"]:
-            return _one_by_one(operands, program, kind, k)
     if kind.is_batch and num_operations > FLAT_WHOLE:
         operands = _without_single_numbers(operands, kind.levels)
     outs = _flat(operands, program, kind, kind.is_cut(num_operations))
     return _as_traced(operands, program, kind) if outs is None else outs
+
+
+def _few_directions(operands: Sequence[Any], kind: Kind) -> int | None:
+    """Which level is a batch over a few directions of a derivative alone, as of a Jacobian."""
+    for k, size in enumerate(reversed(_sizes(operands, kind.levels))):
+        moves = [axis is not None for axis in kind.levels[k]]
+        is_of_directions = kind.linear and not any(moves[: len(moves) - kind.linear])
+        if is_of_directions and size <= MAX_ENTRIES["step"]:
+            return k
+    return None
 
 
 def _of_numbers(
@@ -385,10 +396,13 @@ def _one_by_one(operands, program, kind, k):
     """One member of a batch after the other, as of the few directions of a Jacobian.
 
     In a program for all of them single numbers meet arrays, and XLA would compute the former anew
-    for every use.
+    for every use. The Jacobian of one system is no reason to compile longer where many steps are to
+    follow: that of `CF54` on a spacecraft would take 8 s.
     """
     levels = kind.levels
     kind = kind._replace(levels=(*levels[:k], *levels[k + 1 :]))
+    if not kind.is_batch:
+        kind = kind._replace(most=(kind.most[0], min(kind.most[1], FLAT_DERIVATIVES)))
     moving = [n for n, axis in enumerate(levels[k]) if axis is not None]
     # What is outside of this batch comes first.
     places = [sum(axes[n] is not None for axes in levels[k + 1 :]) for n in moving]
