@@ -329,7 +329,7 @@ class Room(eqx.Module):
         g, gram = (self._block(x, i, 1) for x in (self._columns, self.span.gram))
         return g, jnp.concatenate([gram, self._block(gram, i, 0)])
 
-    def extended(
+    def enlarged(
         self, new: tuple[Array, Array], z: Float[Array, "m p"], i: Any
     ) -> tuple["Room", Array]:
         """With field i, frozen at `z`; and its coordinates."""

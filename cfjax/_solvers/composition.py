@@ -10,7 +10,7 @@ from jax import lax
 from .._control_term import is_driven
 from .._methods.splitting import COMPOSITIONS
 from .base import AbstractLieSolver, State, result_of
-from .dense import Interpolation, Pieces
+from .dense import Interpolation, Substeps
 from .substeps import substeps
 
 
@@ -102,4 +102,4 @@ class Composition(AbstractLieSolver):
             (y0, solver_state, diffrax.RESULTS.successful),
         )
         result = result_of(y1) if self.shows_failure else result
-        return y1, None, dict(path=Pieces(parts)), state, result
+        return y1, None, dict(path=Substeps(parts)), state, result

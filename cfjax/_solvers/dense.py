@@ -50,7 +50,7 @@ class AbstractPath(eqx.Module):
         """The solution at a part `theta` of the step."""
 
 
-class Pieces(AbstractPath):
+class Substeps(AbstractPath):
     """The way of a step that is made of several, of which each has the same part of its time."""
 
     parts: Sequence[diffrax.AbstractLocalInterpolation]

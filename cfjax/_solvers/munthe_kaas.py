@@ -321,7 +321,7 @@ class RKMK(AbstractMuntheKaas, diffrax.AbstractAdaptiveSolver):
             )
         return found
 
-    def extended(self, path: Any, field: Callable[[Any, PyTree], PyTree]):
+    def path_for_output(self, path: Any, field: Callable[[Any, PyTree], PyTree]):
         n = len(self.b)
         _, rows, times = self._extension
         if not rows:

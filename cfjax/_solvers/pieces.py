@@ -22,7 +22,7 @@ from .._term import product
 from .base import AbstractLieSolver, result_of
 from .commutator_free import CF4, LieEuler
 from .compiled import control_of
-from .dense import Interpolation, Pieces
+from .dense import Interpolation, Substeps
 from .dependence import depending_on_state
 from .step import AbstractChartSolver
 from .substeps import substeps
@@ -94,7 +94,7 @@ class AbstractPieces(AbstractLieSolver, diffrax.AbstractStratonovichSolver):
             progress, more = substeps(solver, along, list(alike), t0, t1, args, progress)
             parts += more
         y1, state, _ = progress
-        return y1, None, dict(path=Pieces(parts)), state, result_of(y1)
+        return y1, None, dict(path=Substeps(parts)), state, result_of(y1)
 
 
 class WeakOrder2(AbstractPieces):

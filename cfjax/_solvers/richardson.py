@@ -12,7 +12,7 @@ from jax import lax
 from jaxtyping import Array, PyTree
 
 from .._control_term import is_driven
-from .dense import Interpolation, Pieces
+from .dense import Interpolation, Substeps
 from .solver import AbstractSolver, as_own
 from .substeps import first_failure
 
@@ -174,4 +174,4 @@ class _HalvesFactory(NamedTuple):
         middle = t0 + (t1 - t0) / 2
         halves = (t0, middle, first), (middle, t1, second)
         parts = [self.interpolation_cls(t0=t0, t1=t1, **info) for t0, t1, info in halves]
-        return Interpolation(t0=t0, t1=t1, path=Pieces(parts))
+        return Interpolation(t0=t0, t1=t1, path=Substeps(parts))

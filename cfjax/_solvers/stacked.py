@@ -143,7 +143,7 @@ class Stacked(eqx.Module):
         """What to keep of a field that was evaluated."""
         return like(self.kept(0), field)
 
-    def extended(self, new: PyTree, z: PyTree, k: Any) -> tuple["Stacked", PyTree]:
+    def enlarged(self, new: PyTree, z: PyTree, k: Any) -> tuple["Stacked", PyTree]:
         """With room for field k, of which `new` is kept, frozen at the point z; and the field."""
         return self, new
 

@@ -132,7 +132,7 @@ def rolled(
             lambda: fields.kept(x.stage),
         )
         z = fields.coordinates(point)
-        fields, new = fields.extended(new, z, x.stage)
+        fields, new = fields.enlarged(new, z, x.stage)
         return (with_entry(points, x.target, z), fields.put(x.stage, new)), None
 
     start = fields.coordinates(chart.start)
@@ -197,7 +197,7 @@ def _rolled_elements(
         u = fields.field(combination)
         point = chart.flow(u, chart.start)
         new = fields.entered(chart.field(c, point, [u]))
-        fields, new = fields.extended(new, fields.coordinates(point), k)
+        fields, new = fields.enlarged(new, fields.coordinates(point), k)
         u = fields.field(combination)
         total = None if total is None else total + number(u)
         return (fields.put(k, element(u, new)), total), None
@@ -250,6 +250,6 @@ class _InRoom(eqx.Module):
     def entered(self, field: Any) -> Any:
         return like(self.room.kept(0), self.room.entered(field))
 
-    def extended(self, new: Any, z: Array, k: Any) -> tuple["_InRoom", Any]:
-        room, new = self.room.extended(new, z, k)
+    def enlarged(self, new: Any, z: Array, k: Any) -> tuple["_InRoom", Any]:
+        room, new = self.room.enlarged(new, z, k)
         return _InRoom(room, self.ks), room.field(new)

@@ -149,7 +149,7 @@ class AbstractChartSolver(AbstractLieSolver):
         """Two times that are as far apart as the ends of the step."""
         return t0, t1
 
-    def extended(self, path: Any, field: Callable[[Any, PyTree], PyTree]) -> AbstractPath:
+    def path_for_output(self, path: Any, field: Callable[[Any, PyTree], PyTree]) -> AbstractPath:
         """The way of a step with what only output within it takes.
 
         `field(c, y)` is `h f(t + c h, y)`. Apart from `step_in`, which is compiled whether anybody
@@ -186,7 +186,7 @@ class AbstractChartSolver(AbstractLieSolver):
             return Step(end, step.path, error, last)
 
         y1, error, dense_info, state, result = ended(solver_state, stepped, y0)
-        path = self.extended(
+        path = self.path_for_output(
             dense_info["path"], lambda c, y: product(terms, value(c, y), terms.contr(t0, t1))
         )
         return y1, error, dict(path=path), state, result
