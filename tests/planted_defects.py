@@ -245,7 +245,7 @@ DEFECTS = [
         "xla/test_pack.py -k mesh",
     ),
     Defect(
-        "_solvers/dense.py",
+        "_solvers/base.py",
         "return t1 if c == 1 else t0 + c * (t1 - t0)",
         "return t0 + c * (t1 - t0)",
         "a last stage behind the end of the step by rounding",
@@ -823,8 +823,15 @@ DEFECTS = [
         "xla/test_materialise.py -k error_of_a_step",
     ),
     Defect(
+        "_xla/step.py",
+        "            return num_operations > FLAT_IN_BATCHES",
+        "            return bool(self.linear) and num_operations > FLAT_IN_BATCHES",
+        "long values of a batch that are not cut",
+        "xla/test_turns.py -k cut_at",
+    ),
+    Defect(
         "_solvers/commutator_free.py",
-        "end = narrow(end)",
+        "end = materialised_if_long(end)",
         "end = end",
         "a long step that is not cut",
         "xla/test_materialise.py -k long_step",

@@ -38,12 +38,12 @@ FUNCTION = 2000
 FLAT_VALUES = FUNCTION
 # Longer derivatives of one system take too long to compile for a few steps (compile, gradients).
 # What is compiled in spite of that, as many steps are to follow or it is a batch, is cut where a
-# turn of a loop over stages begins and ends (gradients, batch).
+# turn of a loop over stages begins and ends; in batches values too, whose time would otherwise
+# depend on what else is known of a program, up to a thousandfold (gradients, batch).
 FLAT_DERIVATIVES = 3 * FUNCTION
-FLAT_DERIVATIVES_IN_BATCHES = 5 * FUNCTION // 2
+FLAT_IN_BATCHES = 5 * FUNCTION // 2
 # Of batches, short vectors along leading axes, and what is made for many steps. A gradient of this
-# length takes some 12 s to compile (gradients, batch, chain). Values are not cut: those of 16 000
-# operations, a step of `RKMK8` on a heavy top, did not end in a batch.
+# length takes some 12 s to compile (gradients, batch, chain).
 FLAT_MANY = 7 * FUNCTION
 FLAT_MANY_DERIVATIVES = 8 * FUNCTION
 # Of a derivative that is differentiated again, and of that. (fits, gradients)

@@ -1,6 +1,5 @@
 """Many equal steps in one loop, each of which is one operation."""
 
-import itertools
 from collections.abc import Callable, Sequence
 from typing import Any, NamedTuple
 
@@ -9,10 +8,10 @@ import jax.numpy as jnp
 import jax.tree_util as jtu
 import numpy as np
 from jax import lax
-from jax.extend.core import jaxpr_as_fun
+from jax.extend.core import ClosedJaxpr, jaxpr_as_fun
 from jaxtyping import Array, Int, PyTree
 
-from .jaxprs import is_inexact, program_of, structs_of
+from .jaxprs import altered, is_inexact, program_of, reached, structs_of
 from .limits import MANY, MAX_ENTRIES, MAX_SIZE
 from .pack import pack, unpack
 from .program import read
@@ -34,8 +33,8 @@ def repeat(
 
     On CPU a loop of small steps is fast if XLA has few operations left after fusion, and it fuses
     towards each result all that leads to it. So the numbers of the carry travel as one vector,
-    which is kept as it is. Those of short vectors along leading axes travel as one array for each
-    of their entries.
+    which is kept as it is, and those without a derivative as another. Those of short vectors along
+    leading axes travel as one array for each of their entries.
     """
     reading = read(step, carry, MAX_ENTRIES["loop"])
     if reading is None:
@@ -43,7 +42,7 @@ def repeat(
     leaves, structure = jtu.tree_flatten(carry)
     leaves = list(map(jnp.asarray, leaves))
     program, parameters = reading.program, reading.parameters
-    form, n = _Form.of(leaves), len(parameters)
+    form, n = _Form.of(leaves, _are_moving(program, leaves)), len(parameters)
 
     def of_parts(*operands: Array) -> list[Array]:
         return form.packed(jaxpr_as_fun(program)(*operands[:n], *form.unpacked(operands[n:])))
@@ -78,39 +77,52 @@ def _loop(
     return lax.fori_loop(0, num_steps, lambda _, carry: step(carry), carry), None
 
 
+def _are_moving(program: ClosedJaxpr, leaves: Sequence[Array]) -> list[bool]:
+    """Which parts of the carry have a derivative: not those behind a `stop_gradient`."""
+    jaxpr = program.jaxpr
+    eqns = [eqn for eqn in jaxpr.eqns if eqn.primitive.name != "stop_gradient"]
+    return reached(altered(jaxpr, eqns=eqns), list(map(is_inexact, program.in_avals)))
+
+
 class _Form(NamedTuple):
     """What is carried in the place of some arrays.
 
-    Those at some places are one vector, which comes first. Short vectors along leading axes are
+    Those of each group are one vector, and these come first. Short vectors along leading axes are
     apart, one array for each of their entries.
     """
 
     arrays: Sequence[jax.ShapeDtypeStruct]
-    places: Sequence[int]
+    groups: Sequence[Sequence[int]]
 
     @classmethod
-    def of(cls, arrays: Sequence[Array]) -> "_Form":
+    def of(cls, arrays: Sequence[Array], are_moving: Sequence[bool]) -> "_Form":
+        """Reverse mode does not keep what has no derivative, as what sums have lost, if apart."""
         dtype = next((x.dtype for x in arrays if is_inexact(x)), None)
         places = [k for k, x in enumerate(arrays) if x.dtype == dtype and x.size <= MAX_SIZE]
-        return cls(structs_of(arrays), places)
+        groups = [[k for k in places if are_moving[k] == moves] for moves in (True, False)]
+        return cls(structs_of(arrays), [group for group in groups if group])
 
     def packed(self, arrays: Sequence[Array]) -> list[Array]:
-        vector, rest = [jnp.ravel(arrays[k]) for k in self.places], []
-        for k, x in enumerate(arrays):
-            if k not in self.places:
-                rest += unpack(x, axis=x.ndim - 1) if is_rows(x) else [x]
-        return [jnp.concatenate(vector), *rest] if vector else rest
+        vectors = [jnp.concatenate([jnp.ravel(arrays[k]) for k in group]) for group in self.groups]
+        rest = []
+        for k in self._others():
+            x = arrays[k]
+            rest += unpack(x, axis=x.ndim - 1) if is_rows(x) else [x]
+        return [*vectors, *rest]
 
     def unpacked(self, parts: Sequence[Array]) -> list[Array]:
-        rest = iter(parts)
-        ends = np.cumsum([self.arrays[k].size for k in self.places])[:-1]
-        vector = iter(jnp.split(next(rest), ends) if self.places else ())
-
-        def whole(k: int, x: jax.ShapeDtypeStruct) -> Array:
-            if k in self.places:
-                return next(vector).reshape(x.shape)
+        rest, found = iter(parts), {}
+        for group in self.groups:
+            ends = np.cumsum([self.arrays[k].size for k in group])[:-1]
+            found.update(zip(group, jnp.split(next(rest), ends), strict=True))
+        for k in self._others():
+            x = self.arrays[k]
             if is_rows(x):
-                return pack([next(rest) for _ in range(x.shape[-1])], axis=x.ndim - 1)
-            return next(rest)
+                found[k] = pack([next(rest) for _ in range(x.shape[-1])], axis=x.ndim - 1)
+            else:
+                found[k] = next(rest)
+        return [found[k].reshape(x.shape) for k, x in enumerate(self.arrays)]
 
-        return list(itertools.starmap(whole, enumerate(self.arrays)))
+    def _others(self) -> list[int]:
+        grouped = {k for group in self.groups for k in group}
+        return [k for k in range(len(self.arrays)) if k not in grouped]

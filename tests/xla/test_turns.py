@@ -65,6 +65,22 @@ def test_a_long_step_is_unrolled_in_batches():
         assert not has_loop(*step)
 
 
+def test_long_values_of_a_batch_are_cut_at_the_turns():
+    """Otherwise a batch took half a second a step where what a field closes over is known."""
+    inertia = rigid_body.problem()["args"]
+    known = lambda t, y, args: cfjax.Rotation(-y / np.asarray(inertia))  # noqa: E731
+
+    def num_materialised(solver):
+        step = step_of(rigid_body, solver, known)
+        program = jax.jit(batch_of(*step)[0]).lower(*batch_of(*step)[1:]).compile().as_text()
+        return str(program).count('inlineable="false"')
+
+    # One for what goes into each of 12 turns, and for what comes out.
+    assert num_materialised(cfjax.RKMK8()) >= 24
+    # Short ones are not.
+    assert num_materialised(cfjax.CF4()) < 5
+
+
 def test_what_is_unrolled_has_no_terms_that_are_zero():
     """It is the program of stages that were traced one by one, where a weight of one is no
     product.
