@@ -14,6 +14,7 @@ from jaxtyping import Array, Bool, PyTree, Real
 
 from .._control_term import fault_of_increments, is_driven
 from .._field import is_field
+from .._methods.order_conditions import order
 from .._numerics.checks import Fault
 from .._term import product, velocity
 from .solver import AbstractSolver
@@ -114,6 +115,26 @@ class AbstractLieSolver(AbstractSolver):
         return velocity(terms, terms.vf(t0, y0, args), y0)
 
 
+class AbstractOfTableau(AbstractLieSolver):
+    """A method whose order is that of its tableau."""
+
+    tableau: eqx.AbstractVar[Any]
+    # The orders of the method and of its embedded one, for a named method that takes longer to
+    # prove than a small step to trace. Tests prove them.
+    orders: ClassVar[tuple[int, int | None] | None] = None
+
+    def order(self, terms) -> int:
+        return self.orders[0] if self.orders else order(self.tableau)
+
+    def error_order(self, terms):
+        if is_driven(terms):
+            return super().error_order(terms)
+        embedded = self.tableau.embedded_method
+        if embedded is None:
+            return None
+        return (self.orders[1] if self.orders and self.orders[1] else order(embedded)) + 1
+
+
 def check_choice(name: str, value: Any, *choices: Any) -> None:
     """Raises `ValueError` unless the value is one of the choices."""
     if not any(value is x or (isinstance(x, str) and value == x) for x in choices):
@@ -136,6 +157,14 @@ def result_of(y: PyTree) -> diffrax.RESULTS:
         return diffrax.RESULTS.successful
     nonfinite: Any = diffrax.RESULTS.nonfinite
     return diffrax.RESULTS.where(is_finite(y), diffrax.RESULTS.successful, nonfinite)
+
+
+def time_at(c: Any, t0: Any, t1: Any) -> Any:
+    """The time at a part c of the step, at its end exactly: the field may jump there."""
+    if isinstance(c, float):
+        return t1 if c == 1 else t0 + c * (t1 - t0)
+    c = jnp.asarray(c, jnp.result_type(t0))
+    return jnp.where(c == 1, t1, t0 + c * (t1 - t0))
 
 
 class State(eqx.Module):

@@ -15,16 +15,16 @@ from .._field import combine, tangent
 from .._methods import pairs as _pairs
 from .._methods import tableau as _tableau
 from .._methods.continuous_extension import continuous_extension
-from .._methods.order_conditions import order
 from .._methods.tableau import Product, Row, Tableau
 from .._numerics.vectors import smooth
-from .base import check_choice
+from .base import AbstractOfTableau, check_choice
+from .compiled import materialised_if_long, materialised_together
 from .dense import Path
 from .stages import Stages, rolled
-from .step import AbstractChartSolver, Chart, Step, narrow, shared
+from .step import AbstractChartSolver, Chart, Step
 
 
-class AbstractCommutatorFree(AbstractChartSolver):
+class AbstractCommutatorFree(AbstractOfTableau, AbstractChartSolver):
     """Flows of linear combinations of frozen fields, and no commutator.
 
     If the tableau has an embedded method, the error estimate is `y1 - embedded`, the difference of
@@ -47,9 +47,6 @@ class AbstractCommutatorFree(AbstractChartSolver):
     """
 
     tableau: eqx.AbstractVar[Tableau]
-    # Those of the method and of its embedded one, of a named method that takes longer to prove than
-    # a small step to trace. Tests prove them.
-    orders: ClassVar[tuple[int, int | None] | None] = None
     estimate: Literal["group", "algebra"] | None = eqx.field(
         static=True, default="group", kw_only=True
     )
@@ -67,18 +64,6 @@ class AbstractCommutatorFree(AbstractChartSolver):
             return False
         return any(map(tableau.uses_last, (tableau.embedded, *continuous_extension(tableau))))
 
-    def order(self, terms) -> int:
-        return self.orders[0] if self.orders else order(self.tableau)
-
-    def error_order(self, terms):
-        if is_driven(terms):
-            return super().error_order(terms)
-        embedded = self.tableau.embedded_method
-        if embedded is None:
-            return None
-        known = self.orders and self.orders[1]
-        return (known or order(embedded)) + 1
-
     def step_in(self, chart):
         tableau = self.tableau
         beta, embedded = trimmed(tableau.beta), self._embedded
@@ -86,7 +71,7 @@ class AbstractCommutatorFree(AbstractChartSolver):
         end = points[beta]
         if self.first_same_as_last:
             # The end, the last field and the error are made of it.
-            end = narrow(end)
+            end = materialised_if_long(end)
         points = {**points, beta: end}
         # All that follows is for error control and output within the step. The compiler leaves it
         # out where the caller asks for neither.
@@ -108,7 +93,7 @@ class AbstractCommutatorFree(AbstractChartSolver):
         before = trimmed(tableau.alpha[-1])
         apart = chart.difference(end, reached(before, Stages(chart, fields, points))[before])
         # All of them are needed before the ratio of their sizes.
-        end, error, apart = shared((chart.end(end), error, apart))
+        end, error, apart = materialised_together((chart.end(end), error, apart))
         error = jtu.tree_map(_seen, error, apart, chart.sums.way(end))
         return Step(end, path, error, last, is_shared=True)
 

@@ -15,6 +15,7 @@ from jaxtyping import Array, Float, PyTree, Real
 
 from .._field import combine, from_chart
 from .._methods.tableau import ContinuousExtension
+from .base import time_at
 from .compiled import scalarised
 from .stacked import can_roll, rolled_flows
 from .sums import flow_once
@@ -81,14 +82,6 @@ class Substeps(AbstractPath):
         # Other parts are asked at a time of their own: another may be an error there.
         c = jnp.where(is_now, c, jnp.clip(c, 0, 1))
         return part.evaluate(time_at(c, part.t0, part.t1)), is_now
-
-
-def time_at(c: Any, t0: Any, t1: Any) -> Any:
-    """The time at a part c of the step, at its end exactly: the field may jump there."""
-    if isinstance(c, float):
-        return t1 if c == 1 else t0 + c * (t1 - t0)
-    c = jnp.asarray(c, jnp.result_type(t0))
-    return jnp.where(c == 1, t1, t0 + c * (t1 - t0))
 
 
 class Path(AbstractPath):

@@ -17,15 +17,15 @@ from .._field import Rest, combine, from_chart, is_field, to_chart
 from .._fields.semilinear import AbstractSemilinearField
 from .._methods import exponential as _exponential
 from .._methods.exponential import Columns, Combination, ExponentialTableau
-from .._methods.order_conditions import order
 from .._term import product
-from .base import check_choice
+from .base import AbstractOfTableau, check_choice
+from .compiled import materialised_if_long
 from .dense import AbstractPath
 from .dependence import depending
-from .step import AbstractChartSolver, Step, narrow
+from .step import AbstractChartSolver, Step
 
 
-class AbstractExponential(AbstractChartSolver):
+class AbstractExponential(AbstractOfTableau, AbstractChartSolver):
     """Steps for `x' = L x + g(t, x)` that are exact in L, with g as a polynomial in time.
 
     The field must return `cfjax.Affine`, `cfjax.LinearAffine`, another
@@ -49,9 +49,6 @@ class AbstractExponential(AbstractChartSolver):
     """
 
     tableau: eqx.AbstractVar[ExponentialTableau]
-    # Those of the method and of its embedded one, of a named method that takes longer to prove than
-    # a small step to trace. Tests prove them.
-    orders: ClassVar[tuple[int, int | None] | None] = None
     estimate: Literal["group"] | None = eqx.field(static=True, default="group", kw_only=True)
     # Of steps that are equal: their length, as differences of times would differ from step to step
     # by their rounding, and for each part of the field the coefficients of its linear part, where
@@ -65,16 +62,6 @@ class AbstractExponential(AbstractChartSolver):
     @property
     def first_same_as_last(self) -> bool:
         return self.estimate is not None and self.tableau.uses_last
-
-    def order(self, terms) -> int:
-        return self.orders[0] if self.orders else order(self.tableau)
-
-    def error_order(self, terms) -> int | None:
-        embedded = self.tableau.embedded_method
-        if embedded is None:
-            return None
-        known = self.orders and self.orders[1]
-        return (known or order(embedded)) + 1
 
     def for_terms(self, terms):
         if is_driven(terms):
@@ -137,7 +124,7 @@ class AbstractExponential(AbstractChartSolver):
             return Step(chart.end(end), path)
         last = None
         if tableau.uses_last:
-            end = narrow(end)
+            end = materialised_if_long(end)
             last = chart.value_at(1.0, end)
             field = chart.frozen(last, end, fields)
             changes = {**changes, tableau.num_stages + 1: change(field, end)}

@@ -10,8 +10,8 @@ from jaxtyping import PyTree
 from .._control_term import is_driven
 from .._field import is_field
 from .._term import product
-from .base import AbstractLieSolver
-from .dense import Interpolation, Path, time_at
+from .base import AbstractLieSolver, time_at
+from .dense import Interpolation, Path
 from .fixed_point import fixed_point
 from .step import Step, begun, ended
 from .sums import Sums

@@ -28,10 +28,10 @@ from .._methods.order_conditions import runge_kutta_order
 from .._methods.tableau import ContinuousExtension, Row
 from .._numerics.vectors import smooth
 from .base import check_choice
-from .compiled import scalarised
+from .compiled import materialised_together, scalarised
 from .dense import Path
 from .stages import rolled_elements
-from .step import AbstractChartSolver, Chart, Step, shared
+from .step import AbstractChartSolver, Chart, Step
 from .sums import Sums
 
 # The rows of the stages after the first, and the weights.
@@ -101,7 +101,7 @@ class AbstractMuntheKaas(AbstractChartSolver, diffrax.AbstractStratonovichSolver
             # NaN is an infinite error to diffrax, so that the step is taken again, shorter.
             error = found.or_nan(error)
         # All of them are results then, and XLA would compute the step anew for each.
-        elements = shared(found.elements)
+        elements = materialised_together(found.elements)
         return Step(
             y1, Path.of(self.continuous_extension, chart.origin, elements), error, found.last
         )

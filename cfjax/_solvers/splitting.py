@@ -13,9 +13,9 @@ from .._control_term import fault_of_increments, is_driven
 from .._field import Rest, combine, is_field
 from .._methods.splitting import BLANES_MOAN_4, BLANES_MOAN_6, STRANG, splitting_order
 from .._term import product
-from .base import AbstractLieSolver, State, fault_of_start
+from .base import AbstractLieSolver, State, fault_of_start, time_at
 from .compiled import by_turns, control_of
-from .dense import AbstractPath, Interpolation, time_at
+from .dense import AbstractPath, Interpolation
 from .dependence import depending_on_time, unseen
 from .step import Step, begun, ended
 from .sums import Sums

@@ -14,16 +14,14 @@ from jaxtyping import Array, PyTree, Real
 
 from .._field import from_chart, is_field
 from .._term import product
-from .base import AbstractLieSolver, State, result_of
+from .base import AbstractLieSolver, State, result_of, time_at
 from .compiled import (
     computed_again,
     control_of,
-    materialised_if_long,
     materialised_in_rows,
-    materialised_together,
     scalarised,
 )
-from .dense import AbstractPath, Interpolation, time_at
+from .dense import AbstractPath, Interpolation
 from .sums import Sums
 
 # A part of the step.
@@ -119,13 +117,6 @@ class Chart(NamedTuple):
             return materialised_in_rows(p, alone=True) if is_field(f) and f.is_entrywise else p
 
         return jtu.tree_map(part, self.first, point, is_leaf=is_field)
-
-
-# The same arrays, of each of which several results are made. XLA computes them once then, and not
-# anew for each result.
-shared = materialised_together
-# The same point, on which all depends that follows: where a long step may be cut.
-narrow = materialised_if_long
 
 
 class AbstractChartSolver(AbstractLieSolver):

@@ -7,8 +7,8 @@ import diffrax
 import jax.numpy as jnp
 from jaxtyping import PyTree
 
+from .base import time_at
 from .compiled import by_turns
-from .dense import time_at
 
 # The state, that of the solver, and the first failure.
 Progress = tuple[PyTree, PyTree, Any]
