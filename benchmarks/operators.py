@@ -23,6 +23,7 @@ from typing import Any
 
 import jax
 import jax.numpy as jnp
+import lineax as lx
 import numpy as np
 import scipy.sparse as sparse
 from jax import Array, lax
@@ -147,7 +148,7 @@ def dense(n: int, norm: float) -> Any:
         return functools.reduce(lambda y, _: c * (a @ y), range(6), y)
 
     ours = {
-        "OperatorSum": lambda c, y: cfjax.OperatorSum([-1j * c], [a], is_skew=True).flow(y),
+        "OperatorSum": lambda c, y: cfjax.OperatorSum([-1j * c], [(a, norm)], is_skew=True).flow(y),
         "LeftMatrix": lambda c, y: cfjax.LeftMatrix(-1j * c * a).flow(y),
         "dense exponential": lambda c, y: expm(-1j * c * a) @ y,
         "six products": six,
@@ -186,7 +187,8 @@ def differences(norm: float, slant: float) -> Any:
     def shifted(x: Array) -> Array:
         return middle * x + up * jnp.pad(x[1:], (0, 1)) + down * jnp.pad(x[:-1], (1, 0))
 
-    ours = {"OperatorSum": lambda c, y: cfjax.OperatorSum([c], [(shifted, norm)]).flow(y)}
+    operator = lx.FunctionLinearOperator(shifted, jax.ShapeDtypeStruct(y.shape, y.dtype))
+    ours = {"OperatorSum": lambda c, y: cfjax.OperatorSum([c], [(operator, norm)]).flow(y)}
     product = lambda c, y: c * shifted(y)  # noqa: E731
     return jnp.asarray(y), exact, ours, product, krylov(is_hermitian=slant == 0, factor=1.0)
 

@@ -19,7 +19,8 @@ SOLVERS = {
     for name, value in inspect.getmembers(cfjax)
     if inspect.isclass(value)
     and issubclass(value, diffrax.AbstractSolver)
-    and name not in ("AbstractSolver", "CommutatorFree", "ExponentialRungeKutta", "RKMK", "Richardson")
+    and name
+    not in ("AbstractSolver", "CommutatorFree", "ExponentialRungeKutta", "RKMK", "Richardson")
 } | {
     "CommutatorFree": lambda: cfjax.CommutatorFree(cfjax.third_order_b(2)),
     "ExponentialRungeKutta": lambda: cfjax.ExponentialRungeKutta(cfjax.ETD43.tableau),

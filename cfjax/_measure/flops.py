@@ -336,9 +336,7 @@ def _check(eqn: JaxprEqn) -> int:
 
 # Calls by the parameter that holds the program.
 _CALLS = {
-    "cfjax_alone": "program",
     "cfjax_call": "program",
-    "cfjax_operation": "program",
     "checkpoint": "jaxpr",
     "closed_call": "call_jaxpr",
     "custom_jvp_call": "call_jaxpr",
@@ -368,7 +366,7 @@ _ARITHMETIC = (
     "log1p logistic mul pow rem rsqrt sin sinh sqrt square sub tan tanh"
 )
 _FREE = (
-    "argmax argmin bitcast_convert_type broadcast_in_dim ceil cfjax_materialised cfjax_is_finite "
+    "argmax argmin bitcast_convert_type broadcast_in_dim ceil cfjax_materialised "
     "cfjax_pack cfjax_unpack clamp complex concatenate conj convert_element_type copy copy_p "
     "dynamic_slice dynamic_update_slice eq expand_dims floor gather ge gt imag iota is_finite le "
     "lt max min ne neg optimization_barrier pad real reduce_max reduce_min reshape rev round "

@@ -56,7 +56,6 @@ _LINEAR_IN_ONE = {"div": 0, "triangular_solve": 1}
 # Operations that call a program, and under which parameter.
 _CALLS = {
     "cfjax_call": "program",
-    "cfjax_operation": "program",
     "checkpoint": "jaxpr",
     "closed_call": "call_jaxpr",
     "custom_jvp_call": "call_jaxpr",

@@ -18,7 +18,9 @@ import functools
 from typing import TYPE_CHECKING, Any
 
 import diffrax
+import jax
 import jax.numpy as jnp
+import lineax as lx
 import numpy as np
 from jaxtyping import Array, Complex, Float
 
@@ -73,12 +75,10 @@ def couplings(num_spins: int) -> Float[np.ndarray, " size"]:
 
 @functools.cache
 def _operators(num_spins: int, precision: str) -> list[Any]:
-    diagonal = 1j * couplings(num_spins)
-    return [(_turn, num_spins), diagonal.astype(np.result_type(precision, np.complex64))]
-
-
-def _turn(x: Complex[Array, " size"]) -> Complex[Array, " size"]:
-    return 1j * flips(x)
+    dtype = np.result_type(precision, np.complex64)
+    vector = jax.ShapeDtypeStruct((2**num_spins,), dtype)
+    turn = lx.FunctionLinearOperator(lambda x: 1j * flips(x), vector)
+    return [(turn, num_spins), (1j * couplings(num_spins)).astype(dtype)]
 
 
 def field(t: Any, y: State, args: Any = None) -> OperatorSum:
@@ -162,7 +162,6 @@ def chart(num_spins: int = 10, **options: Any) -> WorkPrecision:
 
 def picture(num_spins: int = 8) -> "Figure":
     """The levels with the energy of the state, how spins order, and what a slower ramp gains."""
-    import jax
     from matplotlib.figure import Figure
 
     from .. import integrate

@@ -4,6 +4,7 @@ Frozen, every field here is affine: `x' = A x + b` for the entries of its point.
 `[[A, b], [0, 0]]` in 64 bits of mantissa says what flow and derivatives are to be.
 """
 
+import functools
 from collections.abc import Callable
 from functools import partial
 from typing import Any, NamedTuple
@@ -11,6 +12,7 @@ from typing import Any, NamedTuple
 import jax
 import jax.numpy as jnp
 import jax.tree_util as jtu
+import lineax as lx
 import mpmath
 import numpy as np
 import problems
@@ -107,6 +109,12 @@ def from_neighbour(x):
     """Half of the next entry less half of the one before."""
     zero = jnp.zeros_like(x[:1])
     return (jnp.concatenate([x[1:], zero]) - jnp.concatenate([zero, x[:-1]])) / 2
+
+
+@functools.cache
+def operators(dtype):
+    vector = jax.ShapeDtypeStruct((4,), dtype)
+    return [OPERATORS[0].astype(dtype), (lx.FunctionLinearOperator(from_neighbour, vector), 1.0)]
 
 
 # Of norm one, as are the directions of the other cases.
@@ -300,9 +308,7 @@ CASES = {
         SIZES,
     ),
     "OperatorSum": Case(
-        lambda coefficients: cfjax.OperatorSum(
-            coefficients, [OPERATORS[0].astype(coefficients.dtype), (from_neighbour, 1.0)]
-        ),
+        lambda coefficients: cfjax.OperatorSum(coefficients, operators(coefficients.dtype)),
         lambda: unit(coefficients=normal(2)),
         normal(4),
         lambda x, coefficients: (
@@ -313,9 +319,7 @@ CASES = {
     ),
     "OperatorSum of columns, skew": Case(
         lambda coefficients: cfjax.OperatorSum(
-            coefficients,
-            [OPERATORS[0].astype(coefficients.dtype), (from_neighbour, 1.0)],
-            is_skew=True,
+            coefficients, operators(coefficients.dtype), is_skew=True
         ),
         lambda: unit(coefficients=normal(2)),
         normal(4, 2),
