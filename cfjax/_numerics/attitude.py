@@ -9,10 +9,11 @@ rotation in particular.
 import equinox as eqx
 import jax.numpy as jnp
 import numpy as np
+from jax.core import Tracer
 from jaxtyping import Array, Bool, Float
 
 from .quaternion import Layout, check_choice, from_parts, parts
-from .vectors import Vector, cross, is_rewritten, pack, smooth
+from .vectors import Vector, cross, pack, smooth
 
 
 def quaternion_to_matrix(
@@ -29,8 +30,8 @@ def quaternion_to_matrix(
     **Returns:** shape `(*batch, 3, 3)`.
 
     **Raises** `ValueError` for another shape or layout, `TypeError` for another dtype. A squared
-    length that differs from 1 by more than 0.1 (q = 0 is such a case) is an error; within a step of
-    a small system it gives NaN. Divide such a q by its length.
+    length that differs from 1 by more than 0.1 (q = 0 is such a case) is an error; in a compiled
+    program, and so in a solve, it gives NaN. Divide such a q by its length.
     """
     (w, x, y, z), c = _quaternion(q, layout)
     rows = [
@@ -92,8 +93,8 @@ def quaternion_from_matrix(
 
     **Raises** `ValueError` for another shape or layout, `TypeError` for another dtype. A matrix
     that is not orthogonal, by more than 1e-6 (float32: 3.5e-4) in an entry of `matrix.T @ matrix`,
-    or has determinant -1 is an error, except within a step of a small system. A solver of linear
-    spaces lets the matrix drift. The nearest rotation is then `u @ vh` for
+    or has determinant -1 is an error; in a compiled program, and so in a solve, it gives NaN. A
+    solver of linear spaces lets the matrix drift. The nearest rotation is then `u @ vh` for
     `u, _, vh = jnp.linalg.svd(matrix)`.
 
     Source: Shepperd, Quaternion from rotation matrix, J. Guid. Control 1 (1978),
@@ -166,10 +167,10 @@ def _checked_matrix(matrix: Array) -> Array:
 
 
 def _error_unless(holds: Bool[Array, "*batch"], x: Array, message: str) -> Array:
-    x = jnp.where(holds.reshape(*holds.shape, *[1] * (x.ndim - holds.ndim)), x, jnp.nan)
-    # A step of a small system would spend most of its time on the call. NaN ends the solve with an
-    # error too.
-    return x if is_rewritten() else eqx.error_if(x, ~jnp.all(holds), message)
+    if not isinstance(holds, Tracer):
+        x = eqx.error_if(x, ~jnp.all(holds), message)
+    # A compiled program would call the host, and a step of a small system spend its time on that.
+    return jnp.where(holds.reshape(*holds.shape, *[1] * (x.ndim - holds.ndim)), x, jnp.nan)
 
 
 def _array(name: str, x: Array | np.ndarray, core: tuple[int, ...]) -> Array:

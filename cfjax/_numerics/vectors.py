@@ -8,7 +8,6 @@ from typing import Any
 
 from jaxtyping import Array, Float
 
-from .._xla import is_rewritten as is_rewritten
 from .._xla import materialised as materialised
 from .._xla import materialised_in_rows as materialised_in_rows
 from .._xla import pack as pack
