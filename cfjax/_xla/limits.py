@@ -15,6 +15,8 @@ MAX_PRODUCT = (MAX_LENGTH - 1) ** 3
 # all of them in each turn, which takes longer than the flow if a field has more numbers, and more
 # than four times those that it moves. (fields)
 MAX_SIZE = 64
+# Of the stages whose vectors are scalarised in a table of all of them, though it is larger. (batch)
+MAX_STAGES = 16
 
 # Of the numbers in the state of a step, together: the time to compile grows with them, and more so
 # in derivatives. What a loop carries may have what sums have lost of each entry too, the number of
@@ -37,21 +39,26 @@ FUNCTION = 2000
 # gain nothing in a loop that is not our own (compile).
 FLAT_VALUES = FUNCTION
 # Longer derivatives of one system take too long to compile for a few steps (compile, gradients).
-# What is compiled in spite of that, as many steps are to follow or it is a batch, is cut where a
-# turn of a loop over stages begins and ends; in batches values too, whose time would otherwise
-# depend on what else is known of a program, up to a thousandfold (gradients, batch).
 FLAT_DERIVATIVES = 3 * FUNCTION
-FLAT_IN_BATCHES = 5 * FUNCTION // 2
+# Of those scalarised as a whole, one system and batches, the longer ones are cut in a loop over
+# many stages. XLA computes what a turn needs of all turns before it in each of its functions, up to
+# a thousand times over, depending on what else is known of a program. What is known of it before
+# are its operations times the turns of its loop: values and derivatives with more than this are
+# cut, as a cut that is not needed costs up to a factor of three (gradients, batch).
+CUT_ONE, CUT_IN_BATCHES = 4 * FUNCTION, 5 * FUNCTION // 2
+UNCUT_VALUES, UNCUT_DERIVATIVES = 32 * FUNCTION, 18 * FUNCTION
 # Of batches, short vectors along leading axes, and what is made for many steps. A gradient of this
 # length takes some 12 s to compile (gradients, batch, chain).
-FLAT_MANY = 7 * FUNCTION
-FLAT_MANY_DERIVATIVES = 8 * FUNCTION
+FLAT_MANY = 9 * FUNCTION
 # Of a derivative that is differentiated again, and of that. (fits, gradients)
 FLAT_SECOND = 2 * FUNCTION
 # Of all these what is longer is cut where a method says, and a derivative on leading axes at the
 # turns of a loop: what two functions need, XLA computes in both, and in long programs exponentially
 # often. (attitude, leading_axes)
 FLAT_WHOLE = 2 * FUNCTION
+# Of the directions of a Jacobian that are computed one after the other although each is too long to
+# be scalarised as a whole. More of them take less time together. (compile)
+FEW_DIRECTIONS = 4
 # Of the numbers of a point. If a loop over stages is differentiated, it keeps the points of all
 # stages for each of its turns, which is too much memory for larger ones; and unrolled, XLA keeps
 # several fields to add them up at once, which is too much for those of twice as many. Of larger

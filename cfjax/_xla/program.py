@@ -36,8 +36,10 @@ from .jaxprs import (
 from .limits import (
     FLAT_MANY,
     FLAT_WHOLE,
+    FUNCTION,
     MAX_ENTRIES,
     MAX_LENGTH,
+    MAX_RESULTS_IN_BATCHES,
     MAX_SIZE,
 )
 from .materialise import materialised, materialised_p, together
@@ -57,6 +59,7 @@ from .struct_of_arrays import (
     apart_like,
     is_inexact,
     is_small,
+    is_small_shape,
     is_whole,
     known,
     literal,
@@ -170,13 +173,14 @@ def on_numbers(
 
     `fixed` says which of them are the same in every step, and `is_last` whether nothing is
     differentiated any more. With `is_cut` each turn of a loop is a piece that reverse mode computes
-    again.
+    again, or several turns together where nothing is differentiated.
     """
     jaxpr, consts = program.jaxpr, list(map(_constant, program.consts))
     flags = [*[True] * len(consts), *fixed]
     is_long = length(jaxpr) > FLAT_WHOLE
     calls = _LAST_CALLS if is_last else _CALLS
-    form = _Form(rows, is_long, is_cut, has_reciprocals(jaxpr, flags), calls, {}, {})
+    cut = None if not is_cut else "groups" if is_last else "turns"
+    form = _Form(rows, is_long, cut, has_reciprocals(jaxpr, flags), calls, {}, {})
     outs, _ = _evaluate(jaxpr, (*consts, *operands), flags, form)
     like = jax.eval_shape(functools.partial(split, rows=rows), structs_of(program.out_avals))
     # What is known before the program runs may come out as NumPy's.
@@ -242,9 +246,20 @@ def _length_of(eqn: JaxprEqn) -> float:
     return sum(terms * n for n in map(_entries, shapes))
 
 
+def num_turns(jaxpr: Jaxpr) -> int:
+    """Of the longest loop over stages, or 1."""
+    inner = [
+        eqn.params[_LAST_CALLS[name]].jaxpr
+        for eqn in jaxpr.eqns
+        if (name := eqn.primitive.name) in _LAST_CALLS
+    ]
+    loops = [eqn.params["length"] for eqn in jaxpr.eqns if eqn.primitive.name == "scan"]
+    return max([1, *loops, *map(num_turns, inner)])
+
+
 def _entries(shape: tuple[int, ...]) -> int:
     """About how many numbers or whole arrays an array is scalarised into, if it is."""
-    if math.prod(shape) <= MAX_SIZE:
+    if is_small_shape(shape):
         return math.prod(shape)
     return shape[-1] if len(shape) > 1 and shape[-1] <= MAX_LENGTH else 1
 
@@ -252,14 +267,15 @@ def _entries(shape: tuple[int, ...]) -> int:
 class _Form(NamedTuple):
     """How a program is scalarised.
 
-    Whether arrays have leading axes, the program is long, is cut into pieces, and products with
-    reciprocals take the place of divisions by what is fixed; which calls are a part of it, and
-    under which parameter; its literals, each of which is made once; and what is materialised.
+    Whether arrays have leading axes and the program is long; whether it is cut at the turns of a
+    loop, or at groups of turns; whether products with reciprocals take the place of divisions by
+    what is fixed; which calls are a part of it, and under which parameter; its literals, each of
+    which is made once; and what is materialised.
     """
 
     rows: bool
     is_long: bool
-    is_cut: bool
+    cut: str | None
     has_reciprocals: bool
     calls: dict[str, str]
     literals: dict[Any, Any]
@@ -353,12 +369,21 @@ def _unrolled(
     flags = [*fixed[:n], *[False] * len(carry), *fixed[m:]]
     rows: dict[int, list[Any]] = {}
     outs_fixed: list[bool] = []
+    group, size = 0, length(loop.body.jaxpr)
     for k in loop.turns:
         turn = [_entry(x, k) for x in values[m:]]
         given = [*values[:n], *carry, *turn]
-        run = _in_parts if form.is_cut else _evaluate_inner
+        run = _in_parts if form.cut == "turns" else _evaluate_inner
         outs, outs_fixed = run(loop.body, given, flags, form)
         carry, rows[k] = outs[: m - n], outs[m - n :]
+        if form.cut == "groups":
+            group += 1
+            new = {id(x) for x in jtu.tree_leaves(carry) if isinstance(x, Tracer)} - {*form.kept}
+            # With one turn more.
+            is_full = (group + 1) * size > FUNCTION
+            if is_full or (group + 1) * len(new) > group * MAX_RESULTS_IN_BATCHES:
+                carry, group = _entries_materialised(carry, form.kept), 0
+                form.kept.update((id(x), x) for x in jtu.tree_leaves(carry))
     stacks = map(_stacked, zip(*(rows[k] for k in range(loop.length)), strict=True))
     # It is the same in every turn.
     return [*carry, *stacks], [*[False] * len(carry), *outs_fixed[m - n :]]

@@ -9,9 +9,15 @@ from jax.extend.core import Jaxpr, JaxprEqn
 
 from . import arithmetic, moves
 from .jaxprs import evaluate, parameters
-from .limits import MAX_SIZE
 from .scope import is_numeric
-from .struct_of_arrays import Call, StructOfArrays, is_inexact, is_whole, known
+from .struct_of_arrays import (
+    Call,
+    StructOfArrays,
+    is_inexact,
+    is_small_shape,
+    is_whole,
+    known,
+)
 from .understood import ELEMENTWISE, REDUCTIONS, is_understood
 
 _RULES: dict[str, Callable[[Call], StructOfArrays | list[StructOfArrays] | None]] = {
@@ -57,14 +63,14 @@ def on_entries(
     outs = avals[len(eqn.invars) :]
     is_large = rows and (
         any(isinstance(x, StructOfArrays) and x.long for x in values)
-        or any(aval.size > MAX_SIZE for aval in avals)
+        or not all(is_small_shape(aval.shape) for aval in avals)
     )
     if not is_large:
         constants = [x for x in map(known, values) if x is not None]
         is_known = len(constants) == len(values) and not any(map(is_inexact, outs))
         if is_known and not eqn.effects:
             return _of_known(jaxpr, eqn, constants)
-        if any(aval.size > MAX_SIZE for aval in outs) or any(map(is_whole, values)):
+        if not all(is_small_shape(aval.shape) for aval in outs) or any(map(is_whole, values)):
             return None
     if eqn.effects or not is_understood(eqn) or any(aval.size == 0 for aval in avals):
         return None

@@ -19,7 +19,7 @@ import jax.numpy as jnp
 import jax.tree_util as jtu
 from jax import lax
 from jax.core import ShapedArray
-from jax.extend.core import ClosedJaxpr, JaxprEqn, Primitive, jaxpr_as_fun
+from jax.extend.core import ClosedJaxpr, Jaxpr, JaxprEqn, Primitive, jaxpr_as_fun
 from jax.interpreters import ad, batching, mlir
 from jaxtyping import PyTree
 
@@ -38,18 +38,21 @@ from .jaxprs import (
     structs_of,
 )
 from .limits import (
+    CUT_IN_BATCHES,
+    CUT_ONE,
+    FEW_DIRECTIONS,
     FLAT_DERIVATIVES,
-    FLAT_IN_BATCHES,
     FLAT_MANY,
-    FLAT_MANY_DERIVATIVES,
     FLAT_SECOND,
     FLAT_VALUES,
     FLAT_WHOLE,
     MAX_ENTRIES,
     MAX_RESULTS_IN_BATCHES,
+    UNCUT_DERIVATIVES,
+    UNCUT_VALUES,
 )
 from .materialise import not_materialised, together
-from .program import Declined, join, length, on_numbers, read, split
+from .program import Declined, join, length, num_turns, on_numbers, read, split
 from .scope import is_everywhere, is_rewritten, unread
 from .turns import by_turns
 
@@ -99,31 +102,31 @@ class Kind(NamedTuple):
 
     def limit(self) -> int:
         """How long a program may be, to be scalarised as a whole."""
-        values, derivatives = self.most
-        if not self.linear:
-            return FLAT_MANY if self.is_batch else values
-        return FLAT_MANY_DERIVATIVES if self.is_batch and self.is_first else derivatives
+        if self.is_batch and (self.is_first or not self.linear):
+            return FLAT_MANY
+        return self.most[bool(self.linear)]
 
     @property
     def is_first(self) -> bool:
         """Whether it is no derivative of a derivative."""
         return self.most[1] > FLAT_SECOND
 
-    def is_cut(self, num_operations: float) -> bool:
-        """Whether it is cut at the turns of a loop over stages: derivatives, and values of batches.
+    def is_cut(self, jaxpr: Jaxpr) -> bool:
+        """Whether a program that is scalarised as a whole is cut at the turns of its loop.
 
-        Long values of a batch that are not cut may explode: 1000 bodies with `RKMK8` took half a
-        second a step where their inertia is known, and 0.15 ms where it is an argument.
+        What is not cut may explode: 1000 bodies with `RKMK8` took half a second a step where their
+        inertia is known, and 0.15 ms where it is an argument.
         """
+        num_operations = length(jaxpr)
         if self.rows:
             return bool(self.linear) and num_operations > FLAT_WHOLE
-        if self.levels:
-            return num_operations > FLAT_IN_BATCHES
-        return bool(self.linear) and num_operations > FLAT_DERIVATIVES
+        least = CUT_IN_BATCHES if self.levels else CUT_ONE
+        uncut = UNCUT_DERIVATIVES if self.linear else UNCUT_VALUES
+        return num_operations > least and num_operations * num_turns(jaxpr) > uncut
 
 
 # The limits for a step of many, and for any other.
-_MANY = FLAT_MANY, FLAT_MANY_DERIVATIVES
+_MANY = FLAT_MANY, FLAT_MANY
 _USUAL = FLAT_VALUES, FLAT_DERIVATIVES
 
 
@@ -362,13 +365,16 @@ def _one_of(xs):
 @step_p.def_impl
 def _run(*operands, program, kind):
     num_operations, few = length(program.jaxpr), _few_directions(operands, kind)
-    if few is not None and (kind.is_first or num_operations <= kind.limit()):
-        return _one_by_one(operands, program, kind, few)
-    if num_operations > kind.limit():
+    if few is not None:
+        level, size = few
+        is_flat = num_operations <= min(kind.limit(), FLAT_DERIVATIVES)
+        if is_flat or (kind.is_first and size <= FEW_DIRECTIONS):
+            return _one_by_one(operands, program, kind, level)
+    if few is not None or num_operations > kind.limit():
         return _as_traced(operands, program, kind)
     if kind.is_batch and num_operations > FLAT_WHOLE:
         operands = _without_single_numbers(operands, kind.levels)
-    is_cut = kind.is_cut(num_operations)
+    is_cut = kind.is_cut(program.jaxpr)
     if kind.linear and kind.levels and not is_cut and kind.most == _MANY:
         # What is kept of many steps lies entry beside entry, and XLA would read it where it lies,
         # one member at a time: `CF4` on 1000 bodies took 6.5 ms for 50 steps, and takes 3.0 ms.
@@ -377,13 +383,13 @@ def _run(*operands, program, kind):
     return _as_traced(operands, program, kind) if outs is None else outs
 
 
-def _few_directions(operands: Sequence[Any], kind: Kind) -> int | None:
-    """Which level is a batch over a few directions of a derivative alone, as of a Jacobian."""
+def _few_directions(operands: Sequence[Any], kind: Kind) -> tuple[int, int] | None:
+    """Which level is a batch over few directions of a derivative, and over how many."""
     for k, size in enumerate(reversed(_sizes(operands, kind.levels))):
         moves = [axis is not None for axis in kind.levels[k]]
         is_of_directions = kind.linear and not any(moves[: len(moves) - kind.linear])
         if is_of_directions and size <= MAX_ENTRIES["step"]:
-            return k
+            return k, size
     return None
 
 

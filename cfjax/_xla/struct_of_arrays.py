@@ -6,6 +6,7 @@ well what each of them needs of the others. As numbers, and as arrays of their o
 """
 
 import itertools
+import math
 from collections.abc import Callable, Iterable, Sequence
 from typing import Any, NamedTuple
 
@@ -16,7 +17,7 @@ from jax import lax
 from jax.extend.core import JaxprEqn, Literal
 from jaxtyping import Array
 
-from .limits import MAX_LENGTH, MAX_SIZE
+from .limits import MAX_LENGTH, MAX_SIZE, MAX_STAGES
 from .materialise import materialised
 from .pack import pack, unpack
 from .scope import is_numeric, is_rows
@@ -154,7 +155,14 @@ def is_whole(x: Any) -> bool:
 
 def is_small(x: Any) -> bool:
     """Whether this is an array of which each entry is to be a number."""
-    return is_whole(x) and 1 <= np.size(x) <= MAX_SIZE and is_numeric(x)
+    return is_whole(x) and np.size(x) > 0 and is_small_shape(np.shape(x)) and is_numeric(x)
+
+
+def is_small_shape(shape: tuple[int, ...]) -> bool:
+    """Whether arrays of this shape are of few entries, or of a short vector for each stage."""
+    if math.prod(shape) <= MAX_SIZE:
+        return True
+    return len(shape) == 2 and shape[0] <= MAX_STAGES and shape[1] <= MAX_LENGTH
 
 
 def struct_of_arrays(x: Any) -> StructOfArrays:

@@ -45,7 +45,6 @@ def lengths(request, monkeypatch):
             ("_USUAL", (0, 0)),
             ("_MANY", (0, 0)),
             ("FLAT_MANY", 0),
-            ("FLAT_MANY_DERIVATIVES", 0),
         ):
             monkeypatch.setattr(random_programs.lowering, name, limit)
     return request.param
