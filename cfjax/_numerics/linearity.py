@@ -1,4 +1,4 @@
-"""Whether a function is linear in one of its arguments, as far as its program shows."""
+"""Whether a function is linear in one of its arguments, by abstract interpretation of its jaxpr."""
 
 import functools
 from collections.abc import Callable, Sequence
@@ -13,22 +13,24 @@ from jaxtyping import PyTree
 
 
 class Linearity(NamedTuple):
-    """How a value depends on x, and what it is where x is zero.
+    """How a value depends on x.
 
     - `power`: 0 if it does not depend on x, 1 if it is linear but for a constant, 2 if it has
-      products of x with itself, 3 if that is not known.
-    - `constant`: "zero"; "some", if it is not zero for all states; or "unknown".
+      products of x with itself, 3 if that is unknown.
+    - `constant`: its value at x = 0: "zero"; "some", if it is not zero for all states; or
+      "unknown".
     """
 
     power: int
     constant: str
 
 
-# Of constants that are looked at.
-_LARGEST = 10_000
+# The most entries of a constant that are inspected.
+_MAX_ENTRIES = 10_000
 
-_ZERO, _SOME, _UNKNOWN = (Linearity(0, constant) for constant in ("zero", "some", "unknown"))
-_NOT_KNOWN = Linearity(3, "unknown")
+# Values that do not depend on x.
+_ZERO, _SOME, _CONSTANT = (Linearity(0, constant) for constant in ("zero", "some", "unknown"))
+_UNKNOWN = Linearity(3, "unknown")
 
 _SUMS = frozenset(("add", "add_any", "sub"))
 # Linear in all operands together.
@@ -37,7 +39,7 @@ _LINEAR = frozenset(
     "cumsum imag neg pad real reduce_sum reshape rev slice split squeeze stack tile transpose "
     "unstack".split()
 )
-# In those beside indices and predicates.
+# Linear in these operands together; the others are indices and predicates.
 _LINEAR_IN_PART = {
     "dynamic_slice": slice(1),
     "dynamic_update_slice": slice(2),
@@ -47,13 +49,13 @@ _LINEAR_IN_PART = {
     "scatter_add": slice(0, None, 2),
     "select_n": slice(1, None),
 }
-# In each of two operands.
-_PRODUCTS = frozenset(("dot_general", "mul"))
-# Those that add entries, which may cancel.
+# Linear in each of two operands.
+_BILINEAR = frozenset(("dot_general", "mul"))
+# These add entries, which may cancel.
 _CONTRACTIONS = frozenset(("cumsum", "dot_general", "reduce_sum"))
-# In one of two operands: which.
+# Linear in this one of two operands.
 _LINEAR_IN_ONE = {"div": 0, "triangular_solve": 1}
-# Operations that call a program, and under which parameter.
+# Operations that call a jaxpr, and the parameter that holds it.
 _CALLS = {
     "cfjax_call": "program",
     "checkpoint": "jaxpr",
@@ -66,88 +68,84 @@ _CALLS = {
 
 
 def linearity(
-    fun: Callable[[Any, Any, Any], PyTree], x: PyTree, state: PyTree, others: PyTree
+    fun: Callable[[Any, Any, Any], PyTree], x: PyTree, state: PyTree, args: PyTree
 ) -> list[Linearity]:
-    """What is known of each array of `fun(x, state, others)` as a function of x.
+    """How each array of `fun(x, state, args)` depends on x.
 
-    The constant is known where it comes from the state and from numbers alone, without sums in
+    The constant is determined only if it comes from the state and from literals, without sums in
     which parts of it may cancel.
     """
-    made = jax.make_jaxpr(fun)(x, state, others)
-    arguments = [(x, Linearity(1, "zero")), (state, _SOME), (others, _UNKNOWN)]
-    given = [known for part, known in arguments for _ in jtu.tree_leaves(part)]
-    return _of_program(made, given)
+    jaxpr = jax.make_jaxpr(fun)(x, state, args)
+    inputs = [(x, Linearity(1, "zero")), (state, _SOME), (args, _CONSTANT)]
+    return _interpret(jaxpr, [kind for tree, kind in inputs for _ in jtu.tree_leaves(tree)])
 
 
-def _of_program(program: ClosedJaxpr, given: Sequence[Linearity]) -> list[Linearity]:
-    return _of_jaxpr(program.jaxpr, [*map(_of_constant, program.consts), *given])
-
-
-def _of_jaxpr(jaxpr: Jaxpr, given: Sequence[Linearity]) -> list[Linearity]:
-    """`given` are those of the constants and of the arguments."""
-    found = dict(zip((*jaxpr.constvars, *jaxpr.invars), given, strict=True))
+def _interpret(jaxpr: ClosedJaxpr | Jaxpr, operands: list[Linearity]) -> list[Linearity]:
+    """The outputs of a jaxpr. Operands of an open one begin with its constants."""
+    if hasattr(jaxpr, "consts"):
+        operands = [*map(_of_constant, jaxpr.consts), *operands]
+        jaxpr = jaxpr.jaxpr
+    env = dict(zip((*jaxpr.constvars, *jaxpr.invars), operands, strict=True))
 
     def read(atom: Any) -> Linearity:
-        return _of_constant(atom.val) if isinstance(atom, Literal) else found[atom]
+        return _of_constant(atom.val) if isinstance(atom, Literal) else env[atom]
 
     for eqn in jaxpr.eqns:
-        found.update(zip(eqn.outvars, _of_operation(eqn, [*map(read, eqn.invars)]), strict=True))
+        env.update(zip(eqn.outvars, _outputs(eqn, [*map(read, eqn.invars)]), strict=True))
     return [*map(read, jaxpr.outvars)]
 
 
 def _of_constant(value: Any) -> Linearity:
-    if isinstance(value, Tracer) or not _is_number(value) or np.size(value) > _LARGEST:
-        return _UNKNOWN
+    if isinstance(value, Tracer) or not _is_number(value) or np.size(value) > _MAX_ENTRIES:
+        return _CONSTANT
     value = np.asarray(value)
     # Masks may cancel in a product.
-    return _ZERO if not value.any() else _SOME if value.all() else _UNKNOWN
+    return _ZERO if not value.any() else _SOME if value.all() else _CONSTANT
 
 
 def _is_number(value: Any) -> bool:
     # Not a key, nor an array of several processes.
-    is_here = getattr(value, "is_fully_addressable", True)
-    return is_here and jax.dtypes.issubdtype(getattr(value, "dtype", np.float64), np.number)
+    is_addressable = getattr(value, "is_fully_addressable", True)
+    return is_addressable and jax.dtypes.issubdtype(getattr(value, "dtype", np.float64), np.number)
 
 
-def _of_operation(eqn: JaxprEqn, operands: list[Linearity]) -> list[Linearity]:
-    name, number = eqn.primitive.name, len(eqn.outvars)
-    inner: Any = eqn.params.get(_CALLS.get(name, ""))
-    if inner is not None:
-        found = _of_inner(inner, operands)
+def _outputs(eqn: JaxprEqn, operands: list[Linearity]) -> list[Linearity]:
+    num_outputs = len(eqn.outvars)
+    jaxpr: Any = eqn.params.get(_CALLS.get(eqn.primitive.name, ""))
+    if jaxpr is not None:
+        outputs = _interpret(jaxpr, operands)
     else:
-        found = [_of_simple(eqn, name, operands)] * number
-    return found if len(found) == number else [_without_rule(operands)] * number
+        outputs = [_output(eqn, operands)] * num_outputs
+    return outputs if len(outputs) == num_outputs else [_without_rule(operands)] * num_outputs
 
 
-def _of_simple(eqn: JaxprEqn, name: str, operands: list[Linearity]) -> Linearity:
+def _output(eqn: JaxprEqn, operands: list[Linearity]) -> Linearity:
+    """Each output of an operation that calls no jaxpr."""
+    name = eqn.primitive.name
     if name in _SUMS:
-        return _sum(*operands)
-    if name in _LINEAR and _is_inexact(eqn.outvars[0].aval):
-        found = functools.reduce(_joined, operands)
-        return _may_cancel(found) if name in _CONTRACTIONS else found
+        return _add(*operands)
+    if name in _LINEAR and jax.dtypes.issubdtype(eqn.outvars[0].aval.dtype, np.inexact):
+        output = functools.reduce(_join, operands)
+        return _may_cancel(output) if name in _CONTRACTIONS else output
     # `x.at[i].apply(f)` has f in its scatter.
     if name in _LINEAR_IN_PART and not (name == "scatter" and eqn.params.get("update_jaxpr")):
-        places = range(len(operands))[_LINEAR_IN_PART[name]]
-        if all(x.power == 0 for k, x in enumerate(operands) if k not in places):
-            return functools.reduce(_joined, (operands[k] for k in places))
-    if name in _PRODUCTS and len(operands) == 2:
-        found = _product(*operands)
-        return _may_cancel(found) if name in _CONTRACTIONS else found
+        linear = range(len(operands))[_LINEAR_IN_PART[name]]
+        if all(x.power == 0 for k, x in enumerate(operands) if k not in linear):
+            return functools.reduce(_join, (operands[k] for k in linear))
+    if name in _BILINEAR and len(operands) == 2:
+        output = _multiply(*operands)
+        return _may_cancel(output) if name in _CONTRACTIONS else output
     if name in _LINEAR_IN_ONE and len(operands) == 2:
-        place = _LINEAR_IN_ONE[name]
-        one, other = operands[place], operands[1 - place]
-        if other.power == 0:
-            return _product(one, other if other == _SOME else _UNKNOWN)
+        linear = _LINEAR_IN_ONE[name]
+        divisor = operands[1 - linear]
+        if divisor.power == 0:
+            return _multiply(operands[linear], divisor if divisor == _SOME else _CONSTANT)
     if name == "square" or (name == "integer_pow" and eqn.params["y"] >= 2):
-        return _product(operands[0], operands[0])
+        return _multiply(operands[0], operands[0])
     return _without_rule(operands)
 
 
-def _is_inexact(aval: Any) -> bool:
-    return jax.dtypes.issubdtype(aval.dtype, np.inexact)
-
-
-def _sum(a: Linearity, b: Linearity) -> Linearity:
+def _add(a: Linearity, b: Linearity) -> Linearity:
     power = max(a.power, b.power)
     for x, y in ((a, b), (b, a)):
         if x.constant == "zero":
@@ -156,11 +154,11 @@ def _sum(a: Linearity, b: Linearity) -> Linearity:
     return Linearity(power, "unknown")
 
 
-def _product(a: Linearity, b: Linearity) -> Linearity:
+def _multiply(a: Linearity, b: Linearity) -> Linearity:
     if _ZERO in (a, b):
         return _ZERO
     powers, constants = {a.power, b.power}, {a.constant, b.constant}
-    power = 3 if 3 in powers else min(2, sum((a.power, b.power)))
+    power = 3 if 3 in powers else min(2, a.power + b.power)
     constant = "zero" if "zero" in constants else "some" if constants == {"some"} else "unknown"
     return Linearity(power, constant)
 
@@ -170,15 +168,10 @@ def _may_cancel(x: Linearity) -> Linearity:
 
 
 def _without_rule(operands: Sequence[Linearity]) -> Linearity:
-    return _UNKNOWN if all(x.power == 0 for x in operands) else _NOT_KNOWN
+    return _CONSTANT if all(x.power == 0 for x in operands) else _UNKNOWN
 
 
-def _joined(a: Linearity, b: Linearity) -> Linearity:
-    """What is known of a value of which some is the one and some the other."""
+def _join(a: Linearity, b: Linearity) -> Linearity:
+    """Of an array with entries of both kinds."""
     power = a.power if a.power == b.power else 1 if max(a.power, b.power) == 1 else 3
     return Linearity(power, a.constant if a.constant == b.constant else "unknown")
-
-
-def _of_inner(inner: Any, operands: Sequence[Linearity]) -> list[Linearity]:
-    is_closed = hasattr(inner, "consts")
-    return _of_program(inner, operands) if is_closed else _of_jaxpr(inner, operands)
