@@ -14,10 +14,10 @@ from .._field import AbstractAlgebraElement, AbstractFrozenField, combine
 
 
 def each(fun: Callable[..., PyTree], num_axes: int) -> Callable[..., PyTree]:
-    """`fun` of arrays without leading axes, for each element of arrays with so many of them.
+    """Maps `fun`, a function of arrays without leading axes, over so many leading axes.
 
-    An axis of 1 is broadcast, and what only such arrays decide is computed once. An array that
-    `fun` returns as it got it stays the same object, and arrays that are one object stay one.
+    An axis of 1 is broadcast, and what depends on such arrays alone is computed once. An array that
+    `fun` returns unchanged stays the same object, and arguments that are one object stay one.
 
     **Raises** `ValueError` where the axes do not broadcast.
     """
@@ -26,29 +26,30 @@ def each(fun: Callable[..., PyTree], num_axes: int) -> Callable[..., PyTree]:
     inner = each(fun, num_axes - 1)
 
     def mapped(*args: PyTree) -> PyTree:
-        leaves, structure = jtu.tree_flatten(args)
+        leaves, treedef = jtu.tree_flatten(args)
         distinct = list({id(x): x for x in leaves}.values())
-        place = {id(x): k for k, x in enumerate(distinct)}
+        index = {id(x): k for k, x in enumerate(distinct)}
         lengths = {x.shape[0] for x in distinct}
-        others = lengths - {1}
-        if len(others) > 1:
+        if len(lengths - {1}) > 1:
             raise ValueError(f"The leading axes must agree or be 1, got lengths {sorted(lengths)}.")
-        is_fixed = [bool(others) and x.shape[0] == 1 for x in distinct]
-        given = [x[0] if fixed else x for x, fixed in zip(distinct, is_fixed, strict=True)]
-        kept: list[int | None] = []
-        out_structure: Any = None
+        axes = [None if len(lengths) > 1 and x.shape[0] == 1 else 0 for x in distinct]
+        operands = [x[0] if axis is None else x for x, axis in zip(distinct, axes, strict=True)]
+        # For each output the operand that it is, or None.
+        forwarded: list[int | None] = []
+        out_treedef: Any = None
 
-        def of_distinct(*inside: Array) -> list[Array]:
-            nonlocal kept, out_structure
-            args = structure.unflatten([inside[place[id(x)]] for x in leaves])
-            outs, out_structure = jtu.tree_flatten(inner(*args))
-            found = {id(x): k for k, x in enumerate(inside) if not is_fixed[k]}
-            kept = [found.get(id(x)) for x in outs]
-            return [x for x, k in zip(outs, kept, strict=True) if k is None]
+        def of_distinct(*elements: Array) -> list[Array]:
+            nonlocal forwarded, out_treedef
+            args = treedef.unflatten([elements[index[id(x)]] for x in leaves])
+            outputs, out_treedef = jtu.tree_flatten(inner(*args))
+            forwardable = {id(x): k for k, x in enumerate(elements) if axes[k] == 0}
+            forwarded = [forwardable.get(id(x)) for x in outputs]
+            return [x for x, k in zip(outputs, forwarded, strict=True) if k is None]
 
-        axes = [None if fixed else 0 for fixed in is_fixed]
-        made = iter(jax.vmap(of_distinct, in_axes=axes)(*given))
-        return out_structure.unflatten([next(made) if k is None else distinct[k] for k in kept])
+        computed = iter(jax.vmap(of_distinct, in_axes=axes)(*operands))
+        return out_treedef.unflatten(
+            [next(computed) if k is None else distinct[k] for k in forwarded]
+        )
 
     return mapped
 
@@ -66,22 +67,19 @@ def check_point(
     points without them, with letters for any length.
     """
     shape = getattr(field, coordinates).shape
-    leading = shape[:num_axes]
-    front, core = point.shape[:num_axes], point.shape[num_axes:]
-    broadcasts = len(front) == num_axes and all(map(_broadcasts, leading, front))
-    if broadcasts and any(_fits(core, expected) for expected in cores):
-        return
     # An axis of 1 is broadcast to any length.
-    sides = [f"l{k}" if n == 1 else n for k, n in enumerate(leading)]
-    shapes = " and ".join(_text(*sides, *core) for core in cores)
+    leading = [f"l{k}" if n == 1 else n for k, n in enumerate(shape[:num_axes])]
+    if any(_fits(point.shape, (*leading, *core)) for core in cores):
+        return
+    shapes = " and ".join(_text(*leading, *core) for core in cores)
     hint = ""
-    for expected in cores:
-        more = point.ndim - len(expected)
-        if num_axes == 0 and more > 0 and _fits(point.shape[more:], expected):
+    for core in cores:
+        missing = point.ndim - len(core)
+        if num_axes == 0 and missing > 0 and _fits(point.shape[missing:], core):
             hint = (
                 " For one motion of each point give the coordinates leading axes: "
-                f"{coordinates} of shape {_text(*point.shape[:more], *shape)}, or "
-                f"{_text(*[1] * more, *shape)} for equal motions."
+                f"{coordinates} of shape {_text(*point.shape[:missing], *shape)}, or "
+                f"{_text(*[1] * missing, *shape)} for equal motions."
             )
             break
     raise ValueError(
@@ -91,16 +89,12 @@ def check_point(
 
 
 def check_other(field: AbstractFrozenField, other: Any) -> None:
-    """Raises `TypeError` unless the other is of the field's class, as its bracket needs."""
+    """Raises `TypeError` unless `other` is of the field's class, as its bracket needs."""
     if not isinstance(other, type(field)):
         name = type(field).__name__
         raise TypeError(
             f"{name} has a bracket with another {name} only, got {type(other).__name__}."
         )
-
-
-def _broadcasts(a: int, b: int) -> bool:
-    return a in (1, b)
 
 
 def _fits(shape: Sequence[int], expected: Sequence[int | str]) -> bool:
@@ -178,22 +172,19 @@ class Elementwise(AbstractFrozenField):
         return elementwise(combined(*(field.field for field in fields)), fields[0].num_axes)
 
     def defect(self, point: Any) -> tuple[Real[Array, ""], str] | None:
-        text = None
+        requirement = None
 
-        def off(point: Any) -> Any:
-            nonlocal text
-            found = self.field.defect(point)
-            if found is not None:
-                text = found[1]
-                return found[0]
+        def defect(point: Any) -> Any:
+            nonlocal requirement
+            size, requirement = self.field.defect(point) or (None, None)
+            return size
 
-        found = self._each(off)(point)
-        return None if text is None else (jnp.max(found, initial=0), text)
+        sizes = self._each(defect)(point)
+        return None if requirement is None else (jnp.max(sizes, initial=0), requirement)
 
     def to_chart(self, point: Any, earlier: Sequence[Any]) -> tuple[AbstractFrozenField, Any]:
-        inside = [field.field for field in earlier]
         each = self._each(lambda field, point, *earlier: field.to_chart(point, earlier))
-        field, point = each(self.field, point, *inside)
+        field, point = each(self.field, point, *(field.field for field in earlier))
         return elementwise(field, self.num_axes), point
 
     def from_chart(self, point: Any) -> Any:
@@ -204,16 +195,16 @@ class Elementwise(AbstractFrozenField):
 
 
 class ElementwiseElement(Elementwise, AbstractAlgebraElement):
-    """Of algebra elements: an algebra element."""
+    """What `elementwise` of an algebra element returns."""
 
     def bracket(self, other: Any) -> Any:
         brackets = self._each(lambda a, b: a.bracket(b))(self.field, other.field)
         return elementwise(brackets, self.num_axes)
 
     def dexpinv(self, other: Any, degree: int) -> Any:
-        images = self._each(lambda a, b: a.dexpinv(b, degree))(self.field, other.field)
-        return elementwise(images, self.num_axes)
+        values = self._each(lambda a, b: a.dexpinv(b, degree))(self.field, other.field)
+        return elementwise(values, self.num_axes)
 
     def has_dexpinv(self) -> Bool[Array, ""] | None:
-        found = self._each(lambda a: a.has_dexpinv())(self.field)
-        return None if found is None else jnp.all(found)
+        has_value = self._each(lambda a: a.has_dexpinv())(self.field)
+        return None if has_value is None else jnp.all(has_value)
