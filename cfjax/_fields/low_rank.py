@@ -275,7 +275,7 @@ class SpanSkew(AbstractSkewElement):
         if span is self.span:
             return self
         m, rest = len(self.k), len(span.gram) - len(self.k)
-        places = span.places(self.span)
+        places = span.column_indices(self.span)
         if np.array_equal(places, np.arange(m)):
             k = jnp.pad(self.k, (0, rest))
             new = matmul(self.k, span.gram[:m, m:])

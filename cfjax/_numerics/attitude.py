@@ -1,9 +1,8 @@
 """Attitudes as unit quaternions and as matrices.
 
-A solver of linear spaces lets a quaternion drift off length 1. It still has one direction, and so
-it means one rotation: what takes a quaternion divides by its length. One that is far off was hardly
-meant as an attitude, and is an error. So is a matrix that is not orthogonal, which means no
-rotation in particular.
+A solver of linear spaces lets a quaternion drift off length 1. Its direction still determines one
+rotation, so these functions divide by its length. A length far off 1 is an error, and so is a
+matrix that is not orthogonal, which determines no rotation.
 """
 
 import equinox as eqx
@@ -13,7 +12,7 @@ from jax.core import Tracer
 from jaxtyping import Array, Bool, Float
 
 from .quaternion import Layout, check_choice, from_parts, parts
-from .vectors import Vector, cross, pack, smooth
+from .vectors import Vector, cross, dot, pack, smooth
 
 
 def quaternion_to_matrix(
@@ -60,21 +59,20 @@ def quaternion_rotate(
 
     **Raises** as `quaternion_to_matrix`.
     """
-    q, x = jnp.asarray(q), _array("x", x, (3,))
+    q, x = jnp.asarray(q), _checked_array("x", x, (3,))
     (w, *v), factor = _quaternion(q, layout)
     if x.dtype != q.dtype:
         raise TypeError(f"x must have the dtype of q, {q.dtype}, got {x.dtype}.")
-    fits = x.ndim == q.ndim and all(
-        1 in pair or pair[0] == pair[1] for pair in zip(q.shape[:-1], x.shape[:-1], strict=True)
-    )
-    if not fits:
+    if x.ndim != q.ndim or any(
+        m != n and 1 not in (m, n) for m, n in zip(q.shape[:-1], x.shape[:-1], strict=True)
+    ):
         raise ValueError(
             f"The leading axes of q and x must agree or be 1, got q {q.shape} and x {x.shape}."
         )
     x0, x1, x2 = (x[..., k] for k in range(3))
-    twice = [factor * t for t in cross(v, (x0, x1, x2))]
-    turned = zip((x0, x1, x2), twice, cross(v, twice), strict=True)
-    return pack([a + (w * b + c) for a, b, c in turned], axis=w.ndim, sums=True)
+    product = [factor * t for t in cross(v, (x0, x1, x2))]
+    terms = zip((x0, x1, x2), product, cross(v, product), strict=True)
+    return pack([a + (w * b + c) for a, b, c in terms], axis=w.ndim, sums=True)
 
 
 def quaternion_from_matrix(
@@ -101,7 +99,7 @@ def quaternion_from_matrix(
     doi:10.2514/3.55767b.
     """
     check_choice("layout", layout)
-    m = _checked_matrix(_array("matrix", matrix, (3, 3)))
+    m = _checked_matrix(_checked_array("matrix", matrix, (3, 3)))
     (a, b, c), (d, e, f), (g, h, i) = ([m[..., j, k] for k in range(3)] for j in range(3))
     # The rows of 4 q q^T: each is q times four times one of its entries.
     candidates = [
@@ -110,13 +108,13 @@ def quaternion_from_matrix(
         (c - g, b + d, 1 - a + e - i, f + h),
         (d - b, c + g, f + h, 1 - a - e + i),
     ]
-    # That of the largest entry, of length 2 at least: nothing cancels, nothing is divided by zero.
-    row, size = candidates[0], candidates[0][0]
+    # The row of the largest entry has length 2 at least: no cancellation, no division by zero.
+    row, largest = candidates[0], candidates[0][0]
     for k in range(1, 4):
-        other, its_size = candidates[k], candidates[k][k]
-        is_larger = its_size > size
-        row = tuple(jnp.where(is_larger, x, y) for x, y in zip(other, row, strict=True))
-        size = jnp.where(is_larger, its_size, size)
+        candidate, entry = candidates[k], candidates[k][k]
+        is_larger = entry > largest
+        row = tuple(jnp.where(is_larger, x, y) for x, y in zip(candidate, row, strict=True))
+        largest = jnp.where(is_larger, entry, largest)
     w, x, y, z = row
     length = jnp.sqrt(w * w + x * x + y * y + z * z)
     scale = jnp.where(w < 0, -1, 1).astype(m.dtype) / length
@@ -127,15 +125,15 @@ def quaternion_from_matrix(
 def _quaternion(q: Array | np.ndarray, layout: Layout) -> tuple[Vector, Array]:
     """The parts of q, and `2 / |q|^2`."""
     check_choice("layout", layout)
-    w, x, y, z = parts(_array("q", q, (4,)), layout)
+    w, x, y, z = parts(_checked_array("q", q, (4,)), layout)
     # Without a division, at which XLA breaks a step of a small system into several functions: it
-    # took 2.4 times as long. The product of all `1 + off^(2^k)` is `1 / (1 - off)`; of these four
-    # it is so to rounding, and its derivative to 2e-14.
-    off = 1 - ((w * w + x * x) + (y * y + z * z))
-    off2 = off * off
-    off4 = off2 * off2
-    inverse = (1 + off) * (1 + off2) * (1 + off4) * (1 + off4 * off4)
-    is_near = jnp.abs(off) <= 0.1
+    # took 2.4 times as long. The product of all `1 + d^(2^k)` is `1 / (1 - d)`. That of these four
+    # is so to rounding, and its derivative to 2e-14.
+    d = 1 - ((w * w + x * x) + (y * y + z * z))
+    d2 = d * d
+    d4 = d2 * d2
+    inverse = (1 + d) * (1 + d2) * (1 + d4) * (1 + d4 * d4)
+    is_near = jnp.abs(d) <= 0.1
     inverse = _error_unless(
         is_near,
         inverse,
@@ -145,35 +143,35 @@ def _quaternion(q: Array | np.ndarray, layout: Layout) -> tuple[Vector, Array]:
 
 
 def _checked_matrix(matrix: Array) -> Array:
-    # Written out, as products of matrices may come in less than full precision.
-    square = jnp.sum(matrix[..., :, None] * matrix[..., None, :], axis=-3)
-    one = jnp.broadcast_to(jnp.eye(3, dtype=matrix.dtype), matrix.shape)
-    off = jnp.max(jnp.abs(square - one), axis=(-2, -1))
-    least = max(1e-6, float(jnp.finfo(matrix.dtype).eps) ** 0.5)
+    # Not jnp.matmul, whose default precision is less on GPU and TPU.
+    gram = jnp.sum(matrix[..., :, None] * matrix[..., None, :], axis=-3)
+    eye = jnp.broadcast_to(jnp.eye(3, dtype=matrix.dtype), matrix.shape)
+    defect = jnp.max(jnp.abs(gram - eye), axis=(-2, -1))
+    atol = max(1e-6, float(jnp.finfo(matrix.dtype).eps) ** 0.5)
     matrix = _error_unless(
-        off <= least,
+        defect <= atol,
         matrix,
         "matrix must be orthogonal, and is off by more than "
-        f"{least:.2g} in an entry of matrix.T @ matrix. The nearest rotation is u @ vh for "
+        f"{atol:.2g} in an entry of matrix.T @ matrix. The nearest rotation is u @ vh for "
         "u, _, vh = jnp.linalg.svd(matrix).",
     )
-    (a, b, c), *others = ([matrix[..., j, k] for k in range(3)] for j in range(3))
-    x, y, z = cross(*others)
+    first, second, third = ([matrix[..., j, k] for k in range(3)] for j in range(3))
     return _error_unless(
-        a * x + b * y + c * z > 0,
+        dot(first, cross(second, third)) > 0,
         matrix,
         "matrix must be a rotation, of determinant 1, and is a reflection, of determinant -1.",
     )
 
 
-def _error_unless(holds: Bool[Array, "*batch"], x: Array, message: str) -> Array:
-    if not isinstance(holds, Tracer):
-        x = eqx.error_if(x, ~jnp.all(holds), message)
-    # A compiled program would call the host, and a step of a small system spend its time on that.
-    return jnp.where(holds.reshape(*holds.shape, *[1] * (x.ndim - holds.ndim)), x, jnp.nan)
+def _error_unless(is_valid: Bool[Array, "*batch"], x: Array, message: str) -> Array:
+    if not isinstance(is_valid, Tracer):
+        x = eqx.error_if(x, ~jnp.all(is_valid), message)
+    # In a compiled program the error would call the host, which takes longer than a small step.
+    shape = *is_valid.shape, *[1] * (x.ndim - is_valid.ndim)
+    return jnp.where(is_valid.reshape(shape), x, jnp.nan)
 
 
-def _array(name: str, x: Array | np.ndarray, core: tuple[int, ...]) -> Array:
+def _checked_array(name: str, x: Array | np.ndarray, core: tuple[int, ...]) -> Array:
     array = jnp.asarray(x)
     if array.shape[-len(core) :] != core:
         batch = ", ".join(("*batch", *map(str, core)))

@@ -1,4 +1,4 @@
-"""Errors of values, which a compiled program finds."""
+"""Errors at run time, of values in a compiled program."""
 
 from collections.abc import Callable
 from typing import Any
@@ -19,7 +19,7 @@ from .squaring import max_over_batch
 
 
 class Fault(eqx.Module):
-    """What is wrong, if anything: a number from 1 on is that of a message, 0 is nothing."""
+    """An error to raise at run time: that of `messages[number - 1]`, or none if `number` is 0."""
 
     number: Int[Array, ""]
     messages: tuple[str, ...] = eqx.field(static=True)
@@ -29,24 +29,24 @@ class Fault(eqx.Module):
         return cls(jnp.zeros((), jnp.int32), ())
 
     def with_case(self, holds: Bool[Array, ""], message: str) -> "Fault":
-        """This, or where the case holds that. So what is worse comes later."""
+        """This fault, or the new one where the case holds. So the worst case comes last."""
         messages = *self.messages, message
         return Fault(jnp.where(holds, jnp.int32(len(messages)), self.number), messages)
 
     def error(self, zero: Real[Array, ""]) -> Real[Array, ""]:
-        """The zero, or an error where something is wrong: in a batch the last case of all."""
+        """The zero, or the error, if there is one: in a batch the one with the largest number."""
         if not self.messages:
             return zero
         index = max_over_batch(jnp.maximum(self.number - 1, 0))
         return eqxi.branched_error_if(zero, self.number > 0, index, self.messages)
 
     def nan(self, zero: Real[Array, ""]) -> Real[Array, ""]:
-        """The zero, or NaN where something is wrong."""
+        """The zero, or NaN if there is an error."""
         return jnp.where(self.number == 0, zero, jnp.nan)
 
 
 def error_if(tree: PyTree, is_wrong: Callable[[PyTree], Bool[Array, ""]], message: str) -> PyTree:
-    """The same arrays, or an error with this message where `is_wrong` says so of them."""
+    """The same arrays, or an error with this message where `is_wrong` of them is true."""
 
     def zero(tree: PyTree) -> Real[Array, ""]:
         return eqx.error_if(jnp.zeros(()), is_wrong(tree), message)
@@ -55,25 +55,30 @@ def error_if(tree: PyTree, is_wrong: Callable[[PyTree], Bool[Array, ""]], messag
 
 
 def checked(tree: PyTree, zero: Callable[[PyTree], Real[Array, ""]]) -> PyTree:
-    """The same floating and complex arrays, or the error that is raised by `zero` of them.
+    """The same floating and complex arrays, or the error that `zero` of them raises.
 
-    One primitive, so that `jax.linear_transpose` sees nothing in it that is not linear, and
-    `jax.shard_map` nothing that varies otherwise than the arrays: what an error gives back varies
-    along no axis of a mesh. `zero` must close over nothing traced.
+    It is one primitive, so that it is linear for `jax.linear_transpose`, and so that its results
+    vary over the axes of a mesh as the arrays do for `jax.shard_map`, which those of an error do
+    not. `zero` must close over nothing traced.
     """
-    leaves, structure = jtu.tree_flatten(tree)
-    return structure.unflatten(
-        checked_p.bind(*leaves, zero=lambda *leaves: zero(structure.unflatten(leaves)))
+    leaves, treedef = jtu.tree_flatten(tree)
+    return treedef.unflatten(
+        checked_p.bind(*leaves, zero=lambda *leaves: zero(treedef.unflatten(leaves)))
     )
 
 
 def needing(zero: Real[Array, ""], tree: PyTree) -> PyTree:
-    """The same arrays, which the program cannot have without the zero."""
+    """The same arrays, made to depend on the zero, so that the program computes it."""
     return jtu.tree_map(lambda x: jnp.where(zero == 0, x, zero.astype(x.dtype)), tree)
 
 
+def error_where(wrong: Bool[Array, ""], x: Array, message: str) -> Array:
+    """The array, or an error with this message if `wrong` is true, which may be any value."""
+    return needing(eqx.error_if(jnp.zeros(()), wrong, message), x)
+
+
 def differ(a: Array | np.ndarray, b: Array | np.ndarray) -> Bool[Array, ""]:
-    """Whether arrays differ. NaN is as good as NaN: what is made of it says so itself."""
+    """Whether arrays differ. NaN equals NaN here, as a result computed from it is NaN anyway."""
     return ~jnp.all((a == b) | ((a != a) & (b != b)))
 
 
@@ -86,7 +91,7 @@ def _impl(*leaves, zero):
     mesh = jax.typeof(leaves[0]).sharding.mesh
     with use_abstract_mesh(mesh):
         value = zero(*leaves)
-        # With errors off it is NaN instead, as equinox has it.
+        # With errors off the arrays are NaN instead, as in equinox.
         return [lax.select(value == 0, x, lax.full_like(x, jnp.nan)) for x in leaves]
 
 
@@ -104,9 +109,9 @@ def _transpose(cotangents, *leaves, zero):
 
 
 def _batch(leaves, dims, *, zero):
-    # As in equinox, an error of one member is one of the batch.
-    each: Any = jax.vmap(zero, dims)
-    return checked_p.bind(*leaves, zero=lambda *leaves: jnp.sum(each(*leaves))), dims
+    # As in equinox, an error of one element is one of the batch.
+    zeros: Any = jax.vmap(zero, dims)
+    return checked_p.bind(*leaves, zero=lambda *leaves: jnp.sum(zeros(*leaves))), dims
 
 
 ad.primitive_jvps[checked_p] = _jvp

@@ -17,11 +17,11 @@ from jaxtyping import Array
 from .matmul import matmul, promoted
 
 # The most rows of a matrix whose 2-norm is computed: some milliseconds, at every trace of a field.
-_LARGEST = 128
+_MAX_ROWS = 128
 
 
 def entries_of(operator: Any) -> Any:
-    """The matrix or diagonal of an operator that is kept as one."""
+    """The matrix or diagonal that an operator stores, or None if it stores neither."""
     if isinstance(operator, jax.Array | np.ndarray):
         return operator
     if isinstance(operator, lx.MatrixLinearOperator):
@@ -45,39 +45,39 @@ def dtype_of(operator: Any) -> Any:
 
 
 def applied(operator: Any, x: Array) -> Array:
-    """What the operator makes of a vector, or of columns."""
+    """The operator applied to a vector, or to columns."""
     if (entries := entries_of(operator)) is not None:
         a = jnp.asarray(entries)
         if a.ndim == 1:
             return scaled(a.reshape(-1, *[1] * (x.ndim - 1)), x)
         return matmul(*promoted(a, x))
     # One of lineax takes vectors of its own dtype only.
-    times = jax.vmap(operator.mv, 1, 1) if x.ndim == 2 else operator.mv
+    mv = jax.vmap(operator.mv, 1, 1) if x.ndim == 2 else operator.mv
     dtype = dtype_of(operator)
     if jnp.iscomplexobj(x) and not jnp.issubdtype(dtype, jnp.complexfloating):
-        return lax.complex(times(x.real), times(x.imag))
-    return times(x.astype(dtype))
+        return lax.complex(mv(x.real), mv(x.imag))
+    return mv(x.astype(dtype))
 
 
 def scaled(c: Array, x: Array) -> Array:
-    """Entry by entry, in the dtype that both have together."""
+    """The product entry by entry, in the common dtype."""
     return jnp.multiply(*promoted(c, x))
 
 
 def added(terms: Iterable[Array]) -> Array:
-    """The sum of arrays, in the dtype that all have together."""
-    first, *others = terms
-    for term in others:
-        first = jnp.add(*promoted(first, term))
-    return first
+    """The sum of arrays, in their common dtype."""
+    total, *terms = terms
+    for term in terms:
+        total = jnp.add(*promoted(total, term))
+    return total
 
 
 def two_norm(a: Any) -> float | None:
-    """That of a matrix or diagonal, to a little more than rounding; NaN where an entry is.
+    """The 2-norm of a matrix or diagonal, a little more than it; NaN if an entry is NaN.
 
     None if its entries are not known when the program is traced, or if that would take long.
     """
-    if isinstance(a, Tracer) or (a.ndim == 2 and len(a) > _LARGEST):
+    if isinstance(a, Tracer) or (a.ndim == 2 and len(a) > _MAX_ROWS):
         return None
     wide = np.asarray(a).astype(np.result_type(a.dtype, np.float64))
     norm = np.max(np.abs(wide), initial=0) if wide.ndim == 1 else _largest_singular_value(wide)

@@ -17,43 +17,43 @@ from .stumpff import dexpinv_times, is_below_full_turn, stumpff_1_to_3_apart
 from .vectors import Vector, entries, pack, placed, plus
 
 
-@functools.partial(jax.jit, static_argnames=("frame", "places"))
+@functools.partial(jax.jit, static_argnames=("frame", "indices"))
 def tangent(
     w: Float[Array, ""],
     v: Float[Array, "2"],
     x: Float[Array, "..."],
     frame: str,
-    places: tuple[int, ...],
+    indices: tuple[int, ...],
 ) -> Float[Array, "..."]:
     """The velocity of `x`: a point, shape `(2,)`, or a pose, shape `(3, 3)` or `(4,)`.
 
-    A pose in one vector has cosine and sine and x, y of its position at `places`.
+    A pose in one vector has cosine and sine and x, y of its position at `indices`.
     """
-    return _moved(lambda w, u: u, _times_i, w, v, x, frame, places)
+    return _increment(lambda w, u: u, _times_i, w, v, x, frame, indices)
 
 
-@functools.partial(jax.jit, static_argnames=("frame", "places", "leads_back"))
+@functools.partial(jax.jit, static_argnames=("frame", "indices", "leads_back"))
 def increment(
     w: Float[Array, ""],
     v: Float[Array, "2"],
     x: Float[Array, "..."],
     frame: str,
-    places: tuple[int, ...],
+    indices: tuple[int, ...],
     leads_back: bool,
 ) -> Float[Array, "..."]:
-    """What `x` moves by in unit time, with a rounding as small as it is.
+    """The increment of `x` in unit time, with a rounding error as small as it is.
 
-    It may lead the length of a direction back to 1.
+    If `leads_back`, it also corrects the length of a direction towards 1.
     """
     exponential = stumpff_1_to_3_apart(w * w)
 
-    def way(w: Array, u: Vector) -> Vector:
+    def displacement(w: Array, u: Vector) -> Vector:
         return exponential.increment(u, _times_i(w, u))
 
-    def turned(w: Array, z: Vector) -> Vector:
+    def turn(w: Array, z: Vector) -> Vector:
         return exponential.turned(w * w, z, _times_i(w, z), leads_back)
 
-    return _moved(way, turned, w, v, x, frame, places)
+    return _increment(displacement, turn, w, v, x, frame, indices)
 
 
 @jax.jit
@@ -75,41 +75,43 @@ def dexpinv(
 
 
 def has_dexpinv(w: Float[Array, "*batch"]) -> Bool[Array, ""]:
-    """Whether `dexpinv` has a value at all of these, whatever the velocity is."""
+    """Whether `dexpinv` has a value at all of these, which does not depend on v."""
     return is_below_full_turn(w * w)
 
 
-def _moved(
-    way: Callable[[Array, Vector], Vector],
-    turned: Callable[[Array, Vector], Vector],
+def _increment(
+    displacement: Callable[[Array, Vector], Vector],
+    turn: Callable[[Array, Vector], Vector],
     w: Array,
     v: Array,
     x: Array,
     frame: str,
-    places: tuple[int, ...],
+    indices: tuple[int, ...],
 ) -> Array:
-    """What `x` moves by, where `way` makes it of a velocity that turns with w.
+    """The increment of `x`.
 
-    `turned` makes it of the direction of a pose in one vector.
+    `displacement` takes w and a velocity that turns with w to the increment of a point, and `turn`
+    takes w and the direction of a pose in one vector to its increment.
     """
     vs = entries(v)
     if x.ndim == 2 and frame == "body":
         # A row of the matrix turns with -w.
         r0, r1 = x[:, 0], x[:, 1]
-        v0, v1 = way(w, vs)
-        return pack([*way(-w, _times_i(-w, [r0, r1])), r0 * v0 + r1 * v1], axis=1, sums=True)
+        v0, v1 = displacement(w, vs)
+        rotation = displacement(-w, _times_i(-w, [r0, r1]))
+        return pack([*rotation, r0 * v0 + r1 * v1], axis=1, sums=True)
     if x.ndim == 2:
         *rows, last = entries(x)
         u = plus(_times_i(w, rows), [last * a for a in vs])
-        return pack([*way(w, u), jnp.zeros_like(last)], sums=True)
+        return pack([*displacement(w, u), jnp.zeros_like(last)], sums=True)
     if x.shape == (2,):
-        return pack(way(w, plus(_times_i(w, entries(x)), vs)), sums=True)
-    z, place = [x[k] for k in places[:2]], [x[k] for k in places[2:]]
+        return pack(displacement(w, plus(_times_i(w, entries(x)), vs)), sums=True)
+    z, position = [x[k] for k in indices[:2]], [x[k] for k in indices[2:]]
     if frame == "fixed":
-        u = plus(_times_i(w, place), vs)
+        u = plus(_times_i(w, position), vs)
     else:
         u = plus([z[0] * a for a in vs], _times_i(z[1], vs))
-    return pack(placed([*turned(w, z), *way(w, u)], places), sums=True)
+    return pack(placed([*turn(w, z), *displacement(w, u)], indices), sums=True)
 
 
 def _times_i(w: Any, x: Vector) -> Vector:

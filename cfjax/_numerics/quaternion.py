@@ -9,7 +9,7 @@ from jaxtyping import Array, Float
 from .stumpff import stumpff_1_to_3_apart
 from .vectors import Vector, cross, dot, pack
 
-# In which frame a vector is given, and where the scalar part of a quaternion is stored.
+# The frame of a vector, and where the scalar part of a quaternion is stored.
 Frame = Literal["body", "fixed"]
 Layout = Literal["wxyz", "xyzw"]
 _CHOICES = {"frame": ("body", "fixed"), "layout": ("wxyz", "xyzw")}
@@ -23,12 +23,12 @@ def check_choice(name: str, value: Any) -> None:
 
 
 def parts(q: Float[Array, "*batch 4"], layout: Layout) -> Vector:
-    """The scalar part and the three others."""
+    """The scalar part, then the three entries of the vector part."""
     return [q[..., k] for k in ((0, 1, 2, 3) if layout == "wxyz" else (3, 0, 1, 2))]
 
 
 def from_parts(q: Vector, layout: Layout) -> Float[Array, "*batch 4"]:
-    """The reverse of `parts`."""
+    """The inverse of `parts`."""
     w, x, y, z = q
     return pack((w, x, y, z) if layout == "wxyz" else (x, y, z, w), axis=w.ndim, sums=True)
 
@@ -45,9 +45,10 @@ def times(
 def increment(
     omega: Float[Array, "3"], q: Float[Array, "4"], frame: Frame, layout: Layout, leads_back: bool
 ) -> Float[Array, "4"]:
-    """The product of `exp(omega / 2)` with q, from the side that `times` says, less q.
+    """The product of `exp(omega / 2)` with q, from the same side as in `times`, less q.
 
-    Its rounding is as small as it is. It may lead the length of q back to 1.
+    Its rounding error is as small as it is. If `leads_back`, it also corrects the length of q
+    towards 1.
     """
     a, p = half(omega), parts(q, layout)
     s = dot(a, a)

@@ -19,46 +19,46 @@ from .stumpff import Exponential, stumpff_1_to_3_apart
 from .vectors import Vector, cross, dot, entries, pack, placed, plus
 
 
-@functools.partial(jax.jit, static_argnames=("frame", "places"))
+@functools.partial(jax.jit, static_argnames=("frame", "indices"))
 def tangent(
     w: Float[Array, "3"],
     v: Float[Array, "3"],
     x: Float[Array, "..."],
     frame: str,
-    places: tuple[int, ...],
+    indices: tuple[int, ...],
 ) -> Float[Array, "..."]:
     """The velocity of `x`: a point, shape `(3,)`, or a pose, shape `(4, 4)` or `(7,)`.
 
-    A pose in one vector has w, x, y, z of its quaternion and x, y, z of its position at `places`.
+    A pose in one vector has w, x, y, z of its quaternion and x, y, z of its position at `indices`.
     """
-    return _moved(entries(w), entries(v), x, frame, places)
+    return _increment(entries(w), entries(v), x, frame, indices)
 
 
-@functools.partial(jax.jit, static_argnames=("frame", "places", "leads_back"))
+@functools.partial(jax.jit, static_argnames=("frame", "indices", "leads_back"))
 def increment(
     w: Float[Array, "3"],
     v: Float[Array, "3"],
     x: Float[Array, "..."],
     frame: str,
-    places: tuple[int, ...],
+    indices: tuple[int, ...],
     leads_back: bool,
 ) -> Float[Array, "..."]:
-    """What `x` moves by in unit time, with a rounding as small as it is.
+    """The increment of `x` in unit time, with a rounding error as small as it is.
 
-    It may lead the length of a quaternion back to 1.
+    If `leads_back`, it also corrects the length of a quaternion towards 1.
     """
     ws = entries(w)
     if x.shape != (7,):
         exponential = stumpff_1_to_3_apart(dot(ws, ws))
-        return _moved(ws, entries(v), x, frame, places, exponential)
+        return _increment(ws, entries(v), x, frame, indices, exponential)
     # A quaternion turns by half of the angle.
     s = dot(half(ws), half(ws))
     of_half = stumpff_1_to_3_apart(s)
 
-    def turned(q: Vector, once: Vector) -> Vector:
-        return of_half.turned(s, q, once, leads_back)
+    def turn(q: Vector, velocity: Vector) -> Vector:
+        return of_half.turned(s, q, velocity, leads_back)
 
-    return _moved(ws, entries(v), x, frame, places, _doubled(s, of_half), turned)
+    return _increment(ws, entries(v), x, frame, indices, _doubled(s, of_half), turn)
 
 
 @jax.jit
@@ -77,52 +77,53 @@ def dexpinv(
 ) -> tuple[Float[Array, "3"], Float[Array, "3"]]:
     """The inverse derivative of the exponential at the first motion, of the second.
 
-    The algebra of rigid motions is the tangent bundle of that of rotations: (w, v) is the point w
-    and its rate v, and so every natural map of the one is that of the other with its derivative.
+    se(3) is the tangent bundle of so(3): (w, v) is the point w with the tangent vector v. So every
+    natural map of se(3) is that of so(3) together with its derivative.
     """
     return jax.jvp(rotate.dexpinv, (w1, w2), (v1, v2))
 
 
-# Whatever the velocity is.
+# It does not depend on v.
 has_dexpinv = rotate.has_dexpinv
 
 
-def _moved(
+def _increment(
     w: Vector,
     v: Vector,
     x: Array,
     frame: str,
-    places: tuple[int, ...],
+    indices: tuple[int, ...],
     exponential: Exponential | None = None,
-    turned: Callable[[Vector, Vector], Vector] = lambda q, once: once,
+    turn: Callable[[Vector, Vector], Vector] = lambda q, velocity: velocity,
 ) -> Array:
-    """What `x` moves by in unit time, or its velocity if there is no exponential.
+    """The increment of `x` in unit time, or its velocity if there is no exponential.
 
-    `turned` is what a quaternion turns by, from itself and its velocity.
+    `turn` takes a quaternion and its velocity to its increment.
     """
     if x.shape == (3,):
         return pack(_along_screw(exponential, w, v, entries(x), 1), sums=True)
     if x.ndim == 1:
-        q, place = [x[k] for k in places[:4]], [x[k] for k in places[4:]]
+        q, position = [x[k] for k in indices[:4]], [x[k] for k in indices[4:]]
         if frame == "fixed":
-            moved = _along_screw(exponential, w, v, place, 1)
+            displacement = _along_screw(exponential, w, v, position, 1)
         else:
-            moved = _rotated(q, _way(exponential, w, v))
-        turned_q = turned(q, product(half(w), q, frame))
-        return pack(placed([*turned_q, *moved], places), sums=True)
+            displacement = _rotated(q, _of_origin(exponential, w, v))
+        rotation = turn(q, product(half(w), q, frame))
+        return pack(placed([*rotation, *displacement], indices), sums=True)
     if frame == "fixed":
         *rows, last = entries(x)
-        moved = _along_screw(exponential, w, v, rows, last)
-        return pack([*moved, jnp.zeros_like(last)], sums=True)
+        displacement = _along_screw(exponential, w, v, rows, last)
+        return pack([*displacement, jnp.zeros_like(last)], sums=True)
     *columns, _ = entries(x.T)
-    once = cross(columns, w)
+    rotation = cross(columns, w)
     if exponential is not None:
-        once = exponential.increment(once, cross(once, w))
-    return pack([*once, dot(columns, _way(exponential, w, v))], axis=1, sums=True)
+        rotation = exponential.increment(rotation, cross(rotation, w))
+    position = dot(columns, _of_origin(exponential, w, v))
+    return pack([*rotation, position], axis=1, sums=True)
 
 
 def _doubled(s: Array, exponential: Exponential) -> Exponential:
-    """That at twice the angle, whose square is s.
+    """The exponential of twice the angle, where s is the square of the angle.
 
     By `c_1(4s) = c_0 c_1`, `c_2(4s) = c_1^2 / 2` and `c_3(4s) = (c_2 + c_0 c_3) / 4`.
     """
@@ -137,20 +138,20 @@ def _doubled(s: Array, exponential: Exponential) -> Exponential:
 def _along_screw(
     exponential: Exponential | None, w: Vector, v: Vector, x: Vector, weight: Any
 ) -> Vector:
-    """What a point in homogeneous coordinates, the last of which is the weight, moves by.
+    """The increment of a point in homogeneous coordinates, the last of which is the weight.
 
-    With its velocity u it is `c_1 u + c_2 a u + c_3 (w . v) w`.
+    With the velocity u of the point it is `c_1 u + c_2 a u + c_3 (w . v) w`.
     """
-    once = plus(cross(w, x), [weight * b for b in v])
+    velocity = plus(cross(w, x), [weight * b for b in v])
     if exponential is None:
-        return once
-    turned = exponential.increment(once, cross(w, once))
+        return velocity
+    displacement = exponential.increment(velocity, cross(w, velocity))
     pitch = (exponential.c3 * dot(w, v)) * weight
-    return plus(turned, [pitch * b for b in w])
+    return plus(displacement, [pitch * b for b in w])
 
 
-def _way(exponential: Exponential | None, w: Vector, v: Vector) -> Vector:
-    """`V v`, the way of the origin."""
+def _of_origin(exponential: Exponential | None, w: Vector, v: Vector) -> Vector:
+    """`V v`, the increment of the origin."""
     if exponential is None:
         return v
     near, _, d2, c3 = exponential

@@ -24,29 +24,29 @@ def rotate(a: Float[Array, "3"], x: Float[Array, "3 *k"]) -> Float[Array, "3 *k"
 
 @jax.jit
 def increment(a: Float[Array, "3"], x: Float[Array, "3 *k"]) -> Float[Array, "3 *k"]:
-    """`rotate(a, x) - x`, with a rounding as small as it is."""
+    """`rotate(a, x) - x`, with a rounding error as small as it is."""
     axis = entries(a)
-    once = cross(axis, entries(x))
+    velocity = cross(axis, entries(x))
     exponential = stumpff_1_to_3_apart(dot(axis, axis))
-    return pack(exponential.increment(once, cross(axis, once)), sums=True)
+    return pack(exponential.increment(velocity, cross(axis, velocity)), sums=True)
 
 
 @jax.jit
 def mean(a: Float[Array, "3"], x: Float[Array, "3 *k"]) -> Float[Array, "3 *k"]:
     """The mean of `rotate(s a, x)` over s from 0 to 1, `x + c_2 a*x + c_3 a*(a*x)`."""
     axis, xs = entries(a), entries(x)
-    once = cross(axis, xs)
+    velocity = cross(axis, xs)
     c2, c3 = (stumpff(n, dot(axis, axis)) for n in (2, 3))
-    parts = zip(xs, once, cross(axis, once), strict=True)
-    return pack([x + (c2 * v + c3 * w) for x, v, w in parts], sums=True)
+    terms = zip(xs, velocity, cross(axis, velocity), strict=True)
+    return pack([x + (c2 * v + c3 * w) for x, v, w in terms], sums=True)
 
 
 @jax.jit
 def dexpinv(a: Float[Array, "3"], x: Float[Array, "3"]) -> Float[Array, "3"]:
     """The inverse derivative of the exponential at `a`, `x - a*x/2 + a*(a*x)/12 - ...`."""
     axis, xs = entries(a), entries(x)
-    once = cross(axis, xs)
-    return pack(dexpinv_times(dot(axis, axis), xs, once, cross(axis, once)), sums=True)
+    velocity = cross(axis, xs)
+    return pack(dexpinv_times(dot(axis, axis), xs, velocity, cross(axis, velocity)), sums=True)
 
 
 def has_dexpinv(a: Float[Array, "*batch 3"]) -> Bool[Array, ""]:

@@ -33,43 +33,42 @@ class Span(eqx.Module):
 
     @classmethod
     def joint(cls, spans: Sequence["Span"]) -> "Span":
-        """One with the blocks of all spans."""
+        """The span of the blocks of all spans."""
         # With the corner in front, if there is one, and then the fewest new products.
         span = max(spans, key=lambda s: (isinstance(s.blocks[0], Corner), len(s.blocks)))
-        for other in spans:
-            for block in other.blocks:
-                if span.position(block) < 0 and not isinstance(block, Corner):
-                    span = span.extended(block)
+        for block in (block for s in spans for block in s.blocks):
+            if span.index(block) < 0 and not isinstance(block, Corner):
+                span = span.extended(block)
         return span
 
     def extended(self, block: Float[Array, "n p"]) -> "Span":
         blocks = (*self.blocks, block)
-        new = inner(blocks, block)
+        products = inner(blocks, block)
         p = block.shape[1]
-        top = jnp.concatenate([self.gram, new[:-p]], axis=1)
-        return Span(blocks, jnp.concatenate([top, new.T]))
+        top = jnp.concatenate([self.gram, products[:-p]], axis=1)
+        return Span(blocks, jnp.concatenate([top, products.T]))
 
-    def position(self, block: Any) -> int:
-        """Which block is the same array, or -1.
+    def index(self, block: Any) -> int:
+        """The index of the block that is the same array, or -1.
 
-        By identity, as values are not known in a trace. The same object always has the same value.
-        Two with equal values make the span longer than it need be, and the field is the same.
+        Arrays are compared by identity, as their values are not known in a trace. Two with equal
+        values make the span longer than necessary, and the field is the same.
         """
-        for i, own in enumerate(self.blocks):
-            if own is block or (isinstance(own, Corner) and isinstance(block, Corner)):
+        for i, x in enumerate(self.blocks):
+            if x is block or (isinstance(x, Corner) and isinstance(block, Corner)):
                 return i
         return -1
 
-    def places(self, other: "Span") -> Int[np.ndarray, " k"]:
-        """Where the columns of another span are, all of whose blocks this one has."""
+    def column_indices(self, other: "Span") -> Int[np.ndarray, " k"]:
+        """The indices here of the columns of another span, whose blocks are all in this one."""
         widths = [x.p if isinstance(x, Corner) else x.shape[1] for x in self.blocks]
         ends = np.cumsum(widths)
         columns = np.split(np.arange(ends[-1]), ends[:-1])
-        return np.concatenate([columns[self.position(block)] for block in other.blocks])
+        return np.concatenate([columns[self.index(block)] for block in other.blocks])
 
 
 def joined(blocks: Blocks) -> Float[Array, "n m"]:
-    """The columns W but those of a corner."""
+    """The columns W without those of a corner."""
     columns: list[Any] = [x for x in blocks if not isinstance(x, Corner)]
     if columns[0].shape[1] == 1:
         # As rows they are copied as they lie in memory: twice as fast where they are long.
@@ -97,7 +96,7 @@ def plus_product(
 
 
 def square(y: Float[Array, "n p"]) -> Float[Array, "p p"]:
-    """`y^T y`, in blocks of rows: the rounding of long sums is what would limit orthonormality."""
+    """`y^T y`, in blocks of rows, as the rounding of long sums would limit orthonormality."""
     n, p = y.shape
     count = math.isqrt(n)
     rows = -(-n // count)
@@ -112,7 +111,7 @@ def orthonormal_defect(square: Float[Array, "p p"]) -> Float[Array, "p p"]:
 
 def correction(square: Float[Array, "p p"]) -> Float[Array, "p p"]:
     """`(I - y^T y) / 2`, the first term of Newton's method for the nearest orthonormal columns."""
-    off = orthonormal_defect(square)
-    # Far from the manifold there is no nearest point that the caller can have meant.
-    near = jnp.max(jnp.abs(lax.stop_gradient(off))) < 0.1
-    return jnp.where(near, off / 2, jnp.nan)
+    defect = orthonormal_defect(square)
+    # A point far from the manifold is a mistake of the caller.
+    is_near = jnp.max(jnp.abs(lax.stop_gradient(defect))) < 0.1
+    return jnp.where(is_near, defect / 2, jnp.nan)

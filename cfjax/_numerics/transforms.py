@@ -27,8 +27,8 @@ class AbstractTransform(eqx.Module):
     `cfjax.TensorTransform`, which applies transforms axis by axis, and for batches `jax.vmap`.
     """
 
-    # When it comes on a grid: 0 if it keeps real points real, 1 if it takes real points to complex
-    # coefficients, 2 if it takes complex points.
+    # The order of transforms on a grid: 0 if it keeps real points real, 1 if it takes real points
+    # to complex coefficients, 2 if it takes complex points.
     _rank: ClassVar[int] = 0
 
     @abc.abstractmethod
@@ -216,7 +216,7 @@ class TensorTransform(AbstractTransform):
                 raise TypeError(
                     "transforms must be of one axis each, got a TensorTransform among them."
                 )
-        if sum(one is not None and one._rank == 1 for one in self.transforms) > 1:
+        if sum(transform._rank == 1 for _, transform in self._in_order()) > 1:
             raise ValueError(
                 "transforms must hold at most one RealFourierTransform, or cfjax.diagonalised of a "
                 "real matrix with complex eigenvalues, as its coefficients are complex, got "
@@ -245,13 +245,13 @@ class TensorTransform(AbstractTransform):
 
     def _in_order(self) -> list[tuple[int, AbstractTransform]]:
         """Axes and their transforms: real ones, that from real to complex, complex ones."""
-        axes = [(k, one) for k, one in enumerate(self.transforms) if one is not None]
-        return sorted(axes, key=lambda axis: axis[1]._rank)
+        pairs = [(axis, t) for axis, t in enumerate(self.transforms) if t is not None]
+        return sorted(pairs, key=lambda pair: pair[1]._rank)
 
 
 def sine_matrix(n: int) -> Float[np.ndarray, "n n"]:
     k = np.arange(1, n + 1)
-    # Reduced in integers, so that no digit of a large angle is lost.
+    # Reduced in integers, so that large angles lose no digits.
     turns = np.outer(k, k) % (2 * (n + 1)) / (n + 1)
     return np.sqrt(2 / (n + 1)) * np.sin(np.pi * turns)
 
@@ -283,8 +283,8 @@ def _sine(x: Float[Array, "n *k"]) -> Float[Array, "n *k"]:
     transformed = jnp.fft.rfft(folded, axis=0)[:-1]
     steps = jnp.concatenate([transformed[:1].real / 2, transformed[1:].real])
     odd, even = jnp.cumsum(steps, axis=0), -jnp.roll(transformed.imag, -1, axis=0)
-    mixed = jnp.stack([odd, even], axis=1).reshape(intervals, *x.shape[1:])
-    return sqrt(2 / intervals) * mixed[:-1]
+    interleaved = jnp.stack([odd, even], axis=1).reshape(intervals, *x.shape[1:])
+    return sqrt(2 / intervals) * interleaved[:-1]
 
 
 def _cosine(x: Float[Array, "n *k"]) -> Float[Array, "n *k"]:

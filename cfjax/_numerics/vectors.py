@@ -1,6 +1,6 @@
 """Short vectors by their entries: numbers, arrays of leading axes, or rows and columns of a matrix.
 
-XLA fuses what is written so, and `pack` puts the entries together again.
+XLA fuses arithmetic on entries, and `pack` puts the entries together again.
 """
 
 from collections.abc import Sequence
@@ -18,13 +18,13 @@ Vector = Sequence[Any]
 
 
 def entries(x: Float[Array, "n *k"]) -> list[Array]:
-    """Along the first axis."""
+    """The entries along the first axis."""
     return [x[k] for k in range(x.shape[0])]
 
 
-def placed(entries: Vector, places: Sequence[int]) -> Vector:
-    """Each entry at its place: `[x[k] for k in places]` has them in order again."""
-    return [entries[places.index(k)] for k in range(len(places))]
+def placed(entries: Vector, indices: Sequence[int]) -> Vector:
+    """The vector x with `x[indices[j]] = entries[j]`."""
+    return [entries[indices.index(k)] for k in range(len(indices))]
 
 
 def cross(a: Vector, b: Vector) -> Vector:
