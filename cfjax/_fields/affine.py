@@ -11,7 +11,7 @@ from jaxtyping import Array, Inexact
 
 from .._arrays import Weight, describe, struct
 from .._field import AbstractAlgebraElement, combine
-from .._numerics.checks import differ, needing
+from .._numerics.checks import differ, error_where
 from .._numerics.phi import phi_1, phis
 from .._numerics.transforms import DTYPES, AbstractTransform, TensorTransform
 from .semilinear import AbstractSemilinearField
@@ -124,17 +124,17 @@ class Affine(AbstractAlgebraElement, AbstractSemilinearField):
     def functions(self, pairs: Sequence[tuple[float, int]]) -> list[Array]:
         nodes = sorted({c for c, _ in pairs})
         z = jnp.stack([c * self._exponent() for c in nodes])
-        found = phis(z, max(k for _, k in pairs))
-        return [found[k][nodes.index(c)] for c, k in pairs]
+        values = phis(z, max(k for _, k in pairs))
+        return [values[k][nodes.index(c)] for c, k in pairs]
 
     def times(self, function: Array, x: Inexact[Array, "*point"]) -> Inexact[Array, "*point"]:
         return self._point(_times(function, self._coefficients(x)))
 
     def rest(self, first: Any, point: Inexact[Array, "*point"]) -> Inexact[Array, "*point"]:
         # The alpha of a field may vary, though mostly it does not.
-        b = _of_one_operator([first, self])[1]
-        more = (self.alpha - first.alpha).astype(self.spectrum.dtype) * self.spectrum
-        return b + self._point(_times(more, self._coefficients(point)))
+        b = _checked_b(self, first)
+        change = (self.alpha - first.alpha).astype(self.spectrum.dtype) * self.spectrum
+        return b + self._point(_times(change, self._coefficients(point)))
 
     def to_chart(self, point: Array, earlier: Sequence[Any]) -> tuple["Affine", Array]:
         if self.transform is None:
@@ -152,9 +152,9 @@ class Affine(AbstractAlgebraElement, AbstractSemilinearField):
 
     @classmethod
     def combine(cls, weights: Sequence[Weight], fields: Sequence[Any]) -> "Affine":
-        b = _of_one_operator(fields)
+        bs = [_checked_b(field, fields[0]) for field in fields]
         alpha = combine(weights, [field.alpha for field in fields])
-        return fields[0]._with(alpha, combine(weights, b))
+        return fields[0]._with(alpha, combine(weights, bs))
 
     def _check(self, point: Array) -> None:
         if point.shape != self.b.shape or point.dtype != self.b.dtype:
@@ -177,7 +177,7 @@ class Affine(AbstractAlgebraElement, AbstractSemilinearField):
 
 
 class _InCoefficients(Affine):
-    """A field with a transform within a step: its b and its points there are coefficients."""
+    """A field with a transform, in the chart of a step: its b and points are coefficients."""
 
     is_entrywise: ClassVar[bool] = True
 
@@ -202,30 +202,24 @@ class _InCoefficients(Affine):
         return coefficients
 
 
-def _of_one_operator(fields: Sequence[Affine]) -> list[Array]:
-    """The b of each field, with an error in those whose operator is not that of the first."""
-    first, *others = fields
-    checked = [first.b]
-    for other in others:
-        operators = [(field.spectrum, field.transform) for field in (first, other)]
-        # Arrays are compared by shape here.
-        if struct(operators[0]) != struct(operators[1]) or struct(first.b) != struct(other.b):
-            raise ValueError(
-                "Affine fields that are added must have one operator, got the spectra and "
-                f"transforms {describe(operators[0])} and {describe(operators[1])}."
-            )
-        b = other.b
-        # Most fields close over one array, and need no check of its values.
-        if other.spectrum is not first.spectrum:
-            zero = eqx.error_if(
-                jnp.zeros(()),
-                differ(other.spectrum, first.spectrum),
-                "Affine fields that are added must have one spectrum: it may not depend on time or "
-                "state, and the terms of a diffrax.MultiTerm must share it.",
-            )
-            b = needing(zero, b)
-        checked.append(b)
-    return checked
+def _checked_b(field: Affine, first: Affine) -> Array:
+    """The b of a field, with an error if its operator is not that of the first field."""
+    operators = [(f.spectrum, f.transform) for f in (first, field)]
+    # Arrays are compared by shape here.
+    if struct(operators[0]) != struct(operators[1]) or struct(first.b) != struct(field.b):
+        raise ValueError(
+            "Affine fields that are added must have one operator, got the spectra and "
+            f"transforms {describe(operators[0])} and {describe(operators[1])}."
+        )
+    # Most fields close over one array, and need no check of its values.
+    if field.spectrum is first.spectrum:
+        return field.b
+    return error_where(
+        field.b,
+        differ(field.spectrum, first.spectrum),
+        "Affine fields that are added must have one spectrum: it may not depend on time or "
+        "state, and the terms of a diffrax.MultiTerm must share it.",
+    )
 
 
 def _times(diagonal: Array, coefficients: Array) -> Array:

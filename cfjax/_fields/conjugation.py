@@ -23,15 +23,15 @@ class AbstractTwoSided(AbstractMatrix):
 
     def flow(self, point: Inexact[Array, "*batch n n"]) -> Inexact[Array, "*batch n n"]:
         def of_one(field: Any, x: Array) -> Array:
-            weight, moved = field.move(x)
-            return weight * x + moved
+            weight, shift = field.move(x)
+            return weight * x + shift
 
         return self._each(of_one, point)
 
     def increment(self, point: Inexact[Array, "*batch n n"]) -> Inexact[Array, "*batch n n"]:
         def of_one(field: Any, x: Array) -> Array:
-            weight, moved = field.move(x)
-            return (weight - 1) * x + moved
+            weight, shift = field.move(x)
+            return (weight - 1) * x + shift
 
         return self._each(of_one, point)
 
@@ -47,7 +47,7 @@ class AbstractTwoSided(AbstractMatrix):
 
     @abc.abstractmethod
     def move(self, x: Inexact[Array, "n n"]) -> tuple[Inexact[Array, ""], Inexact[Array, "n n"]]:
-        """`w, z` with `w x + z` the point that x moves to, for a field without leading axes."""
+        """`w, z` such that the flow of x is `w x + z`, for a field without leading axes."""
 
     @abc.abstractmethod
     def average(self, x: Inexact[Array, "n n"]) -> Inexact[Array, "n n"]:
@@ -91,15 +91,15 @@ class Conjugation(AbstractTwoSided):
     def move(self, x: Inexact[Array, "n n"]) -> tuple[Inexact[Array, ""], Inexact[Array, "n n"]]:
         # A multiple of the identity has no effect, and the norm is smaller without.
         a = _minus_identity(self.a, jnp.trace(self.a) / self.a.shape[0])
-        weight, plus, minus = expm_both_parts(a)
-        return _from_both_sides(weight, (a, plus), x, (-a, minus))
+        weight, remainder, inverse_remainder = expm_both_parts(a)
+        return _from_both_sides(weight, (a, remainder), x, (-a, inverse_remainder))
 
     def average(self, x: Inexact[Array, "n n"]) -> Inexact[Array, "n n"]:
         # exp([[a, x], [0, a]]) has the integral of exp((1 - s) a) x exp(s a) above the diagonal.
         a = _minus_identity(self.a, jnp.trace(self.a) / self.a.shape[0])
         a, x = promoted(a, x)
-        whole = expm(jnp.block([[a, x], [jnp.zeros_like(x), a]]))
-        return _times(whole[: len(x), len(x) :], expm(-a))
+        exp = expm(jnp.block([[a, x], [jnp.zeros_like(x), a]]))
+        return _times(exp[: len(x), len(x) :], expm(-a))
 
     def velocity(self, x: Inexact[Array, "n n"]) -> Inexact[Array, "n n"]:
         return _commutator(self.a, x)
@@ -140,7 +140,7 @@ class Congruence(AbstractTwoSided):
     )
 
     def __check_init__(self):
-        super().__check_init__()  # First: what it says of a is more to the point.
+        super().__check_init__()  # First, as its errors name the cause.
         if self.q is not None:
             check_companion("q", self.q, self.a, self.a.shape[-2:])
 
@@ -153,25 +153,25 @@ class Congruence(AbstractTwoSided):
         is_hermitian = jnp.all(x == _adjoint(x))
         source = jnp.zeros((), x.dtype)
         if self.q is None:
-            weight, rest = expm_parts(a)
+            weight, remainder = expm_parts(a)
         else:
             is_hermitian &= jnp.all(self.q == _adjoint(self.q))
-            weight, rest, source = expm_parts_with_source(*promoted(a, self.q))
-        adjoint = _adjoint(a), _adjoint(rest)
-        weight, moved = _from_both_sides(weight, (a, rest), x, adjoint)
-        moved = jnp.add(*promoted(moved, source))
-        return weight, _without_skew_part(moved, is_hermitian)
+            weight, remainder, source = expm_parts_with_source(*promoted(a, self.q))
+        adjoint = _adjoint(a), _adjoint(remainder)
+        weight, shift = _from_both_sides(weight, (a, remainder), x, adjoint)
+        shift = jnp.add(*promoted(shift, source))
+        return weight, _without_skew_part(shift, is_hermitian)
 
     def average(self, x: Inexact[Array, "n n"]) -> Inexact[Array, "n n"]:
         mean = Congruence(self.a, x).flow(jnp.zeros_like(x))
         if self.q is None:
             return mean
-        # Less than the integral of exp(s a) q exp(s a)^H over s, by the time since: (1 - s) ds.
+        # And the integral of (1 - s) exp(s a) q exp(s a)^H over s from 0 to 1.
         a, q = promoted(self.a, self.q)
         b, zero, n = -_adjoint(a), jnp.zeros_like(a), len(a)
-        one = jnp.eye(n, dtype=a.dtype)
-        whole = expm(jnp.block([[a, q, zero], [zero, b, one], [zero, zero, b]]))
-        return jnp.add(*promoted(mean, _times(whole[:n, 2 * n :], expm(-b))))
+        eye = jnp.eye(n, dtype=a.dtype)
+        exp = expm(jnp.block([[a, q, zero], [zero, b, eye], [zero, zero, b]]))
+        return jnp.add(*promoted(mean, _times(exp[:n, 2 * n :], expm(-b))))
 
     def velocity(self, x: Inexact[Array, "n n"]) -> Inexact[Array, "n n"]:
         v = _linear_part(self.a, x)
@@ -197,18 +197,20 @@ def _from_both_sides(
 ) -> tuple[Array, Array]:
     """`w, z` with `w x + z = (w (I + a) + r) x (w (I + b) + t)`, for `(a, r)` and `(b, t)`.
 
-    With a and b themselves, products are exact but for the rounding of sums, which is random.
+    Products with a and b themselves are exact but for the rounding of sums, which is random.
     """
     w = weight.astype(x.dtype)
     (a, r), (b, t) = left, right
-    first = w * _times(a, x) + _times(r, x)
-    whole = w * x + first
-    return w, w * (first + _times(whole, b)) + _times(whole, t)
+    shift = w * _times(a, x) + _times(r, x)
+    product = w * x + shift
+    return w, w * (shift + _times(product, b)) + _times(product, t)
 
 
 def _without_skew_part(x: Array, is_rounding: Bool[Array, ""]) -> Array:
-    """Leaves the skew-Hermitian part out of the value, where it is rounding, but not out of the
-    derivatives: a direction need not be Hermitian."""
+    """Removes the skew-Hermitian part where it is rounding.
+
+    Derivatives keep theirs, as a tangent need not be Hermitian.
+    """
     mean = lax.stop_gradient(x + _adjoint(x)) / 2
     return jnp.where(is_rounding, mean + (x - lax.stop_gradient(x)), x)
 
@@ -219,11 +221,9 @@ def _with_sources(fields: Sequence[Any]) -> Sequence[Any]:
     if len(sources) in (0, len(fields)):
         return fields
     zero = jnp.zeros_like(sources[0])
-    given = [zero if field.q is None else field.q for field in fields]
-    is_none = lambda q: q is None  # noqa: E731
     return [
-        eqx.tree_at(lambda f: f.q, f, q, is_leaf=is_none)
-        for f, q in zip(fields, given, strict=True)
+        eqx.tree_at(lambda f: f.q, f, zero, is_leaf=lambda q: q is None) if f.q is None else f
+        for f in fields
     ]
 
 

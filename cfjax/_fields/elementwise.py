@@ -97,6 +97,12 @@ def check_other(field: AbstractFrozenField, other: Any) -> None:
         )
 
 
+def check_real(name: str, array: Array) -> None:
+    """Raises `TypeError` unless the array is float32 or float64."""
+    if array.dtype not in (jnp.float32, jnp.float64):
+        raise TypeError(f"{name} must be float32 or float64, got {array.dtype}.")
+
+
 def _fits(shape: Sequence[int], expected: Sequence[int | str]) -> bool:
     return len(shape) == len(expected) and all(
         isinstance(side, str) or side == n for side, n in zip(expected, shape, strict=True)

@@ -41,7 +41,7 @@ class LinearAffine(AbstractMatrix, AbstractSemilinearField):
     b: Inexact[Array, "*#batch n"] = eqx.field(converter=jnp.asarray)
 
     def __check_init__(self):
-        super().__check_init__()  # First: what it says of a is more to the point.
+        super().__check_init__()  # First, as its errors name the cause.
         check_companion("b", self.b, self.a, self.a.shape[-1:])
 
     def flow(self, point: Inexact[Array, "*batch n"]) -> Inexact[Array, "*batch n"]:
@@ -59,9 +59,9 @@ class LinearAffine(AbstractMatrix, AbstractSemilinearField):
 
     def functions(self, pairs: Sequence[tuple[float, int]]) -> list[Array]:
         nodes = sorted({c for c, _ in pairs})
-        most = max(k for _, k in pairs)
-        found = each(lambda a: matrix_phis(a, nodes, most), self._num_axes)(self.a)
-        return [found[nodes.index(c)][k] for c, k in pairs]
+        max_order = max(k for _, k in pairs)
+        values = each(lambda a: matrix_phis(a, nodes, max_order), self._num_axes)(self.a)
+        return [values[nodes.index(c)][k] for c, k in pairs]
 
     def times(
         self, function: Inexact[Array, "*batch n n"], x: Inexact[Array, "*batch n"]

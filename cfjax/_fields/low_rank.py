@@ -24,15 +24,15 @@ from .._numerics.span import (
     plus_product,
     square,
 )
-from .elementwise import check_point, each, elementwise
+from .elementwise import check_point, check_real, each, elementwise
 
 
 class AbstractSkew(AbstractFrozenField):
     """A skew field, which acts on orthonormal columns."""
 
     def defect(self, point: Float[Array, "*batch n p"]) -> tuple[Array, str]:
-        off = each(lambda y: orthonormal_defect(square(y)), point.ndim - 2)(point)
-        return jnp.max(jnp.abs(off), initial=0), "orthonormal columns (in entries of y0.T @ y0)"
+        defect = each(lambda y: orthonormal_defect(square(y)), point.ndim - 2)(point)
+        return jnp.max(jnp.abs(defect), initial=0), "orthonormal columns (in entries of y0.T @ y0)"
 
 
 class LowRankSkew(AbstractSkew):
@@ -68,7 +68,7 @@ class LowRankSkew(AbstractSkew):
         _check_factor("g", self.g)
 
     def flow(self, point: Float[Array, "*batch n p"]) -> Float[Array, "*batch n p"]:
-        """The point that `point`, taken as the one where the field is frozen, reaches."""
+        """The flow of `point`, which is taken as the point where the field is frozen."""
         field, start = self.to_chart(point, ())
         return field.from_chart(field.flow(start))
 
@@ -83,17 +83,16 @@ class LowRankSkew(AbstractSkew):
             check_like(self, "g", 2, point)
         if self.g.ndim > 2:
             return elementwise(self, self.g.ndim - 2).to_chart(point, earlier)
-        return SpanSkew.entered(self.g, point, earlier)
+        return SpanSkew.in_chart(self.g, point, earlier)
 
 
 class AbstractSkewElement(AbstractSkew, AbstractAlgebraElement):
-    """One with a bracket. Those of a form that sums keep, and those on a span, can be added."""
+    """A skew field with a bracket. A sum of bordered fields is bordered, any other is on a span."""
 
     @classmethod
     def combine(cls, weights: Sequence[Weight], fields: Sequence[Any]) -> Any:
         if all(isinstance(f, BorderedSkew) for f in fields):
-            gammas = [f.gamma for f in fields]
-            return BorderedSkew(combine(weights, gammas))
+            return BorderedSkew(combine(weights, [f.gamma for f in fields]))
         fields = _on_one_span(fields)
         k, a = combine(weights, [(f.k, f.a) for f in fields])
         return type(fields[0])(k, a, fields[0].span)
@@ -129,68 +128,69 @@ class BorderedSkew(AbstractSkewElement):
     def flow(self, point: Float[Array, "*batch n p"]) -> Float[Array, "*batch n p"]:
         check_like(self, "gamma", 2, point)
         if self.gamma.ndim > 2:
-            return elementwise(self, self.gamma.ndim - 2).flow(point)
+            return self._elementwise(self).flow(point)
         p = point.shape[1]
         corner, border = self.gamma[:p], self.gamma[p:]
         corner = corner - corner.T
         gram = matmul(border.T, border)
-        top, rest = point[:p], point[p:]
-        # The rest moves in the span of the border: rest + border w, with top' = corner top -
-        # gram w - border^T rest and w' = top.
+        top, bottom = point[:p], point[p:]
+        # The bottom moves in the span of the border: bottom + border w, with top' = corner top -
+        # gram w - border^T bottom and w' = top.
         row = jnp.concatenate([corner, -gram], axis=1)
 
         def product(x: Array) -> Array:
             return jnp.concatenate([matmul(row, x), x[:p]])
 
         # Norms that bound the 2-norm. A skew matrix has its singular values in pairs.
-        half = jnp.sqrt(lax.stop_gradient(jnp.sum(corner * corner)) / 2) / 2
-        size = jnp.max(jnp.sum(jnp.abs(lax.stop_gradient(gram)), axis=1))
+        half_norm = jnp.sqrt(lax.stop_gradient(jnp.sum(corner * corner)) / 2) / 2
+        gram_norm = jnp.max(jnp.sum(jnp.abs(lax.stop_gradient(gram)), axis=1))
 
         def dense() -> tuple[Array, Array]:
             a = jnp.concatenate([row, jnp.eye(p, 2 * p, dtype=row.dtype)])
-            scale = 1 / jnp.sqrt(jnp.maximum(size, 1))
+            scale = 1 / jnp.sqrt(jnp.maximum(gram_norm, 1))
             return a, jnp.repeat(jnp.stack([jnp.ones_like(scale), scale]), p)
 
-        velocity = matmul(corner, top) - matmul(border.T, rest)
-        change = phi_1_action(
+        velocity = matmul(corner, top) - matmul(border.T, bottom)
+        increment = phi_1_action(
             product,
             jnp.concatenate([velocity, top]),
-            half + jnp.sqrt(half * half + size),
+            half_norm + jnp.sqrt(half_norm * half_norm + gram_norm),
             dense,
         )
-        return jnp.concatenate([top + change[:p], rest + matmul(border, change[p:])])
+        return jnp.concatenate([top + increment[:p], bottom + matmul(border, increment[p:])])
 
     def tangent(self, point: Float[Array, "*batch n p"]) -> Float[Array, "*batch n p"]:
         check_like(self, "gamma", 2, point)
         if self.gamma.ndim > 2:
-            return elementwise(self, self.gamma.ndim - 2).tangent(point)
+            return self._elementwise(self).tangent(point)
         p = point.shape[1]
         velocity = matmul(self.gamma, point[:p])
         return jnp.concatenate([velocity[:p] - matmul(self.gamma.T, point), velocity[p:]])
 
     def bracket(self, other: Any) -> Any:
         if self.gamma.ndim > 2:
-            pair: list[Any] = [elementwise(field, self.gamma.ndim - 2) for field in (self, other)]
-            return pair[0].bracket(pair[1])
+            return self._elementwise(self).bracket(self._elementwise(other))
         return _spanned(self).bracket(other)
 
     def dexpinv(self, other: Any, degree: int) -> Any:
         if self.gamma.ndim > 2:
-            pair: list[Any] = [elementwise(field, self.gamma.ndim - 2) for field in (self, other)]
-            return pair[0].dexpinv(pair[1], degree)
+            return self._elementwise(self).dexpinv(self._elementwise(other), degree)
         return super().dexpinv(other, degree)
 
     def to_chart(self, point: Any, earlier: Sequence[Any]) -> tuple[AbstractFrozenField, Any]:
         if self.gamma.ndim > 2:
-            return elementwise(self, self.gamma.ndim - 2).to_chart(point, earlier)
+            return self._elementwise(self).to_chart(point, earlier)
         if not earlier:
             check_like(self, "gamma", 2, point)
             point = point + matmul(point, correction(square(point)))
         return self, point
 
+    def _elementwise(self, field: Any) -> Any:
+        return elementwise(field, self.gamma.ndim - 2)
+
 
 class SpanPoint(eqx.Module):
-    """A point of a step, as its coefficients in the first blocks of a span."""
+    """A point of a step, by its coefficients in the first blocks of a span."""
 
     z: Float[Array, "k p"]
     blocks: Blocks
@@ -204,22 +204,22 @@ class SpanSkew(AbstractSkewElement):
     """
 
     k: Float[Array, "m m"]
-    # What the field does to coefficients: `W k W^T W = W a`. A bracket is a commutator of these.
+    # The field acts on coefficients by a: `W k W^T W = W a`. A bracket is a commutator of these.
     a: Float[Array, "m m"]
     span: Span
 
     @classmethod
-    def entered(
+    def in_chart(
         cls, g: Float[Array, "n p"], point: Any, earlier: Sequence["SpanSkew"]
     ) -> tuple["SpanSkew", SpanPoint]:
-        """The field `g y^T - y g^T` frozen at the point y, and y, in the coordinates of a step."""
+        """The field `g y^T - y g^T` frozen at the point y, and y, in the chart of a step."""
         if earlier:
-            span, frozen_at = earlier[-1].span, point.z
+            span, z = earlier[-1].span, point.z
         else:
             span = Span((point,), square(point))
-            frozen_at = jnp.eye(point.shape[1], dtype=point.dtype)
-            point = SpanPoint(frozen_at + correction(span.gram), span.blocks)
-        return cls.of(g, frozen_at, span), point
+            z = jnp.eye(point.shape[1], dtype=point.dtype)
+            point = SpanPoint(z + correction(span.gram), span.blocks)
+        return cls.of(g, z, span), point
 
     @classmethod
     def of(cls, g: Float[Array, "n p"], z: Float[Array, "k p"], span: Span) -> "SpanSkew":
@@ -234,22 +234,22 @@ class SpanSkew(AbstractSkewElement):
         return cls(k, jnp.concatenate([-top, y_rows]), span)
 
     def flow(self, point: Any) -> Any:
-        def change(velocity: Array) -> Array:
+        def increment(velocity: Array) -> Array:
             a = lax.stop_gradient(self.a)
-            # A real skew matrix has its eigenvalues in pairs, and here is one that is similar.
+            # This matrix is similar to a real skew one, whose eigenvalues come in pairs.
             bound = jnp.sqrt(jnp.maximum(-jnp.sum(a * a.T) / 2, 0))
             return phi_1_action(lambda x: matmul(self.a, x), velocity, bound, self._dense)
 
         if isinstance(point, SpanPoint):
             length, m = len(point.z), len(self.a)
             z = jnp.pad(point.z, ((0, m - length), (0, 0)))
-            z = z + change(matmul(self.a[:, :length], point.z))
+            z = z + increment(matmul(self.a[:, :length], point.z))
             return SpanPoint(z, self.span.blocks)
         velocity = matmul(self.k, inner(self.span.blocks, point))
-        return plus_product(point, self.span.blocks, change(velocity))
+        return plus_product(point, self.span.blocks, increment(velocity))
 
     def _dense(self) -> tuple[Array, Array]:
-        # In units of the columns' lengths.
+        # Scaled to columns of length 1.
         squares = jnp.diagonal(self.span.gram)
         return self.a, jnp.where(squares > 0, lax.rsqrt(jnp.where(squares > 0, squares, 1)), 1)
 
@@ -260,8 +260,8 @@ class SpanSkew(AbstractSkewElement):
 
     def bracket(self, other: Any) -> "SpanSkew":
         x, y = _on_one_span((self, other))
-        half = matmul(x.a, y.k)
-        k = half - half.T
+        product = matmul(x.a, y.k)
+        k = product - product.T
         return type(self)(k, matmul(k, x.span.gram), x.span)
 
     def from_chart(self, point: Any) -> Any:
@@ -274,14 +274,14 @@ class SpanSkew(AbstractSkewElement):
         """The same field on a span that has all its blocks."""
         if span is self.span:
             return self
-        m, rest = len(self.k), len(span.gram) - len(self.k)
-        places = span.column_indices(self.span)
-        if np.array_equal(places, np.arange(m)):
-            k = jnp.pad(self.k, (0, rest))
-            new = matmul(self.k, span.gram[:m, m:])
-            a = jnp.pad(jnp.concatenate([self.a, new], 1), ((0, rest), (0, 0)))
-            return type(self)(k, a, span)
-        k = jnp.zeros(span.gram.shape, self.k.dtype).at[np.ix_(places, places)].set(self.k)
+        m = len(self.k)
+        indices = span.column_indices(self.span)
+        if np.array_equal(indices, np.arange(m)):
+            k = _padded(self.k, len(span.gram))
+            border = matmul(self.k, span.gram[:m, m:])
+            a = jnp.concatenate([self.a, border], 1)
+            return type(self)(k, jnp.pad(a, ((0, len(k) - m), (0, 0))), span)
+        k = jnp.zeros(span.gram.shape, self.k.dtype).at[np.ix_(indices, indices)].set(self.k)
         return type(self)(k, matmul(k, span.gram), span)
 
     def room(self, point: Any, num_fields: int) -> "Room | None":
@@ -290,15 +290,15 @@ class SpanSkew(AbstractSkewElement):
             return None
         p = point.z.shape[1]
         m = (num_fields + 1) * p
-        rest = ((0, 0), (0, m - len(self.span.gram)))
-        columns = jnp.pad(jnp.concatenate(blocks, axis=1), rest)
+        padding = ((0, 0), (0, m - len(self.span.gram)))
+        columns = jnp.pad(jnp.concatenate(blocks, axis=1), padding)
         return Room(Span((columns,), _padded(self.span.gram, m)), p, type(self))
 
 
 class Room(eqx.Module):
     """The span of a step with room for all of its fields, in arrays that do not grow.
 
-    The columns that are not there yet are zero, and so are the coefficients of these.
+    The columns of later fields are zero, and so are their coefficients.
     """
 
     span: Span
@@ -316,31 +316,31 @@ class Room(eqx.Module):
         return SpanPoint(z, self.span.blocks)
 
     def entered(self, field: SpanSkew) -> tuple[Array, Array]:
-        """Of a field that has entered here: its own columns, and their products with the others.
+        """The new columns of a field in this chart, and their products with all columns.
 
-        Of the latter the last p are those with themselves.
+        The last p rows of the latter are the products with themselves.
         """
         m = len(self.span.gram)
         columns: Any = field.span.blocks[-1]
         return columns, field.span.gram[:, m:]
 
     def kept(self, i: Any) -> tuple[Array, Array]:
-        """The same of a field that is here, field i."""
+        """The same of field i, which this span holds."""
         g, gram = (self._block(x, i, 1) for x in (self._columns, self.span.gram))
         return g, jnp.concatenate([gram, self._block(gram, i, 0)])
 
     def enlarged(
         self, new: tuple[Array, Array], z: Float[Array, "m p"], i: Any
     ) -> tuple["Room", Array]:
-        """With field i, frozen at `z`; and its coordinates."""
+        """The room with the columns of field i, and the coordinates of that field, frozen at z."""
         g, products = new
         m = len(self.span.gram)
         products = self._with(products[:m], products[m:], i, 0)
         gram = self._with(self.span.gram, products, i, 1)
         gram = self._with(gram, products.T, i, 0)
         columns = self._with(self._columns, g, i, 1)
-        half = self._with(jnp.zeros_like(gram), z, i, 1)
-        return Room(Span((columns,), gram), self.p, self.cls), half.T - half
+        yg = self._with(jnp.zeros_like(gram), z, i, 1)
+        return Room(Span((columns,), gram), self.p, self.cls), yg.T - yg
 
     @property
     def _columns(self) -> Any:
@@ -362,8 +362,8 @@ def _spanned(field: Any) -> SpanSkew:
         return field
     # gamma E^T - E gamma^T, where E is the corner.
     p = field.gamma.shape[1]
-    one = jnp.eye(p, dtype=field.gamma.dtype)
-    return SpanSkew.of(field.gamma, one, Span((Corner(p),), one))
+    eye = jnp.eye(p, dtype=field.gamma.dtype)
+    return SpanSkew.of(field.gamma, eye, Span((Corner(p),), eye))
 
 
 def _on_one_span(fields: Sequence[Any]) -> list[SpanSkew]:
@@ -377,14 +377,13 @@ def _check_factor(name: str, factor: Array) -> None:
         raise ValueError(
             f"{name} must have shape (n, p) or (*batch, n, p) with n >= p >= 1, got {factor.shape}."
         )
-    if factor.dtype not in (jnp.float32, jnp.float64):
-        raise TypeError(f"{name} must be float32 or float64, got {factor.dtype}.")
+    check_real(name, factor)
 
 
 def check_like(field: AbstractFrozenField, name: str, num_axes: int, point: Array) -> None:
-    """Raises `ValueError` unless the point is of the shape and dtype of an array of the field.
+    """Raises `ValueError` unless the point has the shape and dtype of an array of the field.
 
-    `num_axes` is how many axes both have without leading ones.
+    `num_axes` is how many axes both have besides the leading ones.
     """
     factor = getattr(field, name)
     check_point(field, name, factor.ndim - num_axes, [factor.shape[-num_axes:]], point)

@@ -18,7 +18,7 @@ from .elementwise import check_other, check_point, each
 
 
 class AbstractMatrix(AbstractAlgebraElement):
-    """An element of a matrix Lie algebra. A subclass is one of its actions on points."""
+    """An element of a matrix Lie algebra. A subclass defines an action on points."""
 
     a: Inexact[Array, "*#batch n n"] = eqx.field(converter=jnp.asarray)
 
@@ -58,9 +58,9 @@ def check_companion(
 
 
 class AbstractOneSided(AbstractMatrix):
-    """One that multiplies points from one side."""
+    """An element of a matrix Lie algebra that multiplies points from one side."""
 
-    # Which axis of a matrix it multiplies.
+    # The axis of a matrix that it multiplies.
     axis: ClassVar[int]
 
     @staticmethod
@@ -144,15 +144,15 @@ def exp_times(
     bound: Real[Array, ""] | None = None,
     is_skew: bool | None = None,
 ) -> Array:
-    """Where the flow of one matrix leads one point.
+    """The flow of one point along one matrix.
 
-    `bound` bounds the 2-norm of `a`, and `is_skew` whether it is skew-Hermitian. That is
-    looked at unless it is said.
+    `bound` is a bound on the 2-norm of `a`. `is_skew` says whether `a` is skew-Hermitian; if it is
+    None, the program tests it.
     """
     if _is_thin(a, point):
         return point + exp_minus_one_times(cls, a, point, bound, is_skew)
-    weight, moved = _dense(cls, a, point)
-    return weight * point + moved
+    weight, shift = _dense(cls, a, point)
+    return weight * point + shift
 
 
 def exp_minus_one_times(
@@ -162,11 +162,11 @@ def exp_minus_one_times(
     bound: Real[Array, ""] | None = None,
     is_skew: bool | None = None,
 ) -> Array:
-    """What the flow adds to the point."""
+    """`exp_times` less the point."""
 
     def dense() -> Array:
-        weight, moved = _dense(cls, a, point)
-        return (weight - 1) * point + moved
+        weight, shift = _dense(cls, a, point)
+        return (weight - 1) * point + shift
 
     if not _is_thin(a, point):
         return dense()
@@ -175,22 +175,23 @@ def exp_minus_one_times(
     else:
         columns = by_columns(a.T)
         product = lambda x: columns(x.T).T  # noqa: E731
-    given = lax.stop_gradient(a)
-    norm = max_over_batch(row_norm(given))
-    skew = _is_skew(given, norm) if is_skew is None else is_skew
+    constant = lax.stop_gradient(a)
+    norm = max_over_batch(row_norm(constant))
+    skew = _is_skew(constant, norm) if is_skew is None else is_skew
     if bound is not None:
         norm = jnp.minimum(norm, bound)
     # The dense exponential takes as long as so many products or more, as measured.
-    most = (3 if jnp.iscomplexobj(a) else 2) * a.shape[0]
-    return expm_minus_one_multiply(product, point, norm, is_skew=skew, dense=Dense(most, dense))
+    max_products = (3 if jnp.iscomplexobj(a) else 2) * a.shape[0]
+    dense_flow = Dense(max_products, dense)
+    return expm_minus_one_multiply(product, point, norm, is_skew=skew, dense=dense_flow)
 
 
 def _dense(cls: type[AbstractOneSided], a: Array, point: Array) -> tuple[Array, Array]:
-    """`w, z` with `w x + z` the point that x moves to."""
-    weight, rest = expm_parts(a)
+    """`w, z` such that the flow of the point x is `w x + z`."""
+    weight, remainder = expm_parts(a)
     weight = weight.astype(point.dtype)
-    # With a itself the product is exact but for the rounding of its sums, which is random.
-    return weight, weight * cls.act(a, point) + cls.act(rest, point)
+    # The product with a itself is exact but for the rounding of its sums, which is random.
+    return weight, weight * cls.act(a, point) + cls.act(remainder, point)
 
 
 def _is_thin(a: Array, point: Array) -> bool:
@@ -199,12 +200,12 @@ def _is_thin(a: Array, point: Array) -> bool:
 
 
 def _is_skew(a: Array, norm: Array) -> Bool[Array, ""]:
-    """Whether a matrix is skew-Hermitian to rounding, with all in a batch, where it matters."""
+    """Whether all matrices of a batch are skew-Hermitian to rounding, if their norm exceeds 1."""
 
     def is_skew() -> Array:
         # So small a Hermitian part changes a Chebyshev series by rounding.
-        off = row_norm(a + a.conj().T)
-        return max_over_batch(off) <= 8 * jnp.finfo(norm.dtype).eps * norm
+        defect = row_norm(a + a.conj().T)
+        return max_over_batch(defect) <= 8 * jnp.finfo(norm.dtype).eps * norm
 
-    # Shorter ones need as many products either way.
+    # Below it a Taylor series takes as few products.
     return lax.cond(norm > 1, is_skew, lambda: jnp.zeros((), bool))

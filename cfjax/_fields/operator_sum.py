@@ -16,7 +16,7 @@ from jaxtyping import Array, Inexact, Real
 
 from .._arrays import Weight, describe, struct
 from .._field import AbstractFrozenField, combine
-from .._numerics.checks import differ, needing
+from .._numerics.checks import differ, error_where
 from .._numerics.expm_multiply import expm_minus_one_multiply, row_norm
 from .._numerics.matmul import by_columns, promoted
 from .._numerics.operators import (
@@ -104,10 +104,9 @@ class OperatorSum(AbstractFrozenField):
             raise TypeError(f"is_skew must be True or False, got {is_skew!r}.")
         self.is_skew = is_skew
         pairs = [_with_norm(k, operator) for k, operator in enumerate(operators)]
-        # A lineax operator may hold a function, which is no leaf of a field.
-        self.arrays, self.structure = eqx.partition(
-            tuple(operator for operator, _ in pairs), _is_array
-        )
+        # A lineax operator may hold a function, which cannot be a leaf of a field.
+        is_array = lambda x: isinstance(x, jax.Array | np.ndarray)  # noqa: E731
+        self.arrays, self.structure = eqx.partition(tuple(a for a, _ in pairs), is_array)
         precision = _precision(self.operators)
         sizes = {shape_of(a)[0]: k for k, a in reversed([*enumerate(self.operators)])}
         if len(sizes) > 1:
@@ -124,17 +123,18 @@ class OperatorSum(AbstractFrozenField):
         return eqx.combine(self.arrays, self.structure)
 
     def flow(self, point: Inexact[Array, "n *k"]) -> Inexact[Array, "n *k"]:
-        return self._moved(point, exp_times, lambda change: point + change)
+        return self._apply(point, exp_times, lambda increment: point + increment)
 
     def increment(self, point: Inexact[Array, "n *k"]) -> Inexact[Array, "n *k"]:
-        return self._moved(point, exp_minus_one_times, lambda change: change)
+        return self._apply(point, exp_minus_one_times, lambda increment: increment)
 
-    def _moved(
-        self, point: Array, of_matrix: Callable[..., Array], of_added: Callable[[Array], Array]
+    def _apply(
+        self, point: Array, of_matrix: Callable[..., Array], of_increment: Callable[[Array], Array]
     ) -> Array:
+        """A function of the exponential, by that of one matrix or from the increment."""
         self._check(point)
-        matrix, diagonal, others, bound = self._summed()
-        if matrix is not None and not others:
+        matrix, diagonal, matrix_free, bound = self._summed()
+        if matrix is not None and not matrix_free:
             a = matrix if diagonal is None else jnp.add(*promoted(matrix, jnp.diag(diagonal)))
             return of_matrix(LeftMatrix, a, point, bound, self.is_skew or None)
         products = [] if matrix is None else [by_columns(matrix)]
@@ -142,9 +142,9 @@ class OperatorSum(AbstractFrozenField):
 
         def product(x: Array) -> Array:
             terms = [times(x) for times in products]
-            return added(terms + [scaled(c, applied(a, x)) for c, a in others])
+            return added(terms + [scaled(c, applied(a, x)) for c, a in matrix_free])
 
-        return of_added(expm_minus_one_multiply(product, point, bound, is_skew=self.is_skew))
+        return of_increment(expm_minus_one_multiply(product, point, bound, is_skew=self.is_skew))
 
     def tangent(self, point: Inexact[Array, "n *k"]) -> Inexact[Array, "n *k"]:
         self._check(point)
@@ -156,23 +156,24 @@ class OperatorSum(AbstractFrozenField):
 
     @classmethod
     def combine(cls, weights: Sequence[Weight], fields: Sequence[Any]) -> "OperatorSum":
-        coefficients = combine(weights, _of_the_same_operators(fields))
+        checked = [_checked_coefficients(field, fields[0]) for field in fields]
+        coefficients = combine(weights, checked)
         return eqx.tree_at(lambda field: field.coefficients, fields[0], coefficients)
 
     def _summed(self) -> tuple[Any, Any, list[tuple[Array, Any]], Real[Array, ""]]:
-        """The sums of all matrices and of all diagonals, what else there is with its coefficients,
-        and a bound on the norm of everything.
+        """The sums of all matrices and of all diagonals, the other operators with their
+        coefficients, and a bound on the norm of the whole sum.
         """
         arrays: dict[int, list[tuple[Array, Any]]] = {1: [], 2: []}
-        others, bounds = [], []
+        matrix_free, bounds = [], []
         for c, a, norm in zip(self.coefficients, self.operators, self.norms, strict=True):
-            size = None if norm is None else jnp.abs(lax.stop_gradient(c)) * norm
+            bound = None if norm is None else jnp.abs(lax.stop_gradient(c)) * norm
             entries = entries_of(a)
             if entries is None:
-                others.append((c, a))
-                bounds.append(size)
+                matrix_free.append((c, a))
+                bounds.append(bound)
             else:
-                arrays[entries.ndim].append((scaled(c, jnp.asarray(entries)), size))
+                arrays[entries.ndim].append((scaled(c, jnp.asarray(entries)), bound))
         diagonal, matrix = (
             added(a for a, _ in pairs) if pairs else None for pairs in arrays.values()
         )
@@ -181,9 +182,9 @@ class OperatorSum(AbstractFrozenField):
             # The norm of the sum of arrays may be far below the sum of the norms, and that of the
             # rows may be far above the 2-norm.
             of_sum = added(_row_norm(a) for a in (diagonal, matrix) if a is not None)
-            of_each = added(_row_norm(a) if size is None else size for a, size in terms)
+            of_each = added(_row_norm(a) if bound is None else bound for a, bound in terms)
             bounds.append(jnp.minimum(of_sum, of_each))
-        return matrix, diagonal, others, added(bounds)
+        return matrix, diagonal, matrix_free, added(bounds)
 
     def _check(self, point: Array) -> None:
         n = shape_of(self.operators[0])[0]
@@ -192,10 +193,6 @@ class OperatorSum(AbstractFrozenField):
                 f"OperatorSum with operators of size {n} acts on shapes ({n},) and ({n}, k), got "
                 f"{point.shape}."
             )
-
-
-def _is_array(x: Any) -> bool:
-    return isinstance(x, jax.Array | np.ndarray)
 
 
 def _with_norm(k: int, operator: Any) -> tuple[Any, Any]:
@@ -215,12 +212,12 @@ def _with_norm(k: int, operator: Any) -> tuple[Any, Any]:
 
 
 def _precision(operators: Sequence[Any]) -> Any:
-    """That of the operators."""
+    """The precision of the operators."""
     first: dict[Any, int] = {}
     for k, operator in enumerate(operators):
         if isinstance(operator, lx.AbstractLinearOperator):
-            parts = jtu.tree_leaves((operator.in_structure(), operator.out_structure()))
-            if any(part.ndim != 1 for part in parts) or len(parts) != 2:
+            structs = jtu.tree_leaves((operator.in_structure(), operator.out_structure()))
+            if any(x.ndim != 1 for x in structs) or len(structs) != 2:
                 raise ValueError(
                     f"operators[{k}] must act on vectors, shape (n,), got the structure "
                     f"{describe(operator.in_structure())}."
@@ -247,11 +244,11 @@ def _coefficients(coefficients: Any, number: int, precision: Any) -> Array:
                 "coefficients must be an array of shape (K,) or a sequence of scalars, got shapes "
                 f"{[np.shape(c) for c in scalars]}."
             )
-        # Python's numbers take the precision of the others.
+        # Python's numbers take the precision of the operators.
         dtypes = [c.dtype for c in coefficients if hasattr(c, "dtype")]
-        own = {jnp.finfo(x).dtype: x for x in dtypes if jnp.issubdtype(x, jnp.inexact)}
-        for wrong in own.keys() - {precision}:
-            raise TypeError(f"coefficients must have the precision {precision}, got {own[wrong]}.")
+        for dtype in dtypes:
+            if jnp.issubdtype(dtype, jnp.inexact) and jnp.finfo(dtype).dtype != precision:
+                raise TypeError(f"coefficients must have the precision {precision}, got {dtype}.")
         is_complex = any(map(jnp.iscomplexobj, scalars))
         dtype = np.result_type(precision, np.complex64) if is_complex else precision
         coefficients = [jnp.asarray(c).astype(dtype) for c in scalars]
@@ -278,21 +275,21 @@ def _norm(k: int, operator: Any, norm: Any, precision: Any) -> Any:
                 f"{type(operator).__name__} needs a bound on its norm: give the pair "
                 f"(operator, norm) for operators[{k}]."
             )
-        norm = two_norm(entries)
-        return None if norm is None else np.asarray(norm, precision)
+        computed = two_norm(entries)
+        return None if computed is None else np.asarray(computed, precision)
     is_number = isinstance(norm, int | float | np.generic | np.ndarray | jax.Array)
     if not is_number or jnp.shape(norm) or jnp.iscomplexobj(norm):
         raise TypeError(f"The norm of operators[{k}] must be a real number, got {describe(norm)}.")
     if isinstance(norm, Tracer):
         return lax.stop_gradient(norm).astype(precision)
-    # In NumPy, so that it is known within a program, too.
+    # In NumPy, so that its value is known in a trace.
     if not 0 <= float(norm) < np.inf:
         raise ValueError(f"The norm of operators[{k}] must be finite and >= 0, got {norm}.")
     return np.asarray(norm, precision)
 
 
 def _check_skew(k: int, operator: Any) -> None:
-    """For arrays that are known when the program is traced."""
+    """Raises `ValueError` for an array whose values are known in a trace and not skew-Hermitian."""
     a = entries_of(operator)
     if a is None or isinstance(a, Tracer):
         return
@@ -311,32 +308,26 @@ def _row_norm(a: Array) -> Array:
     return row_norm(lax.stop_gradient(a))
 
 
-def _of_the_same_operators(fields: Sequence[OperatorSum]) -> list[Array]:
-    """The coefficients of each field, with an error in those with other operators."""
-    first, *others = fields
-    checked = [first.coefficients]
-    for other in others:
-        leaves = [jtu.tree_leaves(field.arrays) for field in (first, other)]
-        kinds = [
-            (field.structure, jtu.tree_structure(field.arrays), struct(each), field.is_skew)
-            for field, each in zip((first, other), leaves, strict=True)
-        ]
-        if kinds[0] != kinds[1]:
-            raise ValueError(
-                "OperatorSum fields that are added must have the same operators and is_skew, got "
-                f"{describe(first.operators)} and {describe(other.operators)}. Lineax operators of "
-                "functions are the same if they are made once, outside of the field."
-            )
-        c = other.coefficients
-        # Most fields close over the same arrays, and need no check of their values.
-        different = [differ(a, b) for a, b in zip(*leaves, strict=True) if a is not b]
-        if different:
-            zero = eqx.error_if(
-                jnp.zeros(()),
-                jnp.any(jnp.stack(different)),
-                "OperatorSum fields that are added must have the same operators: these may not "
-                "depend on time or state.",
-            )
-            c = needing(zero, c)
-        checked.append(c)
-    return checked
+def _checked_coefficients(field: OperatorSum, first: OperatorSum) -> Array:
+    """The coefficients of a field, with an error if its operators are not those of the first."""
+    leaves = [jtu.tree_leaves(f.arrays) for f in (first, field)]
+    kinds = [
+        (f.structure, jtu.tree_structure(f.arrays), struct(arrays), f.is_skew)
+        for f, arrays in zip((first, field), leaves, strict=True)
+    ]
+    if kinds[0] != kinds[1]:
+        raise ValueError(
+            "OperatorSum fields that are added must have the same operators and is_skew, got "
+            f"{describe(first.operators)} and {describe(field.operators)}. Lineax operators of "
+            "functions are the same if they are made once, outside of the field."
+        )
+    # Most fields close over the same arrays, and need no check of their values.
+    different = [differ(a, b) for a, b in zip(*leaves, strict=True) if a is not b]
+    if not different:
+        return field.coefficients
+    return error_where(
+        field.coefficients,
+        jnp.any(jnp.stack(different)),
+        "OperatorSum fields that are added must have the same operators: these may not "
+        "depend on time or state.",
+    )

@@ -13,6 +13,7 @@ from .._field import AbstractAlgebraElement
 from .._numerics.quaternion import Frame, Layout, check_choice, increment, times
 from .._numerics.rotate import cross_product, dexpinv, has_dexpinv
 from .elementwise import check_point, each
+from .rotation import check_angular_velocity
 
 
 class QuaternionRotation(AbstractAlgebraElement):
@@ -53,10 +54,7 @@ class QuaternionRotation(AbstractAlgebraElement):
     def __check_init__(self):
         check_choice("frame", self.frame)
         check_choice("layout", self.layout)
-        if self.omega.ndim < 1 or self.omega.shape[-1] != 3:
-            raise ValueError(f"omega must have shape (3,) or (*batch, 3), got {self.omega.shape}.")
-        if self.omega.dtype not in (jnp.float32, jnp.float64):
-            raise TypeError(f"omega must be float32 or float64, got {self.omega.dtype}.")
+        check_angular_velocity(self.omega)
 
     def flow(self, point: Float[Array, "*batch 4"]) -> Float[Array, "*batch 4"]:
         return point + self._each(partial(increment, leads_back=False), point)
@@ -78,20 +76,19 @@ class QuaternionRotation(AbstractAlgebraElement):
         return has_dexpinv(self.omega)
 
     def _with(self, fun: Any, other: Any) -> "QuaternionRotation":
-        kinds = jtu.tree_structure(self), jtu.tree_structure(other)
-        if kinds[0] != kinds[1]:
+        if jtu.tree_structure(self) != jtu.tree_structure(other):
             raise TypeError(
                 "QuaternionRotation has a bracket with another QuaternionRotation of the same "
                 f"frame and layout only, got {describe(self)} and {describe(other)}."
             )
-        # Flows from the right compose the other way round, as if all turned backwards.
+        # Flows from the right compose in the reverse order, as those of -omega from the left.
         sign = 1 if self.frame == "fixed" else -1
         omega = each(fun, self._num_axes)(sign * self.omega, other.omega)
         return QuaternionRotation(omega, frame=self.frame, layout=self.layout)
 
     def defect(self, point: Float[Array, "*batch 4"]) -> tuple[Float[Array, ""], str]:
-        off = jnp.abs(jnp.sum(point * point, axis=-1) - 1)
-        return jnp.max(off, initial=0), "length 1 (in y0 @ y0)"
+        defect = jnp.abs(jnp.sum(point * point, axis=-1) - 1)
+        return jnp.max(defect, initial=0), "length 1 (in y0 @ y0)"
 
     @property
     def _num_axes(self) -> int:
@@ -101,5 +98,5 @@ class QuaternionRotation(AbstractAlgebraElement):
         check_point(self, "omega", self._num_axes, [(4,)], point)
         if jnp.iscomplexobj(point):
             raise TypeError(f"QuaternionRotation acts on real arrays, got {point.dtype}.")
-        moved = partial(fun, frame=self.frame, layout=self.layout)
-        return each(moved, self._num_axes)(self.omega, point)
+        fun = partial(fun, frame=self.frame, layout=self.layout)
+        return each(fun, self._num_axes)(self.omega, point)

@@ -11,15 +11,15 @@ from jaxtyping import Array, Bool, Float, Real
 from .._field import AbstractAlgebraElement
 from .._numerics import planar_motion, rigid_motion
 from .._numerics.matmul import matmul
-from .elementwise import check_other, check_point, each
+from .._numerics.quaternion import Frame
+from .elementwise import check_other, check_point, check_real, each
 
-Frame = Literal["body", "fixed"]
 Layout = Literal["wxyz_xyz", "xyz_xyzw", "xyzw_xyz", "xyz_wxyz"]
 PlanarLayout = Literal["unit_complex_xy", "xy_unit_complex"]
 
 
 class AbstractMotion(AbstractAlgebraElement):
-    """What motions of space and of the plane share."""
+    """A motion of space or of the plane."""
 
     omega: eqx.AbstractVar[Array]
     v: eqx.AbstractVar[Array]
@@ -30,7 +30,7 @@ class AbstractMotion(AbstractAlgebraElement):
     # A pose in one vector is a unit number of so many entries, and a position.
     number: ClassVar[str]
     number_size: ClassVar[int]
-    # Where a pose in one vector has the entries of the number, then those of the position.
+    # The indices of the entries of the number, then of the position, in a pose in one vector.
     layouts: ClassVar[dict[str, tuple[int, ...]]]
     conventions: ClassVar[str]
     # The module with its tangent, increment, bracket, dexpinv and has_dexpinv.
@@ -47,8 +47,7 @@ class AbstractMotion(AbstractAlgebraElement):
                 f"{self.omega.shape}."
             )
         for name, x in (("omega", self.omega), ("v", self.v)):
-            if x.dtype not in (jnp.float32, jnp.float64):
-                raise TypeError(f"{name} must be float32 or float64, got {x.dtype}.")
+            check_real(name, x)
         if self.omega.dtype != self.v.dtype:
             raise TypeError(
                 f"omega and v must have one dtype, got {self.omega.dtype} and {self.v.dtype}."
@@ -85,10 +84,11 @@ class AbstractMotion(AbstractAlgebraElement):
                 f"only, got frame={self.frame!r}, layout={self.layout!r} and "
                 f"frame={other.frame!r}, layout={other.layout!r}."
             )
-        # In the frame of the body flows compose the other way round, as if all moved backwards.
+        # In the frame of the body flows compose in the reverse order, as those of minus the motions
+        # in the fixed frame.
         sign = 1 if self.frame == "fixed" else -1
-        mapped = each(fun, self._num_axes)
-        omega, v = mapped(sign * self.omega, sign * self.v, other.omega, other.v)
+        fun = each(fun, self._num_axes)
+        omega, v = fun(sign * self.omega, sign * self.v, other.omega, other.v)
         return type(self)(omega=omega, v=v, frame=self.frame, layout=self.layout)
 
     def defect(self, point: Float[Array, "..."]) -> tuple[Real[Array, ""], str] | None:
@@ -98,16 +98,16 @@ class AbstractMotion(AbstractAlgebraElement):
         if len(core) == 2:
             row = (0,) * n + (1,)
             expected = f"a rotation, of determinant 1, before its last column and row {row}"
-            off = each(_defect, self._num_axes)(point)
+            defect = each(_defect, self._num_axes)(point)
         else:
-            places = self._places[: self.number_size]
-            end = "first" if 0 in places else "last"
-            expected = f"{self.number} in its {end} {len(places)} entries"
-            off = jnp.abs(sum(point[..., k] ** 2 for k in places) - 1)
-        return jnp.max(off, initial=0), expected
+            indices = self._indices[: self.number_size]
+            end = "first" if 0 in indices else "last"
+            expected = f"{self.number} in its {end} {len(indices)} entries"
+            defect = jnp.abs(sum(point[..., k] ** 2 for k in indices) - 1)
+        return jnp.max(defect, initial=0), expected
 
     @property
-    def _places(self) -> tuple[int, ...]:
+    def _indices(self) -> tuple[int, ...]:
         if self.layout is None:
             raise TypeError(
                 f"{type(self).__name__} needs a layout for poses of shape "
@@ -135,8 +135,8 @@ class AbstractMotion(AbstractAlgebraElement):
                 f"{point.dtype}."
             )
         is_vector = point.shape[axes:] == poses[1]
-        places = self._places if is_vector else ()
-        return each(partial(fun, frame=self.frame, places=places), axes)(self.omega, self.v, point)
+        fun = partial(fun, frame=self.frame, indices=self._indices if is_vector else ())
+        return each(fun, axes)(self.omega, self.v, point)
 
 
 class RigidMotion(AbstractMotion):
@@ -246,6 +246,6 @@ class PlanarMotion(AbstractMotion):
 def _defect(matrix: Float[Array, "n n"]) -> Float[Array, ""]:
     rotation, last = matrix[:-1, :-1], matrix[-1]
     eye = jnp.eye(len(matrix), dtype=matrix.dtype)
-    skewness = matmul(rotation.T, rotation) - eye[:-1, :-1]
-    parts = (skewness, jnp.linalg.det(rotation) - 1, last - eye[-1])
-    return jnp.max(jnp.asarray([jnp.max(jnp.abs(part)) for part in parts]))
+    gram = matmul(rotation.T, rotation)
+    defects = (gram - eye[:-1, :-1], jnp.linalg.det(rotation) - 1, last - eye[-1])
+    return jnp.max(jnp.asarray([jnp.max(jnp.abs(x)) for x in defects]))

@@ -8,7 +8,7 @@ from jaxtyping import Array, Bool, Float
 
 from .._field import AbstractAlgebraElement
 from .._numerics.rotate import cross_product, dexpinv, has_dexpinv, increment, mean, rotate
-from .elementwise import check_other, check_point, each
+from .elementwise import check_other, check_point, check_real, each
 
 
 class Rotation(AbstractAlgebraElement):
@@ -26,7 +26,7 @@ class Rotation(AbstractAlgebraElement):
     The flow is Rodrigues' formula, about 100 flops, exact to rounding for every angle, and so are
     its derivatives of every order, also at `omega = 0`. An angle beyond 2^45 (2^16 in float32),
     where rounding leaves no two digits of the direction, gives NaN. A vector may have any length,
-    so nothing leads a length back: in a solve of equal flows of one angle it drifts by up to some
+    so its length is not corrected: in a solve of equal flows of one angle it drifts by up to some
     units of rounding a flow above a radian, and by the square of the angle less below.
 
     **Arguments:** `omega`, shape `(*batch, 3)`, float32 or float64, in radians per unit of time.
@@ -37,10 +37,7 @@ class Rotation(AbstractAlgebraElement):
     omega: Float[Array, "*batch 3"] = eqx.field(converter=jnp.asarray)
 
     def __check_init__(self):
-        if self.omega.ndim < 1 or self.omega.shape[-1] != 3:
-            raise ValueError(f"omega must have shape (3,) or (*batch, 3), got {self.omega.shape}.")
-        if self.omega.dtype not in (jnp.float32, jnp.float64):
-            raise TypeError(f"omega must be float32 or float64, got {self.omega.dtype}.")
+        check_angular_velocity(self.omega)
 
     def flow(self, point: Float[Array, "..."]) -> Float[Array, "..."]:
         self._check_point(point)
@@ -80,3 +77,9 @@ class Rotation(AbstractAlgebraElement):
         check_point(self, "omega", self._num_axes, [(3,), (3, "k")], point)
         if jnp.iscomplexobj(point):
             raise TypeError(f"Rotation acts on real arrays, got {point.dtype}.")
+
+
+def check_angular_velocity(omega: Array) -> None:
+    if omega.ndim < 1 or omega.shape[-1] != 3:
+        raise ValueError(f"omega must have shape (3,) or (*batch, 3), got {omega.shape}.")
+    check_real("omega", omega)

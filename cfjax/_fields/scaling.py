@@ -61,13 +61,13 @@ class Scaling(AbstractAlgebraElement):
     def _times(self, factor: Array, point: Array) -> Array:
         """The product with a factor that has the shape of the rate."""
         rate = self.rate
-        shape = (1,) * (point.ndim - rate.ndim) + rate.shape
+        ones = (1,) * (point.ndim - rate.ndim)
+        shape = ones + rate.shape
         if len(shape) != point.ndim or any(
             n not in (1, m) for n, m in zip(shape, point.shape, strict=True)
         ):
             hint = ""
             if rate.shape == point.shape[: rate.ndim]:
-                ones = (1,) * (point.ndim - rate.ndim)
                 hint = f" For rates along the first axes give rate the shape {rate.shape + ones}."
             raise ValueError(
                 f"Scaling with rate of shape {rate.shape} acts on the shapes that rate broadcasts "

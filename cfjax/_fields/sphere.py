@@ -10,7 +10,7 @@ from jaxtyping import Array, Float
 
 from .._field import AbstractFrozenField
 from .._numerics.vectors import smooth
-from .elementwise import elementwise
+from .elementwise import check_real, elementwise
 from .low_rank import SpanSkew, check_like
 from .rotation import Rotation
 
@@ -47,18 +47,17 @@ class SphereRotation(AbstractFrozenField):
             raise ValueError(
                 f"g must have shape (n,) or (*batch, n) with n >= 1, got {self.g.shape}."
             )
-        if self.g.dtype not in (jnp.float32, jnp.float64):
-            raise TypeError(f"g must be float32 or float64, got {self.g.dtype}.")
+        check_real("g", self.g)
 
     def flow(self, point: Float[Array, "*batch n"]) -> Float[Array, "*batch n"]:
-        """The point that `point`, taken as the one where the field is frozen, reaches."""
+        """The flow of `point`, which is taken as the point where the field is frozen."""
         field, start = self.to_chart(point, ())
         return field.from_chart(field.flow(start))
 
     def tangent(self, point: Float[Array, "*batch n"]) -> Float[Array, "*batch n"]:
         check_like(self, "g", 1, point)
-        square, along = (jnp.sum(x * point, axis=-1, keepdims=True) for x in (point, self.g))
-        return self.g * square - point * along
+        square, normal = (jnp.sum(x * point, axis=-1, keepdims=True) for x in (point, self.g))
+        return self.g * square - point * normal
 
     def defect(self, point: Float[Array, "*batch n"]) -> tuple[Array, str]:
         length = jnp.sqrt(jnp.sum(point * point, axis=-1))
@@ -73,23 +72,23 @@ class SphereRotation(AbstractFrozenField):
         if self.g.ndim > 1:
             return elementwise(self, self.g.ndim - 1).to_chart(point, earlier)
         y = earlier[0].from_chart(point) if earlier else point
-        # What is along y moves nothing, but large coordinates would round. Nothing depends on the
-        # factor, so it needs no derivative.
+        # The part along y has no effect, but a large one would round. The flow does not depend on
+        # how much is subtracted, so the factor needs no derivative.
         g = self.g - lax.stop_gradient(jnp.sum(y * self.g)) * y
-        return _SpanRotation.entered(g[:, None], point if earlier else point[:, None], earlier)
+        return _SpanRotation.in_chart(g[:, None], point if earlier else point[:, None], earlier)
 
 
 @smooth
 def _corrected(y: Float[Array, "*batch n"]) -> Float[Array, "*batch n"]:
     """`y (3 - y @ y) / 2`, the first step of Newton's method for length 1."""
     defect = 1 - jnp.sum(y * y, axis=-1, keepdims=True)
-    # Far from the sphere there is no nearest point that the caller can have meant.
-    near = jnp.abs(lax.stop_gradient(defect)) < 0.1
-    return y + y * jnp.where(near, defect / 2, jnp.nan)
+    # A point far from the sphere is a mistake of the caller.
+    is_near = jnp.abs(lax.stop_gradient(defect)) < 0.1
+    return y + y * jnp.where(is_near, defect / 2, jnp.nan)
 
 
 class _SpanRotation(SpanSkew):
-    """A skew field on the span of columns, for one column whose axis of length 1 is left out."""
+    """A skew field on the span of columns, which acts on one column without its axis of 1."""
 
     def tangent(self, point: Float[Array, " n"]) -> Float[Array, " n"]:
         return super().tangent(point[:, None])[:, 0]

@@ -72,9 +72,9 @@ def needing(zero: Real[Array, ""], tree: PyTree) -> PyTree:
     return jtu.tree_map(lambda x: jnp.where(zero == 0, x, zero.astype(x.dtype)), tree)
 
 
-def error_where(wrong: Bool[Array, ""], x: Array, message: str) -> Array:
-    """The array, or an error with this message if `wrong` is true, which may be any value."""
-    return needing(eqx.error_if(jnp.zeros(()), wrong, message), x)
+def error_where(x: Array, is_wrong: Bool[Array, ""], message: str) -> Array:
+    """The array x, or an error with this message if `is_wrong`, which need not depend on x."""
+    return needing(eqx.error_if(jnp.zeros(()), is_wrong, message), x)
 
 
 def differ(a: Array | np.ndarray, b: Array | np.ndarray) -> Bool[Array, ""]:
