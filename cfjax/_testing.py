@@ -1,4 +1,4 @@
-"""Whether frozen fields, and terms of a sum, are what the methods assume, by numbers."""
+"""Numerical checks of what the methods assume of frozen fields and of terms of a sum."""
 
 from collections.abc import Sequence
 from operator import itemgetter
@@ -26,9 +26,9 @@ from ._field import (
 from ._numerics.checks import Fault
 from ._term import checked_part, product
 
-# What is compared: the text of the promise, what was found, what is expected, and a size whose
-# rounding the difference may have.
-_Facts = list[tuple[str, PyTree, PyTree, Any]]
+# For each comparison the requirement, the actual value, the expected one, and the scale to which
+# the tolerance is relative.
+_Comparisons = list[tuple[str, PyTree, PyTree, Any]]
 
 
 def check_field(fields: Sequence[AbstractFrozenField], point: PyTree) -> None:
@@ -72,19 +72,19 @@ def check_field(fields: Sequence[AbstractFrozenField], point: PyTree) -> None:
         checked_part("point", field, point)
         eqx.filter_eval_shape(flow, field, point)
 
-    entered, start = [], point
+    charted, start = [], point
     for field in fields:
-        field, start = field.to_chart(start, entered)
-        entered.append(field)
-    unit = float(np.sqrt(max(jnp.finfo(leaf.dtype).eps for leaf in jtu.tree_leaves(point))))
+        field, start = field.to_chart(start, charted)
+        charted.append(field)
+    rtol = float(np.sqrt(max(jnp.finfo(leaf.dtype).eps for leaf in jtu.tree_leaves(point))))
 
-    _compare(name, _of_start(fields[0], entered[0], start, point), unit)
-    _compare(name, _of_many_flows(fields[0], point), unit)
-    for given, field in zip(fields, entered, strict=True):
-        _compare(name, _of_flow(given, field, entered[0], start, point), unit)
-    _compare(name, _of_sum(fields, entered, start), unit)
-    if all(isinstance(field, AbstractAlgebraElement) for field in entered):
-        _compare(name, _of_bracket(entered, start), unit)
+    _compare(name, _of_chart(fields[0], charted[0], start, point), rtol)
+    _compare(name, _of_drift(fields[0], point), rtol)
+    for field, in_chart in zip(fields, charted, strict=True):
+        _compare(name, _of_flow(field, in_chart, charted[0], start, point), rtol)
+    _compare(name, _of_combine(fields, charted, start), rtol)
+    if all(isinstance(field, AbstractAlgebraElement) for field in charted):
+        _compare(name, _of_bracket(charted, start), rtol)
 
 
 def check_terms(term: diffrax.AbstractTerm, t: Any, y: PyTree, args: PyTree = None) -> None:
@@ -116,19 +116,21 @@ def check_terms(term: diffrax.AbstractTerm, t: Any, y: PyTree, args: PyTree = No
         if is_driven(part):
             _check_increments(f"terms[{k}]", part, t, y, args)
             continue
-        whole = _carried(part, t, y, args, 1.0)
-        halves = _carried(part, t, _carried(part, t, y, args, 0.5), args, 0.5)
+        end = _flow_of_term(part, t, y, args, 1.0)
+        middle = _flow_of_term(part, t, y, args, 0.5)
+        by_halves = _flow_of_term(part, t, middle, args, 0.5)
         for (path, start), *ends in zip(
-            jtu.tree_leaves_with_path(y), *map(jtu.tree_leaves, (whole, halves)), strict=True
+            jtu.tree_leaves_with_path(y), *map(jtu.tree_leaves, (end, by_halves)), strict=True
         ):
-            way, off = (float(_size(ends[0] - x)) for x in (start, ends[1]))
+            distance, error = (float(_scale(ends[0] - x)) for x in (start, ends[1]))
             eps = float(jnp.finfo(start.dtype).eps)
-            # What a flow of some roundings leaves of an array that it hardly moves.
-            if not off <= np.sqrt(eps) * way + 16 * eps * float(_size(start)):
+            # The second term allows for the rounding of an array that hardly moves.
+            if not error <= np.sqrt(eps) * distance + 16 * eps * float(_scale(start)):
                 raise ValueError(
                     f"The field of terms[{k}] must not change along its own flow, and its flow in "
-                    f"one unit of time is off by {off:.1g}, where it moves y{jtu.keystr(path)} by "
-                    f"{way:.1g}. Split it into terms that do not change what they depend on."
+                    f"one unit of time is off by {error:.1g}, where it moves y{jtu.keystr(path)} "
+                    f"by {distance:.1g}. Split it into terms that do not change what they depend "
+                    "on."
                 )
 
 
@@ -143,8 +145,8 @@ def _check_increments(name: str, term: Any, t: Any, y: PyTree, args: PyTree) -> 
         raise ValueError(f"{name}: {message}")
 
 
-def _carried(term: Any, t: Any, y: PyTree, args: PyTree, time: float) -> PyTree:
-    """Where the frozen field at `y` carries it in some time."""
+def _flow_of_term(term: Any, t: Any, y: PyTree, args: PyTree, time: float) -> PyTree:
+    """The flow from `y` of the field that is frozen there."""
     control = jtu.tree_map(lambda x: time * x, term.contr(t, t + 1.0))
     field, point = to_chart(product(term, term.vf(t, y, args), control), y, ())
     return from_chart(field, flow(field, point))
@@ -173,174 +175,176 @@ def _check_arguments(fields: Any, point: PyTree) -> None:
 
 
 @eqx.filter_jit
-def _of_start(given: Any, field: Any, start: Any, point: PyTree) -> _Facts:
-    here, end = field.from_chart(start), given.flow(point)
-    entered = field.from_chart(field.flow(start))
-    size = _size((point, end))
-    facts: _Facts = [
-        ("to_chart and from_chart must lead back to the point", here, point, size),
-        ("flow must be the same before and after to_chart", end, entered, size),
+def _of_chart(field: Any, in_chart: Any, start: Any, point: PyTree) -> _Comparisons:
+    returned, end = in_chart.from_chart(start), field.flow(point)
+    end_in_chart = in_chart.from_chart(in_chart.flow(start))
+    scale = _scale((point, end))
+    comparisons: _Comparisons = [
+        ("to_chart and from_chart must lead back to the point", returned, point, scale),
+        ("flow must be the same before and after to_chart", end, end_in_chart, scale),
     ]
-    defect = given.defect(end)
+    defect = field.defect(end)
     if defect is not None:
-        facts.append((f"flow must keep {defect[1]}", defect[0], jnp.zeros_like(defect[0]), 1))
-    return facts
+        comparisons.append((f"flow must keep {defect[1]}", defect[0], jnp.zeros_like(defect[0]), 1))
+    return comparisons
 
 
 @eqx.filter_jit
-def _of_many_flows(field: Any, point: PyTree) -> _Facts:
+def _of_drift(field: Any, point: PyTree) -> _Comparisons:
     defect = field.defect(point)
     if defect is None:
         return []
 
-    def off(factor: Any) -> Any:
-        """The most that a point is off, of those that flows have not carried far away."""
-        along = type(field).combine((factor,), (field,))
+    def max_defect(factor: Any) -> Any:
+        """The largest defect along the flows, of points that are not far from the start."""
+        scaled = type(field).combine((factor,), (field,))
 
         def body(carry: Any, _: None) -> Any:
-            point, most = carry
-            way = along.increment(point)
-            new = along.flow(point) if way is None else jtu.tree_map(jnp.add, point, way)
-            is_near = _size(new) <= 1e3 * _size(start[0])
-            return (new, jnp.where(is_near, jnp.maximum(most, field.defect(new)[0]), most)), None
+            y, largest = carry
+            increment = scaled.increment(y)
+            y = scaled.flow(y) if increment is None else jtu.tree_map(jnp.add, y, increment)
+            is_near = _scale(y) <= 1e3 * _scale(point)
+            return (y, jnp.where(is_near, jnp.maximum(largest, field.defect(y)[0]), largest)), None
 
-        start = point, jnp.zeros_like(defect[0])
-        return lax.scan(body, start, length=100)[0][1]
+        return lax.scan(body, (point, jnp.zeros_like(defect[0])), length=100)[0][1]
 
     name = "flow" if field.increment(point) is None else "increment"
     factors = jnp.asarray([1.0, 2.0, 4.0, 8.0, 16.0], defect[0].dtype)
-    most = lax.map(off, factors)
-    promise = f"{name} must keep {defect[1]} over 100 flows, also of large fields"
-    return [(promise, most, jnp.zeros_like(most), 1)]
+    defects = lax.map(max_defect, factors)
+    requirement = f"{name} must keep {defect[1]} over 100 flows, also of large fields"
+    return [(requirement, defects, jnp.zeros_like(defects), 1)]
 
 
 @eqx.filter_jit
-def _of_flow(given: Any, field: Any, first: Any, start: Any, point: PyTree) -> _Facts:
-    def moved(t: Any, start: Any) -> Any:
-        return type(field).combine((t,), (field,)).flow(start)
+def _of_flow(field: Any, in_chart: Any, first: Any, start: Any, point: PyTree) -> _Comparisons:
+    def flow_to(t: Any, start: Any) -> Any:
+        return type(in_chart).combine((t,), (in_chart,)).flow(start)
 
-    here = first.from_chart(start)
+    y = first.from_chart(start)
     # In the precision of the point, which is that of the field.
-    times = jnp.asarray([0.0, 0.6, 1.0], jnp.finfo(jtu.tree_leaves(here)[0].dtype).dtype)
+    times = jnp.asarray([0.0, 0.6, 1.0], jnp.finfo(jtu.tree_leaves(y)[0].dtype).dtype)
     # In a loop, so that the flow is compiled once.
-    ends = lax.map(lambda t: moved(t, start), times)
-    at_zero, before, end = (jtu.tree_map(itemgetter(k), ends) for k in range(3))
+    ends = lax.map(lambda t: flow_to(t, start), times)
+    at_zero, between, end = (jtu.tree_map(itemgetter(k), ends) for k in range(3))
     end = first.from_chart(end)
-    velocity = jax.jvp(lambda t: first.from_chart(moved(t, start)), (0 * times[0],), (times[2],))[1]
-    tangent = given.tangent(here)
-    increment = given.increment(point)
-    facts: _Facts = [
+    path = lambda t: first.from_chart(flow_to(t, start))  # noqa: E731
+    velocity = jax.jvp(path, (0 * times[0],), (times[2],))[1]
+    tangent = field.tangent(y)
+    increment = field.increment(point)
+    comparisons: _Comparisons = [
         (
             "flow of the zero field must be the identity",
             first.from_chart(at_zero),
-            here,
-            _size(here),
+            y,
+            _scale(y),
         ),
         (
             "tangent must be the derivative of the flow at time zero",
             tangent,
             velocity,
-            _size((here, tangent, velocity)),
+            _scale((y, tangent, velocity)),
         ),
         (
             "flow of 0.4 of a field after 0.6 of it must be that of the whole field",
-            first.from_chart(moved(0.4, before)),
+            first.from_chart(flow_to(0.4, between)),
             end,
-            _size((here, end)),
+            _scale((y, end)),
         ),
     ]
-    if type(given).mean is not AbstractFrozenField.mean:
+    if type(field).mean is not AbstractFrozenField.mean:
         # To ten digits for a field of size one.
-        nodes, parts = np.polynomial.legendre.leggauss(8)
-        whole = lax.map(
-            lambda t: type(given).combine((t,), (given,)).flow(point),
+        nodes, weights = np.polynomial.legendre.leggauss(8)
+        values = lax.map(
+            lambda t: type(field).combine((t,), (field,)).flow(point),
             jnp.asarray((nodes + 1) / 2, times.dtype),
         )
         expected = jtu.tree_map(
-            lambda y: jnp.tensordot(jnp.asarray(parts / 2, y.dtype), y, axes=1), whole
+            lambda y: jnp.tensordot(jnp.asarray(weights / 2, y.dtype), y, axes=1), values
         )
-        promise = "mean must be the mean of the flow"
-        facts.append((promise, given.mean(point), expected, _size((point, expected))))
+        requirement = "mean must be the mean of the flow"
+        comparisons.append((requirement, field.mean(point), expected, _scale((point, expected))))
     if increment is not None:
-        expected = jtu.tree_map(jnp.subtract, given.flow(point), point)
-        promise = "increment must be flow(point) - point"
-        facts.append((promise, increment, expected, _size((point, expected))))
-    return facts
+        expected = jtu.tree_map(jnp.subtract, field.flow(point), point)
+        requirement = "increment must be flow(point) - point"
+        comparisons.append((requirement, increment, expected, _scale((point, expected))))
+    return comparisons
 
 
 @eqx.filter_jit
-def _of_sum(fields: Sequence[Any], entered: Sequence[Any], start: Any) -> _Facts:
-    here = entered[0].from_chart(start)
+def _of_combine(fields: Sequence[Any], charted: Sequence[Any], start: Any) -> _Comparisons:
+    y = charted[0].from_chart(start)
     weights = [0.7 * (-0.6) ** k for k in range(len(fields))]
-    parts = [field.tangent(here) for field in fields]
-    # Translations are added without the class's help.
-    expected = combine(weights, parts)
-    size = _size((here, parts))
+    tangents = [field.tangent(y) for field in fields]
+    # Of arrays, without the method of the class.
+    expected = combine(weights, tangents)
+    scale = _scale((y, tangents))
     return [
         (
             f"combine must be linear {what}: the tangent of a sum must be the sum of the tangents",
-            type(summed[0]).combine(weights, summed).tangent(here),
+            type(terms[0]).combine(weights, terms).tangent(y),
             expected,
-            size,
+            scale,
         )
-        for what, summed in [("in the fields", fields), ("in what has entered", entered)]
+        for what, terms in [("in the fields", fields), ("in what has entered", charted)]
     ]
 
 
 @eqx.filter_jit
-def _of_bracket(entered: Sequence[Any], start: Any) -> _Facts:
-    here = entered[0].from_chart(start)
-    a, b, c = entered[0], entered[1], entered[-1]
+def _of_bracket(charted: Sequence[Any], start: Any) -> _Comparisons:
+    point = charted[0].from_chart(start)
+    a, b, c = charted[0], charted[1], charted[-1]
     ab = a.bracket(b)
-    facts: _Facts = []
-    for what, x, y, found in [
+    comparisons: _Comparisons = []
+    for what, x, y, bracket in [
         ("[a, b]", a, b, ab),
         ("[b, a]", b, a, b.bracket(a)),
         ("[[a, b], c]", ab, c, ab.bracket(c)),
     ]:
-        # How each tangent changes along the other.
-        parts = [jax.jvp(p.tangent, (here,), (q.tangent(here),))[1] for p, q in [(x, y), (y, x)]]
-        expected, tangent = jtu.tree_map(jnp.subtract, *parts), found.tangent(here)
-        promise = (
+        # The derivative of each tangent along the other field.
+        derivatives = [
+            jax.jvp(p.tangent, (point,), (q.tangent(point),))[1] for p, q in [(x, y), (y, x)]
+        ]
+        expected, tangent = jtu.tree_map(jnp.subtract, *derivatives), bracket.tangent(point)
+        requirement = (
             f"bracket must have the sign and size of AbstractAlgebraElement (ab - ba for matrices "
             f"that act from the left), here {what}"
         )
-        facts.append((promise, tangent, expected, _size((here, tangent, parts))))
-    return facts
+        comparisons.append((requirement, tangent, expected, _scale((point, tangent, derivatives))))
+    return comparisons
 
 
-def _size(x: PyTree) -> Any:
+def _scale(x: PyTree) -> Any:
     return sum(jnp.max(jnp.abs(leaf), initial=0) for leaf in jtu.tree_leaves(x))
 
 
-def _compare(name: str, facts: _Facts, unit: float) -> None:
-    for promise, found, expected, size in facts:
+def _compare(name: str, comparisons: _Comparisons, rtol: float) -> None:
+    for requirement, actual, expected, scale in comparisons:
         a, b = (
             np.concatenate([np.ravel(leaf) for leaf in jtu.tree_leaves(x)])
-            for x in (found, expected)
+            for x in (actual, expected)
         )
-        atol = unit * float(size)
+        tol = rtol * float(scale)
         # False for NaN.
-        if np.all(np.abs(a - b) <= atol):
+        if np.all(np.abs(a - b) <= tol):
             continue
-        raise ValueError(f"{name}.{promise}, but {_difference(a, b, atol)}")
+        raise ValueError(f"{name}.{requirement}, but {_difference(a, b, tol)}")
 
 
-def _difference(found: np.ndarray, expected: np.ndarray, atol: float) -> str:
+def _difference(actual: np.ndarray, expected: np.ndarray, tol: float) -> str:
     if not np.all(np.isfinite(expected)):
         return (
             "what is expected is not finite. A flow must be smooth at the zero field, as it is "
             "with cfjax.stumpff."
         )
-    if not np.all(np.isfinite(found)):
+    if not np.all(np.isfinite(actual)):
         return "it is not finite."
     square = np.vdot(expected, expected).real
-    factor = np.vdot(expected, found).real / square if square > 0 else 0.0
-    if abs(factor) > 0.01 and np.abs(found - factor * expected).max() <= max(1, abs(factor)) * atol:
+    factor = np.vdot(expected, actual).real / square if square > 0 else 0.0
+    if abs(factor) > 0.01 and np.abs(actual - factor * expected).max() <= max(1, abs(factor)) * tol:
         if abs(factor + 1) < 0.01:
             return "it has the opposite sign."
         return f"it is {factor:.3g} times what is expected."
     return (
-        f"it is off by {np.abs(found - expected).max():.1g}, with entries of up to "
-        f"{np.abs(expected).max():.1g} expected and {atol:.0g} allowed for rounding."
+        f"it is off by {np.abs(actual - expected).max():.1g}, with entries of up to "
+        f"{np.abs(expected).max():.1g} expected and {tol:.0g} allowed for rounding."
     )
