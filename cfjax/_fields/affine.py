@@ -26,10 +26,10 @@ class Affine(AbstractAlgebraElement, AbstractSemilinearField):
     `Affine(1.0, g(u), spectrum, transform)`, and use `cfjax.ETD54`. On a grid the transform is a
     `cfjax.TensorTransform` and u has the shape of the grid.
 
-    M should hold at least four fifths of the stiffness, for `CF4` half. So of a coefficient that
-    varies it holds the largest value, not the mean.
+    M should contain at least four fifths of the stiffness, or half for `CF4`. So if a coefficient
+    varies, use its largest value in M, not its mean.
 
-    Boundary values and fluxes that are constant in time may stand in b, divided by `dx^2`. Subtract
+    Boundary values and fluxes that are constant in time may be in b, divided by `dx^2`. Subtract
     those that vary: take a smooth w that has them and solve for `v = u - w`, whose boundary values
     are zero, `v' = M v + g(v + w) + L w - w'`. Here `L w` is M applied to w with its boundary
     values in place, so it is as smooth as w. In b they would lower the order, of CF4 to two.

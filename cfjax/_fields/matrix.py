@@ -1,6 +1,7 @@
 """Matrix Lie algebras, acting from the left or from the right."""
 
 import abc
+from collections.abc import Callable
 from functools import partial
 from typing import Any, ClassVar
 
@@ -69,27 +70,25 @@ class AbstractOneSided(AbstractMatrix):
         """The product of a matrix with a point, from the side that this class acts from."""
 
     def flow(self, point: Inexact[Array, "..."]) -> Inexact[Array, "..."]:
-        self._check_point(point)
-        return each(partial(exp_times, type(self)), self._num_axes)(self.a, point)
+        return self._each(partial(exp_times, type(self)), point)
 
     def increment(self, point: Inexact[Array, "..."]) -> Inexact[Array, "..."]:
-        self._check_point(point)
-        return each(partial(exp_minus_one_times, type(self)), self._num_axes)(self.a, point)
+        return self._each(partial(exp_minus_one_times, type(self)), point)
 
     def tangent(self, point: Inexact[Array, "..."]) -> Inexact[Array, "..."]:
-        self._check_point(point)
-        return each(self.act, self._num_axes)(self.a, point)
+        return self._each(self.act, point)
 
     def bracket(self, other: Any) -> "AbstractOneSided":
         check_other(self, other)
-        # Flows from the right compose the other way round, and so do these products.
+        # Flows from the right compose in the reverse order, and so do these products.
         act = each(self.act, self._num_axes)
         return type(self)(act(self.a, other.a) - act(other.a, self.a))
 
-    def _check_point(self, point: Array) -> None:
+    def _each(self, fun: Callable[[Array, Array], Array], point: Array) -> Array:
         n = self.a.shape[-1]
         matrix = (n, "k") if self.axis == 0 else ("k", n)
         check_point(self, "a", self._num_axes, [(n,), matrix], point)
+        return each(fun, self._num_axes)(self.a, point)
 
 
 class LeftMatrix(AbstractOneSided):

@@ -60,7 +60,7 @@ class OperatorSum(AbstractFrozenField):
       `lineax.FunctionLinearOperator(f, jax.ShapeDtypeStruct((n,), dtype))` of a linear function of
       a vector. To declare a bound on the 2-norm of an operator, give a pair `(operator, norm)`.
       Lineax operators other than matrices and diagonals need a bound. Make operators once, outside
-      of the field: a function is another one each time that it becomes an operator.
+      of the field: two operators that are made of one function are not equal.
     - `is_skew`: whether every sum that occurs is skew-Hermitian, as in Schrödinger's equation. Then
       the flow is unitary to rounding and needs fewer products.
 

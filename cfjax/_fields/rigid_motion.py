@@ -161,8 +161,8 @@ class RigidMotion(AbstractMotion):
     The flow is the closed form of the exponential, 100 to 200 flops. It is exact to rounding for
     every angle, and so are its derivatives, also at zero. (The rounding of second derivatives
     grows with the square of the angle.) An angle beyond 2^45 (2^16 in float32) gives NaN. A solve
-    keeps the length of a quaternion to rounding, however many steps. Matrices are not led back to
-    orthogonal ones, and drift as vectors do along `cfjax.Rotation`.
+    keeps the length of a quaternion to rounding, however many steps. Matrices are not corrected:
+    they drift as vectors do along `cfjax.Rotation`.
 
     **Arguments:**
 

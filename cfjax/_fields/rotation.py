@@ -1,5 +1,6 @@
 """Rotations of space: the Lie algebra so(3) in three numbers."""
 
+from collections.abc import Callable
 from typing import Any
 
 import equinox as eqx
@@ -27,7 +28,7 @@ class Rotation(AbstractAlgebraElement):
     its derivatives of every order, also at `omega = 0`. An angle beyond 2^45 (2^16 in float32),
     where rounding leaves no two digits of the direction, gives NaN. A vector may have any length,
     so its length is not corrected: in a solve of equal flows of one angle it drifts by up to some
-    units of rounding a flow above a radian, and by the square of the angle less below.
+    units of rounding a flow above a radian, and by these times the square of the angle below.
 
     **Arguments:** `omega`, shape `(*batch, 3)`, float32 or float64, in radians per unit of time.
 
@@ -40,20 +41,16 @@ class Rotation(AbstractAlgebraElement):
         check_angular_velocity(self.omega)
 
     def flow(self, point: Float[Array, "..."]) -> Float[Array, "..."]:
-        self._check_point(point)
-        return each(rotate, self._num_axes)(self.omega, point)
+        return self._each(rotate, point)
 
     def increment(self, point: Float[Array, "..."]) -> Float[Array, "..."]:
-        self._check_point(point)
-        return each(increment, self._num_axes)(self.omega, point)
+        return self._each(increment, point)
 
     def tangent(self, point: Float[Array, "..."]) -> Float[Array, "..."]:
-        self._check_point(point)
-        return each(cross_product, self._num_axes)(self.omega, point)
+        return self._each(cross_product, point)
 
     def mean(self, point: Float[Array, "..."]) -> Float[Array, "..."]:
-        self._check_point(point)
-        return each(mean, self._num_axes)(self.omega, point)
+        return self._each(mean, point)
 
     def bracket(self, other: Any) -> "Rotation":
         return self._with(cross_product, other)
@@ -73,10 +70,11 @@ class Rotation(AbstractAlgebraElement):
     def _num_axes(self) -> int:
         return self.omega.ndim - 1
 
-    def _check_point(self, point: Array) -> None:
+    def _each(self, fun: Callable[[Array, Array], Array], point: Array) -> Array:
         check_point(self, "omega", self._num_axes, [(3,), (3, "k")], point)
         if jnp.iscomplexobj(point):
             raise TypeError(f"Rotation acts on real arrays, got {point.dtype}.")
+        return each(fun, self._num_axes)(self.omega, point)
 
 
 def check_angular_velocity(omega: Array) -> None:

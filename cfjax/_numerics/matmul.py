@@ -15,7 +15,7 @@ matmul = functools.partial(jnp.matmul, precision=lax.Precision.HIGHEST)
 def promoted(
     a: Inexact[Array, "..."], b: Inexact[Array, "..."]
 ) -> tuple[Inexact[Array, "..."], Inexact[Array, "..."]]:
-    """Both in one dtype, if a real array meets a complex one of its own precision."""
+    """Both arrays in one dtype, if they have one precision."""
     if jnp.finfo(a.dtype).dtype == jnp.finfo(b.dtype).dtype:
         dtype = np.promote_types(a.dtype, b.dtype)
         a, b = a.astype(dtype), b.astype(dtype)
@@ -25,8 +25,8 @@ def promoted(
 def by_columns(a: Inexact[Array, "n n"]) -> Callable[[Array], Array]:
     """`x -> a @ x`, for many products with vectors or few columns.
 
-    XLA:CPU takes 4 times as long for a complex product with a vector as for the real ones it is
-    made of. So the parts of `a` are put apart, once.
+    XLA:CPU takes 4 times as long for a complex product with a vector as for the real products that
+    it consists of. So the real and imaginary parts of `a` are separated, once.
     """
     n = a.shape[0]
     parts = jnp.concatenate([a.real, a.imag]) if jnp.iscomplexobj(a) else a
@@ -42,7 +42,7 @@ def by_columns(a: Inexact[Array, "n n"]) -> Callable[[Array], Array]:
 
 
 def small_product(x: Array, y: Array) -> Array:
-    """`x @ y` for matrices, or a matrix and a vector, of one dtype that may be small."""
+    """`x @ y` for matrices that may be small, or a matrix and a vector, of one dtype."""
     # XLA:CPU writes a real dot up to n = 3 into the code around it. The next ones are calls, two
     # to four times slower than a sum, which fuses.
     n = x.shape[-1]

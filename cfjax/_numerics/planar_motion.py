@@ -69,7 +69,7 @@ def dexpinv(
     w1: Float[Array, ""], v1: Float[Array, "2"], w2: Float[Array, ""], v2: Float[Array, "2"]
 ) -> tuple[Float[Array, ""], Float[Array, "2"]]:
     """The inverse derivative of the exponential at the first motion, of the second."""
-    # Of two motions the bracket has no rotation: a translation, u, which the first one turns.
+    # The bracket of two motions of the plane is a translation, u.
     u = _bracket(w1, v1, w2, v2)
     return w2, pack(dexpinv_times(w1 * w1, entries(v2), u, _times_i(w1, u)), sums=True)
 
