@@ -110,8 +110,8 @@ class OperatorSum(AbstractFrozenField):
         precision = _precision(self.operators)
         sizes = {shape_of(a)[0]: k for k, a in reversed([*enumerate(self.operators)])}
         if len(sizes) > 1:
-            each = " and ".join(f"{n} for operators[{k}]" for n, k in reversed(sizes.items()))
-            raise ValueError(f"operators must act on vectors of one size, got {each}.")
+            listed = " and ".join(f"{n} for operators[{k}]" for n, k in reversed(sizes.items()))
+            raise ValueError(f"operators must act on vectors of one size, got {listed}.")
         self.coefficients = _coefficients(coefficients, len(operators), precision)
         self.norms = tuple(_norm(k, *pair, precision) for k, pair in enumerate(pairs))
         if is_skew and not jnp.iscomplexobj(self.coefficients):
@@ -213,7 +213,7 @@ def _with_norm(k: int, operator: Any) -> tuple[Any, Any]:
 
 def _precision(operators: Sequence[Any]) -> Any:
     """The precision of the operators."""
-    first: dict[Any, int] = {}
+    precisions: dict[Any, int] = {}
     for k, operator in enumerate(operators):
         if isinstance(operator, lx.AbstractLinearOperator):
             structs = jtu.tree_leaves((operator.in_structure(), operator.out_structure()))
@@ -229,11 +229,11 @@ def _precision(operators: Sequence[Any]) -> Any:
             )
         if jnp.dtype(dtype).name not in DTYPES:
             raise TypeError(f"operators[{k}] must be one of {', '.join(DTYPES)}, got {dtype}.")
-        first.setdefault(jnp.finfo(dtype).dtype, k)
-    if len(first) > 1:
-        each = " and ".join(f"{precision} for operators[{k}]" for precision, k in first.items())
-        raise TypeError(f"operators must have one precision, got {each}.")
-    return next(iter(first))
+        precisions.setdefault(jnp.finfo(dtype).dtype, k)
+    if len(precisions) > 1:
+        listed = " and ".join(f"{dtype} for operators[{k}]" for dtype, k in precisions.items())
+        raise TypeError(f"operators must have one precision, got {listed}.")
+    return next(iter(precisions))
 
 
 def _coefficients(coefficients: Any, number: int, precision: Any) -> Array:

@@ -29,14 +29,14 @@ def by_columns(a: Inexact[Array, "n n"]) -> Callable[[Array], Array]:
     it consists of. So the real and imaginary parts of `a` are separated, once.
     """
     n = a.shape[0]
-    parts = jnp.concatenate([a.real, a.imag]) if jnp.iscomplexobj(a) else a
+    stacked = jnp.concatenate([a.real, a.imag]) if jnp.iscomplexobj(a) else a
 
     def product(x: Array) -> Array:
         if not jnp.iscomplexobj(x):
-            p = matmul(parts, x)
-            return p if parts is a else lax.complex(p[:n], p[n:])
-        p, q = matmul(parts, x.real), matmul(parts, x.imag)
-        return lax.complex(p, q) if parts is a else lax.complex(p[:n] - q[n:], q[:n] + p[n:])
+            p = matmul(stacked, x)
+            return p if stacked is a else lax.complex(p[:n], p[n:])
+        p, q = matmul(stacked, x.real), matmul(stacked, x.imag)
+        return lax.complex(p, q) if stacked is a else lax.complex(p[:n] - q[n:], q[:n] + p[n:])
 
     return product
 
