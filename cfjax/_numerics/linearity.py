@@ -8,7 +8,7 @@ import jax
 import jax.tree_util as jtu
 import numpy as np
 from jax.core import Tracer
-from jax.extend.core import ClosedJaxpr, Jaxpr, JaxprEqn, Literal
+from jax.extend.core import JaxprEqn, Literal
 from jaxtyping import PyTree
 
 
@@ -80,8 +80,8 @@ def linearity(
     return _interpret(jaxpr, [kind for tree, kind in inputs for _ in jtu.tree_leaves(tree)])
 
 
-def _interpret(jaxpr: ClosedJaxpr | Jaxpr, operands: list[Linearity]) -> list[Linearity]:
-    """The outputs of a jaxpr. Operands of an open one begin with its constants."""
+def _interpret(jaxpr: Any, operands: list[Linearity]) -> list[Linearity]:
+    """The outputs of a jaxpr, closed or open. Operands of an open one begin with its constants."""
     if hasattr(jaxpr, "consts"):
         operands = [*map(_of_constant, jaxpr.consts), *operands]
         jaxpr = jaxpr.jaxpr
@@ -111,7 +111,7 @@ def _is_number(value: Any) -> bool:
 
 def _outputs(eqn: JaxprEqn, operands: list[Linearity]) -> list[Linearity]:
     num_outputs = len(eqn.outvars)
-    jaxpr: Any = eqn.params.get(_CALLS.get(eqn.primitive.name, ""))
+    jaxpr = eqn.params.get(_CALLS.get(eqn.primitive.name, ""))
     if jaxpr is not None:
         outputs = _interpret(jaxpr, operands)
     else:
@@ -124,7 +124,7 @@ def _output(eqn: JaxprEqn, operands: list[Linearity]) -> Linearity:
     name = eqn.primitive.name
     if name in _SUMS:
         return _add(*operands)
-    if name in _LINEAR and jax.dtypes.issubdtype(eqn.outvars[0].aval.dtype, np.inexact):
+    if name in _LINEAR and _is_inexact(eqn.outvars[0].aval):
         output = functools.reduce(_join, operands)
         return _may_cancel(output) if name in _CONTRACTIONS else output
     # `x.at[i].apply(f)` has f in its scatter.
@@ -143,6 +143,10 @@ def _output(eqn: JaxprEqn, operands: list[Linearity]) -> Linearity:
     if name == "square" or (name == "integer_pow" and eqn.params["y"] >= 2):
         return _multiply(operands[0], operands[0])
     return _without_rule(operands)
+
+
+def _is_inexact(aval: Any) -> bool:
+    return jax.dtypes.issubdtype(aval.dtype, np.inexact)
 
 
 def _add(a: Linearity, b: Linearity) -> Linearity:
