@@ -5,7 +5,7 @@ PYTEST := -m pytest --numprocesses auto --dist worksteal --durations=10
 # Each solver and each field once, what the code relies on in jax, equinox and diffrax, and imports.
 QUICK := tests/test_quick.py tests/xla/test_struct_of_arrays.py tests/test_canary.py tests/test_public.py tests/test_architecture.py
 
-.PHONY: paper lint test test-all test-quick test-lowest test-newest coverage defects benchmarks benchmark-gpu pages docs clean
+.PHONY: paper lint test test-all test-quick test-lowest test-newest coverage mutations benchmarks benchmark-gpu pages docs clean
 
 # Tables and figures of the paper, in figures/.
 paper: .venv/paper
@@ -62,9 +62,9 @@ docs: .venv/docs
 coverage: .venv/dev
 	$(BIN)/python -m pytest --numprocesses auto --dist worksteal --cov --cov-report=term-missing
 
-# Whether the tests see mistakes, planted one at a time.
-defects: .venv/dev
-	$(BIN)/python tests/planted_defects.py
+# Whether the tests see mistakes, planted one at a time. ARGS='--count 20 cfjax/_solvers'
+mutations: .venv/dev
+	$(BIN)/python tests/mutations.py $(ARGS)
 
 .venv/paper .venv/docs .venv/dev: pyproject.toml
 	test -x $(BIN)/python || $(PYTHON) -m venv .venv
