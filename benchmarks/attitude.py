@@ -35,7 +35,7 @@ def craft(t: Any, y: Any, args: Any) -> dict[str, Any]:
 
 class Scene(NamedTuple):
     module: Any
-    end: float
+    t1: float
     field: Callable[[Any, Any, Any], Any]
     velocity: Callable[[Any, Any, Any], Any]
 
@@ -62,40 +62,40 @@ METHODS: dict[str, tuple[diffrax.AbstractSolver, int]] = {
 
 
 def solve(scene: Scene, name: str, y0: Any, num_steps: Any) -> Any:
-    """`num_steps` may be traced, to look for it: then all are solved by diffrax."""
+    """The final state. If `num_steps` is traced, diffrax solves for every method."""
     solver, _ = METHODS[name]
-    in_space, is_known = name.startswith("diffrax"), isinstance(num_steps, int)
+    in_space, is_static = name.startswith("diffrax"), isinstance(num_steps, int)
     term = diffrax.ODETerm(scene.velocity) if in_space else cfjax.LieTerm(scene.field)
-    if in_space or not is_known:
+    if in_space or not is_static:
         # Rounding of the times may make a step more.
-        max_steps = num_steps + 1 if is_known else None
-        step = scene.end / num_steps
-        sol = diffrax.diffeqsolve(term, solver, 0.0, scene.end, step, y0, max_steps=max_steps)
+        max_steps = num_steps + 1 if is_static else None
+        step = scene.t1 / num_steps
+        sol = diffrax.diffeqsolve(term, solver, 0.0, scene.t1, step, y0, max_steps=max_steps)
     else:
-        sol = cfjax.integrate(term, solver, 0.0, scene.end, y0, num_steps=num_steps)
+        sol = cfjax.integrate(term, solver, 0.0, scene.t1, y0, num_steps=num_steps)
     return jax.tree.map(lambda y: y[-1], sol.ys)
 
 
 def steps_to(scene: Scene, name: str, y0: Any) -> dict[float, tuple[int, float]]:
     """For each target the fewest equal steps, to within a twelfth, and their error."""
-    exact = scene.module.reference(scene.end)
+    exact = scene.module.reference(scene.t1)
     # One program for all numbers of steps.
     program = jax.jit(lambda y0, n: solve(scene, name, y0, n))
-    found = {}
+    fewest = {}
     n = 4
     for target in TARGETS:
         tried: dict[int, float] = {}
         while n not in tried and len(tried) < 12:
             tried[n] = scene.module.error(program(y0, jnp.asarray(n)), exact)
             # Far too few steps may overflow in plain space.
-            off = tried[n] / target if np.isfinite(tried[n]) else np.inf
-            factor = off ** (1 / METHODS[name][1])
+            ratio = tried[n] / target if np.isfinite(tried[n]) else np.inf
+            factor = ratio ** (1 / METHODS[name][1])
             n = max(n + (factor > 1), round(n * min(max(1.02 * factor, 0.5), 4)))
             if 1 / 1.08 < factor <= 1:
                 break
         n = min(n for n, error in tried.items() if error <= target)
-        found[target] = n, tried[n]
-    return found
+        fewest[target] = n, tried[n]
+    return fewest
 
 
 def measure(quick: bool) -> Iterator[results.Row]:
@@ -104,22 +104,20 @@ def measure(quick: bool) -> Iterator[results.Row]:
         fewest = {name: steps_to(scene, name, y0) for name in METHODS}
         many = jax.tree.map(lambda y: jnp.broadcast_to(y, (BATCH, *y.shape)), y0)
         for target in TARGETS:
-            found = {name: fewest[name][target] for name in METHODS}
             kinds = ["solve", "gradient"]
             runs: dict[tuple[str, int], list[Any]] = {}
-            for name, (n, _) in found.items():
+            for name in METHODS:
+                n, _ = fewest[name][target]
 
-                def end(y: Any, name=name, n=n, scene=scene) -> Any:
+                def final_state(y: Any, name=name, n=n, scene=scene) -> Any:
                     return solve(scene, name, y, n)
 
-                def value(y: Any, end=end) -> Any:
-                    return sum(jnp.sum(jnp.sin(x)) for x in jax.tree.leaves(end(y)))
+                def value(y: Any, final_state=final_state) -> Any:
+                    return sum(jnp.sum(jnp.sin(x)) for x in jax.tree.leaves(final_state(y)))
 
-                runs[name, 1] = [
-                    results.compiled(f, y0, repeats=REPEATS)
-                    for f in ((end, jax.grad(value)) if target == TARGETS[0] else (end,))
-                ]
-                runs[name, BATCH] = [results.compiled(jax.vmap(end), many)]
+                programs = [final_state, jax.grad(value)][: 2 if target == TARGETS[0] else 1]
+                runs[name, 1] = [results.compiled(f, y0, repeats=REPEATS) for f in programs]
+                runs[name, BATCH] = [results.compiled(jax.vmap(final_state), many)]
             for systems in (1, BATCH):
                 programs = [run for name in METHODS for run in runs[name, systems]]
                 rounds = (3 if quick else 25) if systems == 1 else (1 if quick else 7)
@@ -128,13 +126,14 @@ def measure(quick: bool) -> Iterator[results.Row]:
                 seconds = seconds / (REPEATS if systems == 1 else systems)
                 best = int(np.argmin(np.median(seconds[:2, 0], axis=-1)))
                 for name, times in zip(METHODS, seconds, strict=True):
+                    num_steps, error = fewest[name][target]
                     row = {
                         "scene": label,
                         "systems": systems,
                         "to": target,
                         "method": name,
-                        "steps": found[name][0],
-                        "error": results.digits(found[name][1]),
+                        "steps": num_steps,
+                        "error": results.digits(error),
                     }
                     for kind, spent in zip(kinds, times, strict=False):
                         row[f"seconds, {kind}"] = results.spread(spent)

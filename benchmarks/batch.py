@@ -24,7 +24,6 @@ import cfjax
 import results
 from cfjax._batch import batch as _batch
 from cfjax._measure import style as _style
-from cfjax._measure.work_precision import take_turns
 from cfjax.scenes import rigid_body
 
 STEPS, END = 100, 10.0
@@ -53,7 +52,7 @@ def measure(quick: bool) -> Iterator[results.Row]:
     for size in SIZES:
         members = _members(size)
         programs = {f"chunks of {n}": _in_chunks(members, n) for n in CHUNKS if n <= size}
-        programs["one jax.vmap"] = _whole(members)
+        programs["one jax.vmap"] = _one_vmap(members)
         for name, seconds in _times(programs, rounds, budget).items():
             yield {
                 "members": size,
@@ -63,21 +62,21 @@ def measure(quick: bool) -> Iterator[results.Row]:
                 "compile seconds": results.digits(programs[name].compile_seconds),
             }
     members = _members(ADAPTIVE)
-    for what, make in PROGRAMS.items():
-        runs, waits = [], []
-        for solver in METHODS.values():
-            start = time.process_time()
-            runs.append(results.compiled(jax.vmap(make(solver)), *members))
-            waits.append(time.process_time() - start)
-        taken = take_turns(runs, repeats=3 if quick else 15)
-        for method, seconds, wait in zip(METHODS, taken, waits, strict=True):
+    for output, make in PROGRAMS.items():
+        runs, compile_seconds = {}, {}
+        for method, solver in METHODS.items():
+            begin = time.process_time()
+            runs[method] = results.compiled(jax.vmap(make(solver)), *members)
+            compile_seconds[method] = time.process_time() - begin
+        times = results.in_turns(runs, repeats=3 if quick else 15)
+        for method, seconds in times.items():
             yield {
-                "what": what,
+                "what": output,
                 "method": method,
                 "members": ADAPTIVE,
-                "compile CPU seconds": results.digits(wait),
+                "compile CPU seconds": results.digits(compile_seconds[method]),
                 "seconds": results.spread(seconds),
-                "over Tsit5": results.ratios(seconds, taken[-1]),
+                "over Tsit5": results.ratios(seconds, times["Tsit5"]),
             }
 
 
@@ -131,10 +130,10 @@ def _solve(member: Member) -> jax.Array:
 def _in_chunks(members: Member, chunk_size: int) -> Program:
     """`cfjax.map_batch`, over all devices."""
     mesh = jax.make_mesh((jax.device_count(),), ("batch",)) if jax.device_count() > 1 else None
-    start = time.perf_counter()
+    begin = time.perf_counter()
     program = _batch.Program(_solve, members, chunk_size, mesh)
     executable = program.run
-    compile_seconds = time.perf_counter() - start
+    compile_seconds = time.perf_counter() - begin
 
     def run():
         # Compiled already: it takes as long as the first ten thousand trajectories or more.
@@ -144,10 +143,10 @@ def _in_chunks(members: Member, chunk_size: int) -> Program:
     return Program(run, _memory(executable), compile_seconds)
 
 
-def _whole(members: Member) -> Program:
-    start = time.perf_counter()
+def _one_vmap(members: Member) -> Program:
+    begin = time.perf_counter()
     executable = jax.jit(jax.vmap(_solve)).lower(members).compile()
-    compile_seconds = time.perf_counter() - start
+    compile_seconds = time.perf_counter() - begin
     run = lambda: np.asarray(executable(members))  # noqa: E731
     return Program(run, _memory(executable), compile_seconds)
 
@@ -159,25 +158,26 @@ def _memory(executable: jax.stages.Compiled) -> int:
 
 
 def _times(programs: dict[str, Program], rounds: int, budget: float) -> dict[str, np.ndarray]:
-    runs = [program.run for program in programs.values()]
-    first, *others = (run() for run in runs)
-    # The same steps; what differs is rounding, which the flow lets grow with time.
-    if not all(np.allclose(first, other, atol=1e-9, rtol=1e-9) for other in others):
+    runs = {name: program.run for name, program in programs.items()}
+    expected, *ends = (run() for run in runs.values())
+    # The steps are the same. They differ by rounding, which the flow lets grow with time.
+    if not all(np.allclose(expected, end, atol=1e-9, rtol=1e-9) for end in ends):
         raise RuntimeError("Programs disagree.")
-    return dict(zip(programs, take_turns(runs, repeats=rounds, budget=budget), strict=True))
+    return results.in_turns(runs, repeats=rounds, budget=budget)
 
 
 def draw() -> dict[str, Figure]:
-    found = results.load("batch")
+    stored = results.load("batch")
+    cores = stored["machine"]["cores"]
     figure = _style.new_figure(
         (6.5, 4.2),
         f"The rigid body, {STEPS} steps of CF4 a trajectory, in float64 on "
-        f"{found['machine']['cores']} cores. Median of runs in turns; bars reach from the lower to "
-        "the upper quartile. Without compilation.",
+        f"{cores} cores. Median of runs in turns; bars reach from the lower to the upper quartile. "
+        "Without compilation.",
     )
     axes = figure.subplots()
     for name, style in STYLES.items():
-        rows = results.pick(found["rows"], program=name)
+        rows = results.pick(stored["rows"], program=name)
         # The quickest quarter of the runs has the largest rates.
         rates = np.array([1 / np.array(row["seconds a trajectory"])[3:0:-1] for row in rows])
         spread = np.abs(rates[:, ::2] - rates[:, 1:2]).T

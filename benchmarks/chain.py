@@ -77,32 +77,32 @@ def velocity(t: Any, state: State, args: Any) -> State:
     ]
 
 
-def start(bodies: int) -> State:
+def initial_state(bodies: int) -> State:
     momenta = np.random.default_rng(0).normal(size=(bodies, 3))
     return [{"attitude": jnp.eye(3), "momentum": jnp.asarray(m)} for m in momenta]
 
 
-def last(program: str, state: State) -> State:
-    end = STEP * STEPS
+def final_state(program: str, state: State) -> State:
+    t1 = STEP * STEPS
     if program.startswith("cfjax"):
-        sol = cfjax.integrate(cfjax.LieTerm(field), cfjax.CF4(), 0.0, end, state, num_steps=STEPS)
+        sol = cfjax.integrate(cfjax.LieTerm(field), cfjax.CF4(), 0.0, t1, state, num_steps=STEPS)
     else:
         lie = cfjax.LieTerm(field), cfjax.CF4()
         method = lie if "CF4" in program else (diffrax.ODETerm(velocity), diffrax.Tsit5())
-        sol = diffrax.diffeqsolve(*method, 0.0, end, STEP, state, max_steps=STEPS + 1)
+        sol = diffrax.diffeqsolve(*method, 0.0, t1, STEP, state, max_steps=STEPS + 1)
     return jax.tree.map(lambda ys: ys[-1], sol.ys)
 
 
 def loss(program: str, state: State) -> Float[Array, ""]:
-    ends = jax.tree.leaves(last(program, state))
-    return jnp.sum(jnp.stack([jnp.sum(jnp.sin(x)) for x in ends]))
+    leaves = jax.tree.leaves(final_state(program, state))
+    return jnp.sum(jnp.stack([jnp.sum(jnp.sin(x)) for x in leaves]))
 
 
-def case(program: str, what: str, bodies: int, repeats: int) -> results.Row:
+def case(program: str, task: str, bodies: int, repeats: int) -> results.Row:
     """Compiles and runs one program, in this process."""
     jax.config.update("jax_enable_x64", True)
-    state = start(bodies)
-    function = {"solve": last, "gradient": jax.grad(loss, argnums=1)}[what]
+    state = initial_state(bodies)
+    function = {"solve": final_state, "gradient": jax.grad(loss, argnums=1)}[task]
     before, begin, begin_cpu = _peak(), time.perf_counter(), time.process_time()
     executable = jax.jit(lambda state: function(program, state)).lower(state).compile()
     compiling, compiling_cpu = time.perf_counter() - begin, time.process_time() - begin_cpu
@@ -128,21 +128,21 @@ def _peak() -> int:
 
 
 def measure(quick: bool) -> Iterator[results.Row]:
-    for what in WHAT[: 1 if quick else None]:
+    for task in WHAT[: 1 if quick else None]:
         for program in PROGRAMS:
             for bodies in BODIES[: 2 if quick else None]:
-                row = {"program": program, "what": what, "bodies": bodies}
-                found = _in_process(program, what, bodies, 3 if quick else 20)
-                yield row | found
-                if "ended" in found:
+                row = {"program": program, "what": task, "bodies": bodies}
+                measured = _in_process(program, task, bodies, 3 if quick else 20)
+                yield row | measured
+                if "ended" in measured:
                     break
 
 
-def _in_process(program: str, what: str, bodies: int, repeats: int) -> results.Row:
+def _in_process(program: str, task: str, bodies: int, repeats: int) -> results.Row:
     rewrites = "0" if "no rewriting" in program else "1"
-    arguments = json.dumps([program, what, bodies, repeats])
+    arguments = json.dumps([program, task, bodies, repeats])
     try:
-        done = subprocess.run(
+        process = subprocess.run(
             [sys.executable, __file__, "--case", arguments],
             stdout=subprocess.PIPE,
             timeout=LIMIT,
@@ -153,7 +153,7 @@ def _in_process(program: str, what: str, bodies: int, repeats: int) -> results.R
         return {"ended": f"{LIMIT:g} s"}
     except subprocess.CalledProcessError as error:
         return {"ended": f"exit status {error.returncode}"}
-    return json.loads(done.stdout)
+    return json.loads(process.stdout)
 
 
 def draw() -> dict[str, Figure]:
@@ -163,15 +163,15 @@ def draw() -> dict[str, Figure]:
         f"A chain of coupled rigid bodies, {STEPS} steps in float64, each program in a process of "
         f"its own. A line ends where the next chain took more than {LIMIT:g} seconds.",
     )
-    whats = list(dict.fromkeys(row["what"] for row in rows))
-    panels = figure.subplots(1, len(whats), sharey=True, squeeze=False)[0]
-    for axes, what in zip(panels, whats, strict=True):
+    tasks = list(dict.fromkeys(row["what"] for row in rows))
+    panels = figure.subplots(1, len(tasks), sharey=True, squeeze=False)[0]
+    for axes, task in zip(panels, tasks, strict=True):
         for program, style in PROGRAMS.items():
-            found = [r for r in results.pick(rows, program=program, what=what) if "ended" not in r]
-            label = program if what == "solve" else None
-            bodies, seconds = ([r[key] for r in found] for key in ("bodies", "compile CPU seconds"))
+            curve = [r for r in results.pick(rows, program=program, what=task) if "ended" not in r]
+            label = program if task == "solve" else None
+            bodies, seconds = ([r[key] for r in curve] for key in ("bodies", "compile CPU seconds"))
             axes.plot(bodies, seconds, label=label, markersize=5, **style)
-        axes.set(xlabel="bodies", yscale="log", title=what, xticks=BODIES, xlim=(0, 32))
+        axes.set(xlabel="bodies", yscale="log", title=task, xticks=BODIES, xlim=(0, 32))
     figure.axes[0].set(ylabel="processor seconds to compile")
     _style.finish(figure, columns=2)
     return {"chain": figure}

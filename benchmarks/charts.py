@@ -41,7 +41,7 @@ def _rows(name: str, work: WorkPrecision) -> Iterator[results.Row]:
 
 
 def work(name: str) -> WorkPrecision:
-    """What was measured for a chart."""
+    """The stored measurements of a chart."""
     rows = results.pick(results.load("charts")["rows"], chart=name)
     columns = {field: [row[field] for row in rows] for field in WorkPrecision._fields}
     words = ("method", "note")

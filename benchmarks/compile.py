@@ -1,4 +1,4 @@
-"""Time to compile what people write, over the same with a method of diffrax in plain space.
+"""Time to compile typical programs, relative to a method of diffrax in plain space.
 
 It measures processor time to trace, lower and compile, which other work on the machine disturbs
 less than wall time, and the instructions of optimised HLO, for the programs and scenes of
@@ -21,7 +21,7 @@ from cfjax.scenes import rigid_body
 from compile_programs import SCENES, Scene, lowered, size
 
 
-def second_derivative(what: str) -> Callable[[Any], Any]:
+def second_derivative(name: str) -> Callable[[Any], Any]:
     def loss(inertia):
         term = cfjax.LieTerm(rigid_body.field)
         y0 = jnp.asarray(rigid_body.y0)
@@ -30,34 +30,34 @@ def second_derivative(what: str) -> Callable[[Any], Any]:
 
     gradient = jax.grad(loss)
     product = lambda inertia: jax.jvp(gradient, (inertia,), (jnp.ones(3),))[1]  # noqa: E731
-    return {"gradient": gradient, "product": product, "Hessian": jax.hessian(loss)}[what]
+    return {"gradient": gradient, "product": product, "Hessian": jax.hessian(loss)}[name]
 
 
 def measure(quick: bool) -> Iterator[results.Row]:
     repeats = 1 if quick else 2
-    # The first program pays for what all use.
+    # Warm-up: the first program pays for what all of them share.
     compiled(SCENES["rigid body"](), "gradient", "Tsit5")
     for name, make in [*SCENES.items()][: 1 if quick else None]:
         scene = make()
         methods = [scene.base, *scene.methods]
         for program in scene.programs:
-            made = [[compiled(scene, program, m) for m in methods] for _ in range(repeats)]
-            times = np.array([[seconds for seconds, _ in turn] for turn in made]).T
-            sizes = [size for _, size in made[0]]
-            for method, taken, number in zip(methods, times, sizes, strict=True):
+            compilations = [[compiled(scene, program, m) for m in methods] for _ in range(repeats)]
+            times = np.array([[seconds for seconds, _ in turn] for turn in compilations]).T
+            sizes = [size for _, size in compilations[0]]
+            for method, seconds, number in zip(methods, times, sizes, strict=True):
                 yield {
                     "scene": name,
                     "program": program,
                     "method": method,
-                    "CPU seconds": results.spread(taken),
+                    "CPU seconds": results.spread(seconds),
                     "over": scene.base,
-                    "seconds, ratio": results.ratios(taken, times[0]),
+                    "seconds, ratio": results.ratios(seconds, times[0]),
                     "instructions": number,
                     "instructions, ratio": number / sizes[0],
                 }
-    for what in ("gradient", "product", "Hessian"):
-        taken = [seconds_of(second_derivative(what)) for _ in range(repeats)]
-        yield {"derivative": what, "CPU seconds": results.spread(taken)}
+    for name in ("gradient", "product", "Hessian"):
+        seconds = [seconds_of(second_derivative(name)) for _ in range(repeats)]
+        yield {"derivative": name, "CPU seconds": results.spread(seconds)}
 
 
 def compiled(scene: Scene, program: str, method: str) -> tuple[float, int]:
@@ -68,7 +68,7 @@ def compiled(scene: Scene, program: str, method: str) -> tuple[float, int]:
 
 
 def seconds_of(fun: Callable[[Any], Any]) -> float:
-    """Of the processor. A new function each time, or jax would remember the old program."""
+    """Of the processor. A new function each time, or jax would use its cached program."""
     begin = time.process_time()
     jax.jit(fun).lower(jnp.asarray(rigid_body.inertia)).compile()
     return time.process_time() - begin

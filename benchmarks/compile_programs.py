@@ -1,4 +1,4 @@
-"""The programs of `benchmarks/compile.py`: what people write, in small scenes.
+"""The programs of `benchmarks/compile.py`: typical programs, in small scenes.
 
 A program takes a term, a solver and a start. Each comes as cfjax's and as the one of diffrax that
 it is compared with, in plain space. The two differ where cfjax has its own loop of equal steps.
@@ -45,13 +45,13 @@ def jacobian(program: Program) -> Program:
 
 
 def time_of_event(**options: Any) -> Program:
-    def last(term: Any, solver: Any, y0: Any) -> Any:
+    def final_time(term: Any, solver: Any, y0: Any) -> Any:
         sol = diffrax.diffeqsolve(
             term, solver, 0.0, T1, T1 / STEPS, y0, max_steps=256, **EVENT, **options
         )
         return jnp.asarray(sol.ts)[-1]
 
-    return last
+    return final_time
 
 
 def fit(program: Program) -> Program:
@@ -69,7 +69,7 @@ def fit(program: Program) -> Program:
     return least_squares
 
 
-def first(t: Any, y: Any, args: Any, **_: Any) -> Any:
+def event_function(t: Any, y: Any, args: Any, **_: Any) -> Any:
     """Zero where the first number of the state is 0.3."""
     return jax.tree.leaves(y)[0].reshape(-1)[0] - 0.3
 
@@ -77,7 +77,7 @@ def first(t: Any, y: Any, args: Any, **_: Any) -> Any:
 CONTROL: dict[str, Any] = dict(stepsize_controller=diffrax.PIDController(rtol=1e-6, atol=1e-6))
 TIMES: dict[str, Any] = dict(saveat=diffrax.SaveAt(ts=jnp.linspace(0.0, T1, 11)))
 ALL_TIMES: dict[str, Any] = dict(saveat=diffrax.SaveAt(ts=jnp.linspace(0.0, T1, STEPS + 1)))
-EVENT: dict[str, Any] = dict(event=diffrax.Event(first, optimistix.Newton(1e-8, 1e-8)))
+EVENT: dict[str, Any] = dict(event=diffrax.Event(event_function, optimistix.Newton(1e-8, 1e-8)))
 FORWARD: dict[str, Any] = dict(adjoint=diffrax.ForwardMode())
 
 
@@ -85,7 +85,7 @@ def both(program: Program) -> tuple[Program, Program]:
     return program, program
 
 
-# cfjax's, and what it is compared with.
+# The program of cfjax, and the one of diffrax that it is compared with.
 PROGRAMS: dict[str, tuple[Program, Program]] = {
     "equal steps": both(solve()),
     "adaptive steps": both(solve(**CONTROL)),
@@ -193,7 +193,7 @@ def long_times() -> Scene:
     """Spins on a lattice."""
     magnet, y0 = spin_waves.MAGNET, jnp.asarray(spin_waves.y0(16))
 
-    def whole(t: Any, y: Any, _: Any) -> cfjax.Rotation:
+    def field(t: Any, y: Any, _: Any) -> cfjax.Rotation:
         return spins.field(t, y, magnet)
 
     def colour(parity: int) -> cfjax.LieTerm:
@@ -205,9 +205,9 @@ def long_times() -> Scene:
         "Strang": (split, cfjax.Strang()),
         "BlanesMoan4": (split, cfjax.BlanesMoan4()),
         "BlanesMoan6": (split, cfjax.BlanesMoan6()),
-        "ImplicitMidpoint": (cfjax.LieTerm(whole), cfjax.ImplicitMidpoint()),
+        "ImplicitMidpoint": (cfjax.LieTerm(field), cfjax.ImplicitMidpoint()),
     }
-    velocity = diffrax.ODETerm(lambda t, y, _: cfjax.tangent(whole(t, y, None), y))
+    velocity = diffrax.ODETerm(lambda t, y, _: cfjax.tangent(field(t, y, None), y))
     plain = velocity, diffrax.LeapfrogMidpoint()
     return Scene(methods, "LeapfrogMidpoint", plain, y0, OF_EQUAL_STEPS + OF_GRADIENTS)
 
@@ -242,7 +242,7 @@ SCENES: dict[str, Callable[[], Scene]] = {
 
 
 def lowered(scene: Scene, program: str, method: str) -> jax.stages.Lowered:
-    """Traced anew each time. The method is one of the scene, or what it is compared with."""
+    """The program, traced anew each time. The method is one of the scene or its `base`."""
     ours, theirs = PROGRAMS[program]
     is_base = method == scene.base
     fun, (term, solver) = (theirs, scene.plain) if is_base else (ours, scene.methods[method])

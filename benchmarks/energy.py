@@ -53,15 +53,15 @@ SAVES = 1000
 class System(NamedTuple):
     """A Hamiltonian system, with frozen fields of terms where it splits."""
 
-    start: PyTree
+    y0: PyTree
     energy: Callable[[PyTree], Array]
     field: Part
     # Evaluations in a unit of time, and the time of the last.
     rate: float
-    end: float
+    t1: float
     terms: tuple[Part, ...] = ()
     # How much of an evaluation each of the terms takes.
-    parts: tuple[float, ...] = ()
+    shares: tuple[float, ...] = ()
 
 
 class Run(NamedTuple):
@@ -81,17 +81,17 @@ def measure(quick: bool) -> Iterator[results.Row]:
 
 
 def equal_evaluations(name: str, quick: bool) -> Iterator[results.Row]:
-    system, found = SYSTEMS[name](), {}
+    system, runs = SYSTEMS[name](), {}
     shorter = 50 if quick else 1
     for method in of_system(system):
         program = Program(system, method)
-        found[method] = program.run(system.rate, system.end / shorter)
-        yield row(name, method, system.rate, found[method]) | curve(found[method])
+        runs[method] = program.run(system.rate, system.t1 / shorter)
+        yield row(name, method, system.rate, runs[method]) | curve(runs[method])
         if name == "lattice" and method == "Strang":
             # A step of one unit of time, with one evaluation.
             long = program.run(1.0, 1e6 / shorter)
             yield row(name, method, 1.0, long) | curve(long)
-    yield from break_even(name, system.rate, found)
+    yield from break_even(name, system.rate, runs)
 
 
 def of_system(system: System) -> tuple[str, ...]:
@@ -108,8 +108,8 @@ class Program:
         if method in SPLITTINGS:
             solver, pairs = SPLITTINGS[method]
             term = terms_of(system)
-            first, *middle, last = system.parts
-            cost = pairs * (first + 2 * sum(middle) + last)
+            first_share, *middle_shares, last_share = system.shares
+            cost = pairs * (first_share + 2 * sum(middle_shares) + last_share)
         elif method in IMPLICIT:
             solver = IMPLICIT[method]
             cost = evaluations(system, solver)
@@ -129,13 +129,13 @@ class Program:
 
         self.piece = jax.jit(piece)
 
-    def run(self, rate: float, end: float) -> Run:
+    def run(self, rate: float, t1: float) -> Run:
         step = self.cost / rate
-        energies, y = [], jax.tree.map(jnp.asarray, self.system.start)
-        for _ in range(math.ceil(end / (SAVES * self.every * step))):
+        energies, y = [], jax.tree.map(jnp.asarray, self.system.y0)
+        for _ in range(math.ceil(t1 / (SAVES * self.every * step))):
             y, new = self.piece(y, jnp.asarray(step))
             energies.append(np.asarray(new))
-        error = np.concatenate(energies) - float(self.system.energy(self.system.start))
+        error = np.concatenate(energies) - float(self.system.energy(self.system.y0))
         t = step * self.every * np.arange(1, len(error) + 1)
         return Run(t, error, step, len(error) * self.every)
 
@@ -161,10 +161,10 @@ def evaluations(system: System, solver: Any) -> float:
     steps, cost = 100, 10.0
 
     @jax.jit
-    def program(end: Array) -> PyTree:
+    def program(t1: Array) -> PyTree:
         term = cfjax.LieTerm(field)
         options: Any = dict(num_steps=steps, throw=False)
-        return cfjax.integrate(term, solver, 0.0, end, system.start, **options).ys
+        return cfjax.integrate(term, solver, 0.0, t1, system.y0, **options).ys
 
     for _ in range(4):
         count = 0
@@ -174,27 +174,27 @@ def evaluations(system: System, solver: Any) -> float:
     return cost
 
 
-def row(name: str, method: str, rate: float, found: Run) -> results.Row:
-    slope, scatter = trend(found.t, found.error)
+def row(name: str, method: str, rate: float, run: Run) -> results.Row:
+    slope, scatter = trend(run.t, run.error)
     return {
         "system": name,
         "method": method,
         "evaluations a unit": rate,
-        "step": results.digits(found.step),
-        "steps": found.steps,
-        "largest": results.digits(np.max(np.abs(found.error))),
+        "step": results.digits(run.step),
+        "steps": run.steps,
+        "largest": results.digits(np.max(np.abs(run.error))),
         "slope": results.digits(slope),
         "scatter": results.digits(scatter),
-        "drifts": drifts(found),
+        "drifts": drifts(run),
     }
 
 
-def curve(found: Run) -> results.Row:
+def curve(run: Run) -> results.Row:
     """The largest error so far, at times in equal ratios."""
-    largest = np.maximum.accumulate(np.abs(found.error))
+    largest = np.maximum.accumulate(np.abs(run.error))
     places = np.unique(np.geomspace(1, len(largest), 80).astype(int)) - 1
     return {
-        "t": [results.digits(t) for t in found.t[places]],
+        "t": [results.digits(t) for t in run.t[places]],
         "largest so far": [results.digits(x) for x in largest[places]],
     }
 
@@ -206,37 +206,37 @@ def trend(t: np.ndarray, values: np.ndarray) -> tuple[float, float]:
     return float(slope), float(np.std(y - slope * x))
 
 
-def drifts(found: Run) -> bool:
+def drifts(run: Run) -> bool:
     """Whether the line rises, or falls, by more than the energy scatters about it."""
-    slope, scatter = trend(found.t, found.error)
-    return bool(abs(slope) * (found.t[-1] - found.t[0]) > scatter)
+    slope, scatter = trend(run.t, run.error)
+    return bool(abs(slope) * (run.t[-1] - run.t[0]) > scatter)
 
 
-def break_even(name: str, rate: float, found: dict[str, Run]) -> Iterator[results.Row]:
-    """When the error of other methods becomes larger than the best symplectic one ever has.
+def break_even(name: str, rate: float, runs: dict[str, Run]) -> Iterator[results.Row]:
+    """When the error of each other method exceeds the largest error of the best symplectic one.
 
-    If that is after the end, along the slope of the energy.
+    If that is after the end, it is extrapolated along the slope of the energy.
     """
-    bands = {m: np.max(np.abs(found[m].error)) for m in SYMPLECTIC if m in found}
+    bands = {m: np.max(np.abs(runs[m].error)) for m in SYMPLECTIC if m in runs}
     best = min(bands, key=lambda m: bands[m])
     for method in OTHERS:
-        if method not in found:
+        if method not in runs:
             continue
-        run, after = found[method], None
-        # What is not finite is larger too.
+        run, after = runs[method], None
+        # Errors that are not finite count as larger.
         larger = ~(np.abs(run.error) <= bands[best])
-        end = run.t[-1]
+        t1 = run.t[-1]
         if np.any(larger):
             after = run.t[np.argmax(larger)]
         elif drifts(run):
-            after = max(bands[best] / abs(trend(run.t, run.error)[0]), end)
+            after = max(bands[best] / abs(trend(run.t, run.error)[0]), t1)
         yield {
             "system": name,
             "evaluations a unit": rate,
             "best": best,
             "other": method,
             "break-even": None if after is None else results.digits(after),
-            "end": results.digits(end),
+            "end": results.digits(t1),
         }
 
 
@@ -271,9 +271,9 @@ def top() -> System:
         return jnp.sum(y["m"] ** 2 / inertia) / 2 + center @ body(y["q"], upwards)
 
     q = jnp.asarray([0.8, 0.6, 0.0, 0.0])
-    start = {"q": q, "m": jnp.asarray([1.0, 0.5, 3.5])}
+    y0 = {"q": q, "m": jnp.asarray([1.0, 0.5, 3.5])}
     terms = (kick, *map(spin, range(3)))
-    return System(start, energy, field, 40.0, 1e5, terms, (1.0, 0.0, 0.0, 0.0))
+    return System(y0, energy, field, 40.0, 1e5, terms, (1.0, 0.0, 0.0, 0.0))
 
 
 def directions(seed: int, *sides: int) -> Array:
@@ -289,12 +289,13 @@ def spins() -> System:
     flows do not keep, the energy then walks at random.
     """
     axes, applied = jnp.eye(3), jnp.asarray([[0.1, 0.0, 0.3]])
-    first, second, chiral, anisotropy = 1.0, 0.4, 0.3, jnp.asarray([[0.0, 0.0, 0.5]])
+    nearest, next_nearest, chiral, anisotropy = 1.0, 0.4, 0.3, jnp.asarray([[0.0, 0.0, 0.5]])
     is_even = jnp.arange(6)[:, None] % 2 == 0
 
     def exchange(s: Array) -> Array:
-        left, right = jnp.roll(s, 1, axis=0), jnp.roll(s, -1, axis=0)
-        return first * (left + right) + second * (jnp.roll(left, 1, 0) + jnp.roll(right, -1, 0))
+        before, after = jnp.roll(s, 1, axis=0), jnp.roll(s, -1, axis=0)
+        second = jnp.roll(before, 1, 0) + jnp.roll(after, -1, 0)
+        return nearest * (before + after) + next_nearest * second
 
     def twist(s: Array) -> Array:
         return chiral * jnp.cross(jnp.roll(s, -1, axis=0) - jnp.roll(s, 1, axis=0), axes[2:])
@@ -304,7 +305,7 @@ def spins() -> System:
         return lambda s: cfjax.Rotation(unit * (exchange(s) + anisotropy * s + applied))
 
     def twisted(even: int, odd: int) -> Part:
-        """This component of the even spins with that of the odd ones."""
+        """Couples component `even` of the even spins with component `odd` of the odd spins."""
         mask = jnp.where(is_even, axes[even : even + 1], axes[odd : odd + 1])
         return lambda s: cfjax.Rotation(mask * twist(s))
 
@@ -316,10 +317,10 @@ def spins() -> System:
         energy,
         lambda s: cfjax.Rotation(exchange(s) + twist(s) + anisotropy * s + applied),
         rate=80.0,
-        end=2e4,
+        t1=2e4,
         terms=(along(0), twisted(0, 1), along(1), twisted(1, 0), along(2)),
         # By the number of components of neighbours that they read.
-        parts=(1 / 4, 1 / 8, 1 / 4, 1 / 8, 1 / 4),
+        shares=(1 / 4, 1 / 8, 1 / 4, 1 / 8, 1 / 4),
     )
 
 
@@ -335,8 +336,8 @@ def vortices() -> System:
         total = strength[i] * x[i] + strength[k] * x[k]
         return total / (4 * jnp.pi * (1 - x[i] @ x[k]))
 
-    def pairs(other: dict[int, int]) -> Part:
-        return lambda x: tuple(cfjax.Rotation(velocity(x, i, other[i])) for i in range(6))
+    def pairs(partner: dict[int, int]) -> Part:
+        return lambda x: tuple(cfjax.Rotation(velocity(x, i, partner[i])) for i in range(6))
 
     def field(x: tuple[Array, ...]) -> PyTree:
         sums = (sum(velocity(x, i, k) for k in range(6) if k != i) for i in range(6))
@@ -347,8 +348,8 @@ def vortices() -> System:
         total = sum(itertools.starmap(pair, itertools.combinations(range(6), 2)), jnp.zeros(()))
         return -total / (4 * jnp.pi)
 
-    start = tuple(directions(5, 6))
-    return System(start, energy, field, 40.0, 5e4, tuple(map(pairs, rounds)), (1 / 5,) * 5)
+    y0 = tuple(directions(5, 6))
+    return System(y0, energy, field, 40.0, 5e4, tuple(map(pairs, rounds)), (1 / 5,) * 5)
 
 
 def fluid() -> System:
@@ -359,7 +360,7 @@ def fluid() -> System:
         lambda y: zeitlin.energy(y, inverse),
         lambda y: zeitlin.field(0.0, y, inverse),
         rate=60.0,
-        end=6.7e4,
+        t1=6.7e4,
     )
 
 
@@ -380,9 +381,9 @@ def lattice() -> System:
         lambda s: -jnp.sum(s * neighbours(s)) / 128,
         lambda s: cfjax.Rotation(neighbours(s)),
         rate=40.0,
-        end=2.6e4,
+        t1=2.6e4,
         terms=(colour(0), colour(1)),
-        parts=(1 / 2, 1 / 2),
+        shares=(1 / 2, 1 / 2),
     )
 
 
@@ -400,14 +401,14 @@ SYSTEMS: dict[str, Callable[[], System]] = {
 
 def top_with_large_steps(quick: bool) -> Iterator[results.Row]:
     system, name, rates = top(), "top, large steps", (10.0, 20.0, 40.0, 80.0)
-    found: dict[float, dict[str, Run]] = {rate: {} for rate in rates}
+    runs: dict[float, dict[str, Run]] = {rate: {} for rate in rates}
     for method in (*SPLITTINGS, "CF4", "RKMK8"):
         program = Program(system, method)
         for rate in rates:
-            found[rate][method] = program.run(rate, 1e3 if quick else 1e4)
-            yield row(name, method, rate, found[rate][method])
+            runs[rate][method] = program.run(rate, 1e3 if quick else 1e4)
+            yield row(name, method, rate, runs[rate][method])
     for rate in rates:
-        yield from break_even(name, rate, found[rate])
+        yield from break_even(name, rate, runs[rate])
 
 
 OSCILLATOR: dict[str, Any] = SPLITTINGS | {
@@ -431,10 +432,10 @@ def oscillator() -> Iterator[results.Row]:
         @jax.vmap
         def is_stable(h: Any, term: Any = term, solver: Any = solver) -> Array:
             def step(y: Array) -> Array:
-                start = {"q": y[:1], "p": y[1:]}
-                sol = cfjax.integrate(term, solver, 0.0, h, start, num_steps=1, throw=False)
-                end = jnp.concatenate([sol.ys["q"][-1], sol.ys["p"][-1]])  # pyright: ignore
-                return jnp.where(diffrax.is_okay(sol.result), end, jnp.nan)
+                y0 = {"q": y[:1], "p": y[1:]}
+                sol = cfjax.integrate(term, solver, 0.0, h, y0, num_steps=1, throw=False)
+                y1 = jnp.concatenate([sol.ys["q"][-1], sol.ys["p"][-1]])  # pyright: ignore
+                return jnp.where(diffrax.is_okay(sol.result), y1, jnp.nan)
 
             # The eigenvalues of a matrix of determinant one are on the unit circle.
             return jnp.abs(jnp.trace(jax.vmap(step)(jnp.eye(2)))) <= 2 + 1e-12
@@ -442,8 +443,8 @@ def oscillator() -> Iterator[results.Row]:
         low, high = 0.01, 4.0
         while high - low > 1e-9:
             steps = np.linspace(low, high, 400)
-            first = int(np.argmin(is_stable(steps)))
-            low, high = steps[first - 1], steps[first]
+            first_unstable = int(np.argmin(is_stable(steps)))
+            low, high = steps[first_unstable - 1], steps[first_unstable]
         yield {"oscillator": name, "forces": forces, "longest step": results.digits(low)}
 
 
@@ -481,17 +482,17 @@ def draw() -> dict[str, Figure]:
     panels = figure.subplots(2, 3)
     for axes, name in zip(panels.flat, TITLES, strict=False):
         _panel(axes, name, results.pick(rows, system=name))
-    last = panels[1, 2]
-    last.set_axis_off()
+    legend_axes = panels[1, 2]
+    legend_axes.set_axis_off()
     used = [method for method in STYLES if results.pick(rows, method=method)]
     for method in used:
-        last.plot([], [], label=LABELS.get(method, method), **STYLES[method])
+        legend_axes.plot([], [], label=LABELS.get(method, method), **STYLES[method])
     for axes in panels[:, 0]:
         axes.set_ylabel("largest error of the energy until t")
     for axes in panels.flat[:-1]:
         axes.grid(color="0.9", linewidth=0.6)
         axes.set_axisbelow(True)
-    last.legend(loc="center", frameon=False, handlelength=3.5, fontsize=10)
+    legend_axes.legend(loc="center", frameon=False, handlelength=3.5, fontsize=10)
     return {"energy": figure}
 
 

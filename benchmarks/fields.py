@@ -105,7 +105,7 @@ class Quaternion(cfjax.AbstractAlgebraElement):
 
 
 class Normalised(Quaternion):
-    """With the length restored, as many do who fear drift."""
+    """The same, with the length normalised after each flow, as users often do."""
 
     def flow(self, point):
         moved = super().flow(point)
@@ -140,28 +140,28 @@ def term(way: str) -> cfjax.LieTerm:
 
 
 def solve(loop: str, solver: Any, way: str) -> Callable[[Any, Array], Any]:
-    end = STEP * STEPS
+    t1 = STEP * STEPS
 
-    def last(state, inertia):
+    def final_state(state, inertia):
         if loop == "cfjax.integrate":
-            sol = cfjax.integrate(term(way), solver, 0.0, end, state, inertia, num_steps=STEPS)
+            sol = cfjax.integrate(term(way), solver, 0.0, t1, state, inertia, num_steps=STEPS)
         else:
             sol = diffrax.diffeqsolve(
-                term(way), solver, 0.0, end, STEP, state, inertia, max_steps=STEPS + 1
+                term(way), solver, 0.0, t1, STEP, state, inertia, max_steps=STEPS + 1
             )
         return jax.tree.map(lambda ys: ys[-1], sol.ys)
 
-    return last
+    return final_state
 
 
-def gradient(last: Callable[[Any, Array], Any]) -> Callable[[Any, Array], Any]:
+def gradient(final_state: Callable[[Any, Array], Any]) -> Callable[[Any, Array], Any]:
     def loss(state, inertia):
-        return sum(jnp.sum(jnp.sin(x)) for x in jax.tree.leaves(last(state, inertia)))
+        return sum(jnp.sum(jnp.sin(x)) for x in jax.tree.leaves(final_state(state, inertia)))
 
     return jax.grad(loss, argnums=(0, 1))
 
 
-def start(systems: int) -> dict[str, Array]:
+def initial_state(systems: int) -> dict[str, Array]:
     rng = np.random.default_rng(0)
     q, momentum = rng.normal(size=(systems, 4)), rng.normal(size=(systems, 3))
     q /= np.linalg.norm(q, axis=1, keepdims=True)
@@ -169,7 +169,7 @@ def start(systems: int) -> dict[str, Array]:
 
 
 def compiled(program: Callable[..., Any], systems: int) -> Callable[[], Any]:
-    state, inertia = start(BATCH), jnp.asarray(INERTIA)
+    state, inertia = initial_state(BATCH), jnp.asarray(INERTIA)
     if systems == 1:
         state = jax.tree.map(lambda x: x[0], state)
     else:
@@ -181,23 +181,23 @@ def measure(quick: bool) -> Iterator[results.Row]:
     for loop in LOOPS[: 1 if quick else None]:
         for systems in REPEATS:
             solves = {name: [solve(loop, s, way) for way in WAYS] for name, s in SOLVERS.items()}
-            solves["CF4, gradient"] = [gradient(last) for last in solves["CF4"]]
+            solves["CF4, gradient"] = [gradient(final_state) for final_state in solves["CF4"]]
             programs = [compiled(program, systems) for row in solves.values() for program in row]
             check([program() for program in programs[: len(WAYS)]])
             seconds = take_turns(programs, repeats=3 if quick else 25)
             seconds = seconds.reshape(len(solves), len(WAYS), -1)
             work = STEPS * systems * REPEATS[systems]
-            for name, taken in zip(solves, seconds, strict=True):
-                best = min(taken, key=np.median)
+            for name, times in zip(solves, seconds, strict=True):
+                best = min(times, key=np.median)
                 for k, way in enumerate(WAYS):
                     yield {
                         "way": way,
                         "loop": loop,
                         "program": name,
                         "systems": systems,
-                        "seconds a step": results.spread(taken[k] / work),
-                        "over the best": results.ratios(taken[k], best),
-                        "over the solve": results.ratios(taken[k], seconds[0, k]),
+                        "seconds a step": results.spread(times[k] / work),
+                        "over the best": results.ratios(times[k], best),
+                        "over the solve": results.ratios(times[k], seconds[0, k]),
                     }
 
 

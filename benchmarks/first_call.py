@@ -19,7 +19,7 @@ METHODS = ("Tsit5", "CF4", "CF54", "RKMK(Dopri8)")
 
 
 def fields(problem: str, xp: Any) -> tuple[Callable[..., Any], Callable[..., Any], Any]:
-    """What makes the frozen field, given cfjax; the velocity in plain space; and the start.
+    """A function from cfjax to the frozen field, the velocity in plain space, and the start.
 
     They are written out as a user would, for each problem alone. `xp` is `jax.numpy`.
     """
@@ -80,7 +80,7 @@ def fields(problem: str, xp: Any) -> tuple[Callable[..., Any], Callable[..., Any
 
 
 def solve(problem: str, method: str, way: str) -> None:
-    """All of it in a process that has imported nothing yet."""
+    """The whole solve, imports included."""
     import diffrax
     import jax
 
@@ -112,21 +112,21 @@ def measure(quick: bool) -> "Iterator[results.Row]":
     fresh_process.seconds(__file__, PROBLEMS[0], "CF4", WAYS[0])
     for problem in PROBLEMS:
         for way in WAYS:
-            taken = [
+            turns = [
                 [fresh_process.seconds(__file__, problem, m, way) for m in METHODS]
                 for _ in range(repeats)
             ]
-            processor, clock = ([[pair[k] for pair in turn] for turn in taken] for k in range(2))
+            processor, clock = ([[pair[k] for pair in turn] for turn in turns] for k in range(2))
             base = [turn[0] for turn in processor]
             for k, method in enumerate(METHODS):
-                own = [turn[k] for turn in processor]
+                seconds = [turn[k] for turn in processor]
                 yield {
                     "problem": problem,
                     "way": way,
                     "method": method,
-                    "CPU seconds": results.spread(own),
+                    "CPU seconds": results.spread(seconds),
                     "seconds": results.spread(turn[k] for turn in clock),
-                    "over Tsit5": results.ratios(own, base),
+                    "over Tsit5": results.ratios(seconds, base),
                 }
 
 

@@ -1,4 +1,4 @@
-"""The gradient of a fit to data at every step: what it costs to compile and to run.
+"""The gradient of a fit to data at every step: time to compile and to run.
 
 `cfjax.integrate` makes equal steps and saves the state after each step (or each fifth step). The
 loss is the sum of cubes of all saved numbers, and the derivative is with respect to the start and
@@ -72,26 +72,26 @@ def fit(field: Any, solver: Any, save_every: int) -> Callable[[Any, Any], Any]:
 
 def measure(quick: bool) -> Iterator[results.Row]:
     for problem in [*PROBLEMS][: 1 if quick else None]:
-        field, *start = PROBLEMS[problem]
-        start = jax.tree.map(jnp.asarray, start)
+        field, *args = PROBLEMS[problem]
+        args = jax.tree.map(jnp.asarray, args)
         for name, solver in SOLVERS.items():
             runs, seconds = [], {}
             for form, (is_on, save_every) in FORMS.items():
                 with cfjax.rewriting(is_on):
                     begin = time.process_time()
-                    run = results.compiled(fit(field, solver, save_every), *start, repeats=REPEATS)
+                    run = results.compiled(fit(field, solver, save_every), *args, repeats=REPEATS)
                     seconds[form] = time.process_time() - begin
                 runs.append(run)
             times = take_turns(runs, repeats=5 if quick else 25) / REPEATS
             base = times[list(FORMS).index("every fifth")]
-            for form, own in zip(FORMS, times, strict=True):
+            for form, gradient_seconds in zip(FORMS, times, strict=True):
                 yield {
                     "problem": problem,
                     "solver": name,
                     "saved": form,
                     "compile, seconds": results.digits(seconds[form]),
-                    "gradient, seconds": results.spread(own),
-                    "over every fifth": results.ratios(own, base),
+                    "gradient, seconds": results.spread(gradient_seconds),
+                    "over every fifth": results.ratios(gradient_seconds, base),
                 }
 
 

@@ -1,7 +1,7 @@
-"""Times of a fresh process, from its start until it has done what a benchmark asks for.
+"""Times of a fresh process, from its start until it has finished the task of a benchmark.
 
-A benchmark's file is its own command for one of them, `python FILE --one ...`. At the top neither
-imports what the process is to import itself.
+A benchmark's file is the command of such a process, `python FILE --one ...`. Its imports are part
+of the measured time, so neither file imports jax or cfjax at the top.
 """
 
 import json
@@ -16,19 +16,19 @@ if TYPE_CHECKING:
     import results
 
 
-def seconds(file: str, *what: str) -> tuple[float, float]:
-    """Of the processor, and of the clock."""
+def seconds(file: str, *arguments: str) -> tuple[float, float]:
+    """Seconds of the processor, and of the clock."""
     begin = time.monotonic()
-    command = [sys.executable, file, "--one", *what]
-    done = subprocess.run(command, check=True, capture_output=True, text=True)
-    processor, end = json.loads(done.stdout)
+    command = [sys.executable, file, "--one", *arguments]
+    process = subprocess.run(command, check=True, capture_output=True, text=True)
+    processor, end = json.loads(process.stdout)
     return processor, end - begin
 
 
-def run(file: str, doc: str | None, measure: "results.Measure", one: Callable[..., None]) -> None:
-    """The command of a benchmark, and within it that of one of its processes, which calls `one`."""
+def run(file: str, doc: str | None, measure: "results.Measure", task: Callable[..., None]) -> None:
+    """The command of a benchmark, and with `--one` that of a process, which calls `task`."""
     if sys.argv[1:2] == ["--one"]:
-        one(*sys.argv[2:])
+        task(*sys.argv[2:])
         usage = resource.getrusage(resource.RUSAGE_SELF)
         # This clock is the same for all processes.
         print(json.dumps([usage.ru_utime + usage.ru_stime, time.monotonic()]))

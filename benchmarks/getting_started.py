@@ -1,6 +1,6 @@
-"""What a reader waits for who pastes *Getting started*, up to the first line that is printed.
+"""Time of the code of *Getting started* up to the first printed line.
 
-Each time in a fresh process with nothing compiled before, imports included.
+Each run is a fresh process with nothing compiled before, imports included.
 """
 
 from collections.abc import Iterator

@@ -24,12 +24,12 @@ END, STEPS = 10.0, 100
 
 
 class Case(NamedTuple):
-    """A program, what it starts from, in float64, and how many members have a time each."""
+    """A program, its inputs in float64, and the number of members of the batch."""
 
     problem: str
     method: str
     run: Callable[[Any], Any]
-    start: Any
+    inputs: Any
     members: int
 
 
@@ -48,8 +48,8 @@ def equal_steps(solver: Any, rewrites: bool = True) -> Callable[[Any], Any]:
     def solve(y0: Any, inertia: Any) -> Any:
         with cfjax.rewriting(rewrites):
             options: Any = dict(num_steps=STEPS, throw=False)
-            found: Any = cfjax.integrate(equation, solver, 0.0, END, y0, inertia, **options)
-            return found.ys[-1]
+            solution: Any = cfjax.integrate(equation, solver, 0.0, END, y0, inertia, **options)
+            return solution.ys[-1]
 
     return lambda members: jax.vmap(solve)(*members)
 
@@ -89,16 +89,16 @@ def bodies(count: int) -> Any:
 
 def cases(quick: bool) -> Iterator[Case]:
     for members in (1, 1000, 100) if quick else (1, 1000, 100_000):
-        start = bodies(members)
-        case = functools.partial(Case, "rigid bodies, equal steps", start=start, members=members)
+        inputs = bodies(members)
+        case = functools.partial(Case, "rigid bodies, equal steps", inputs=inputs, members=members)
         yield case("CF4", equal_steps(cfjax.CF4()))
         if members > 1:
             yield case("CF4, as traced", equal_steps(cfjax.CF4(), False))
         yield case("Tsit5", equal_steps(diffrax.Tsit5()))
     members = 1000 if quick else 100_000
-    start = bodies(members)
+    inputs = bodies(members)
     case = functools.partial(
-        Case, "gradient of rigid bodies, equal steps", start=start, members=members
+        Case, "gradient of rigid bodies, equal steps", inputs=inputs, members=members
     )
     yield case("CF4", gradient(equal_steps(cfjax.CF4())))
     yield case("Tsit5", gradient(equal_steps(diffrax.Tsit5())))
@@ -106,7 +106,7 @@ def cases(quick: bool) -> Iterator[Case]:
         for solver in (cfjax.CF54(), cfjax.RKMK8(), diffrax.Tsit5()):
             method = type(solver).__name__
             problem = f"rigid bodies, adaptive steps, {name}"
-            yield Case(problem, method, controlled(solver, num_saves), start, members)
+            yield Case(problem, method, controlled(solver, num_saves), inputs, members)
 
     side = 64 if quick else 1024
     magnet: Any = dict(num_steps=20, throw=False)
@@ -119,10 +119,10 @@ def cases(quick: bool) -> Iterator[Case]:
         def run(y: Any, solver: Any = solver, on: bool = on) -> Any:
             equation = term(solver, spins.field, spins.velocity)
             with cfjax.rewriting(on):
-                found: Any = cfjax.integrate(
+                solution: Any = cfjax.integrate(
                     equation, solver, 0.0, 1.0, y, spins.Magnet(), **magnet
                 )
-            return found.ys[-1]
+            return solution.ys[-1]
 
         yield Case(f"{side} x {side} spins", method, run, spins.y0(side, side), 1)
 
@@ -132,8 +132,8 @@ def cases(quick: bool) -> Iterator[Case]:
 
         def react(y: Any, solver: Any = solver, steps: int = steps) -> Any:
             options: Any = dict(args=gray_scott.Reactor(), num_steps=steps, throw=False)
-            found: Any = cfjax.integrate(reaction, solver, 0.0, 100.0, y, **options)
-            return found.ys["v"][-1]
+            solution: Any = cfjax.integrate(reaction, solver, 0.0, 100.0, y, **options)
+            return solution.ys["v"][-1]
 
         method = f"{type(solver).__name__}, {steps} steps"
         yield Case(f"Gray and Scott's reaction, {n} x {n}", method, react, gray_scott.y0(n), 1)
@@ -144,11 +144,11 @@ def measure(quick: bool) -> Iterator[results.Row]:
     devices = [jax.devices("gpu")[0], jax.devices("cpu")[0]]
     for dtype in ("float64", "float32"):
         for case in cases(quick):
-            start = jax.tree.map(lambda x: np.asarray(x, dtype), case.start)  # noqa: B023
-            found = [_time(case.run, start, device) for device in devices]
-            (here, *_), (there, *_) = found
-            off = jax.tree.map(lambda a, b: np.max(np.abs(a - b), initial=0.0), here, there)
-            for device, (_, seconds, compile_seconds) in zip(devices, found, strict=True):
+            inputs = jax.tree.map(lambda x: np.asarray(x, dtype), case.inputs)  # noqa: B023
+            measured = [_time(case.run, inputs, device) for device in devices]
+            (on_gpu, *_), (on_cpu, *_) = measured
+            gaps = jax.tree.map(lambda a, b: np.max(np.abs(a - b), initial=0.0), on_gpu, on_cpu)
+            for device, (_, seconds, compile_seconds) in zip(devices, measured, strict=True):
                 yield {
                     "problem": case.problem,
                     "dtype": dtype,
@@ -157,23 +157,23 @@ def measure(quick: bool) -> Iterator[results.Row]:
                     "device": device.device_kind,
                     "seconds": results.spread(seconds),
                     "compile seconds": results.digits(compile_seconds),
-                    "difference": results.digits(max(map(float, jax.tree.leaves(off)))),
+                    "difference": results.digits(max(map(float, jax.tree.leaves(gaps)))),
                 }
 
 
-def _time(run: Callable[[Any], Any], start: Any, device: Any) -> tuple[Any, list[float], float]:
-    start = jax.device_put(start, device)
+def _time(run: Callable[[Any], Any], inputs: Any, device: Any) -> tuple[Any, list[float], float]:
+    inputs = jax.device_put(inputs, device)
     begin = time.perf_counter()
-    program = jax.jit(run).lower(start).compile()
+    program = jax.jit(run).lower(inputs).compile()
     compile_seconds = time.perf_counter() - begin
-    out = jax.block_until_ready(program(start))
+    output = jax.block_until_ready(program(inputs))
     seconds = []
     begin = time.perf_counter()
     while len(seconds) < 7 and (not seconds or time.perf_counter() - begin < 2):
         before = time.perf_counter()
-        jax.block_until_ready(program(start))
+        jax.block_until_ready(program(inputs))
         seconds.append(time.perf_counter() - before)
-    return jax.tree.map(np.asarray, out), seconds, compile_seconds
+    return jax.tree.map(np.asarray, output), seconds, compile_seconds
 
 
 if __name__ == "__main__":

@@ -1,4 +1,4 @@
-"""What a gradient costs, over its solve: CF4 and Tsit5, alone and in a batch.
+"""The cost of a gradient relative to its solve: CF4 and Tsit5, alone and in a batch.
 
 The gradient of one number is with respect to the initial value. A solve and its gradient take
 turns.
@@ -68,7 +68,7 @@ def measure(quick: bool) -> Iterator[results.Row]:
     for state in [*STATES][: 1 if quick else None]:
         field, y0 = STATES[state]
         for systems in REPEATS:
-            start = many(y0, systems)
+            y0s = many(y0, systems)
             for name, solve in PROGRAMS.items():
 
                 def value(y0, solve=solve, field=field):
@@ -79,7 +79,7 @@ def measure(quick: bool) -> Iterator[results.Row]:
                 if systems > 1:
                     programs = [jax.vmap(program) for program in programs]
                 repeats = REPEATS[systems]
-                runs = [results.compiled(p, start, repeats=repeats) for p in programs]
+                runs = [results.compiled(p, y0s, repeats=repeats) for p in programs]
                 solves, gradients = take_turns(runs, repeats=3 if quick else 25)
                 work = STEPS * systems * repeats
                 yield {

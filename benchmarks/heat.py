@@ -1,10 +1,10 @@
 """Time of one CF4 step of the heat problem against NumPy and SciPy.
 
-Two programs make the same steps with `scipy.fft`, and compute
-the exponentials of a step of fixed size once, before the loop: one as the paper writes the method,
-with grid values as the state and three transforms for each flow, the other with the sine
-coefficients as the state, as cfjax does, so with 8 transforms a step instead of 15. All programs
-take turns in one run, so that the ratios mean something on a busy machine.
+Two programs make the same steps with `scipy.fft`, and compute the exponentials of a step of fixed
+size once, before the loop: one as the paper writes the method, with grid values as the state and
+three transforms for each flow, the other with the sine coefficients as the state, as cfjax does, so
+with 8 transforms a step instead of 15. All programs take turns in one run, so that the ratios are
+meaningful on a busy machine.
 """
 
 from collections.abc import Callable, Iterator
@@ -16,7 +16,6 @@ import scipy.fft
 
 import cfjax
 import results
-from cfjax._measure.work_precision import take_turns
 from cfjax.scenes import heat
 
 SIZES = (100, 1000, 10_000)
@@ -37,8 +36,7 @@ def measure(quick: bool) -> Iterator[results.Row]:
             "cfjax, grid values": compiled(size, steps, spectral=False),
         }
         check(*(program() for program in programs.values()))
-        seconds = take_turns(list(programs.values()), repeats=3 if quick else 15)
-        times = dict(zip(programs, seconds, strict=True))
+        times = results.in_turns(programs, repeats=3 if quick else 15)
         for name, values in times.items():
             yield {"N": size, "program": name, "seconds a step": results.spread(values / steps)} | {
                 f"over {state}": results.ratios(values, times[f"NumPy and SciPy, {state}"])
@@ -59,8 +57,8 @@ def compiled(size: int, steps: int, *, spectral: bool) -> Callable[[], np.ndarra
 
     def run(y0, args):
         y0 = y0 if spectral else heat.to_grid(y0)
-        end = steps * STEP
-        solution = cfjax.integrate(term, cfjax.CF4(), 0.0, end, y0, args, num_steps=steps)
+        t1 = steps * STEP
+        solution = cfjax.integrate(term, cfjax.CF4(), 0.0, t1, y0, args, num_steps=steps)
         y = jax.tree.map(lambda ys: ys[-1], solution.ys)
         return heat.to_grid(y) if spectral else y
 
@@ -133,11 +131,11 @@ def coefficients(size: int) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     return nu, np.exp(z), np.expm1(z) / z
 
 
-def check(reference: np.ndarray, *others: np.ndarray) -> None:
-    # The same steps; what differs is rounding, which the heat equation damps.
-    for other in others:
-        if not np.allclose(other, reference, atol=1e-10, rtol=0):
-            raise RuntimeError(f"Programs disagree by {np.abs(other - reference).max()}.")
+def check(reference: np.ndarray, *alternatives: np.ndarray) -> None:
+    # The steps are the same. They differ by rounding, which the heat equation damps.
+    for alternative in alternatives:
+        if not np.allclose(alternative, reference, atol=1e-10, rtol=0):
+            raise RuntimeError(f"Programs disagree by {np.abs(alternative - reference).max()}.")
 
 
 if __name__ == "__main__":

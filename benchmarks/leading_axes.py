@@ -16,7 +16,6 @@ import numpy as np
 
 import cfjax
 import results
-from cfjax._measure.work_precision import take_turns
 from cfjax.scenes import spins
 
 STEP, STEPS = 0.05, 20
@@ -44,7 +43,7 @@ def pose(t: Any, y: Any, args: Any) -> Any:
     return cfjax.RigidMotion(omega=w, v=v, frame="body", layout="wxyz_xyz")
 
 
-def own(t: Any, s: Any, args: Any) -> Any:
+def single_spin(t: Any, s: Any, args: Any) -> Any:
     """The field of `spins` for spins without neighbours."""
     b = args.anisotropy * s * np.array([0.0, 0.0, 1.0]) + jnp.array(args.applied)
     return cfjax.Rotation((b + args.damping * jnp.cross(s, b)) / (1 + args.damping**2))
@@ -82,16 +81,17 @@ def normalised(y: Any) -> Any:
 def rows(programs: dict[str, Any], y: Any, turns: int, **about: Any) -> Iterator[results.Row]:
     leaf = jax.tree.leaves(y)[0]
     members = leaf.size // leaf.shape[-1]
-    compiled = [results.compiled(run, y) for run in programs.values()]
-    # One step of one member.
-    seconds = take_turns(compiled, repeats=turns) / (STEPS * members)
-    for name, times in zip(programs, seconds, strict=True):
+    compiled = {name: results.compiled(run, y) for name, run in programs.items()}
+    times = results.in_turns(compiled, repeats=turns)
+    base = [*times.values()][-1]
+    for name, seconds in times.items():
         yield {
             **about,
             "way": name,
             "members": members,
-            "seconds": results.spread(times),
-            "ratio": results.ratios(times, seconds[-1]),
+            # One step of one member.
+            "seconds": results.spread(seconds / (STEPS * members)),
+            "ratio": results.ratios(seconds, base),
         }
 
 
@@ -101,7 +101,7 @@ def measure(quick: bool) -> Iterator[results.Row]:
         "quaternion": (quaternion, units(MEMBERS, 4)),
         "attitude and momentum": (attitude, {"q": units(MEMBERS, 4), "m": units(MEMBERS, 3)}),
         "pose": (pose, np.concatenate([units(MEMBERS, 4), units(MEMBERS, 3)], axis=-1)),
-        "spin without neighbours": (own, units(MEMBERS, 3)),
+        "spin without neighbours": (single_spin, units(MEMBERS, 3)),
     }
     for name, (field, y) in states.items():
         programs = {"leading axes": solve(field), "vmap": jax.vmap(solve(field))}
@@ -111,7 +111,7 @@ def measure(quick: bool) -> Iterator[results.Row]:
         "CF4": solve(spins.field),
         "CF54": solve(spins.field, cfjax.CF54()),
         "Dopri5 with normalisation": normalised,
-        "CF4, without neighbours, vmap": jax.vmap(jax.vmap(solve(own))),
+        "CF4, without neighbours, vmap": jax.vmap(jax.vmap(solve(single_spin))),
     }
     exact = jax.jit(solve(spins.field, cfjax.CF54(), 5 * STEPS))(y)
     for row in rows(programs, y, turns, state="ferromagnet"):

@@ -1,5 +1,4 @@
-"""Noise: what methods err on a path and in the mean, with steps that are too large, and what they
-cost.
+"""Noise: errors on a path and in the mean, steps that are too large, and costs.
 
 A unit vector turns with random angular velocities. The methods of cfjax turn it. Those of diffrax
 step in plain space, with and without a projection to the sphere after each step. The Brownian paths
@@ -50,8 +49,8 @@ class Projected(diffrax.AbstractWrappedSolver):
         return self.solver.init(terms, t0, t1, y0, args)
 
     def step(self, terms, t0, t1, y0, args, solver_state, made_jump):
-        y1, *others = self.solver.step(terms, t0, t1, y0, args, solver_state, made_jump)
-        return y1 / jnp.linalg.norm(y1), *others
+        y1, *remainder = self.solver.step(terms, t0, t1, y0, args, solver_state, made_jump)
+        return y1 / jnp.linalg.norm(y1), *remainder
 
     def func(self, terms, t0, y0, args):
         return self.solver.func(terms, t0, y0, args)
@@ -134,12 +133,12 @@ class Grid(diffrax.AbstractBrownianPath):
         return 1.0
 
     def evaluate(self, t0: Any, t1: Any = None, left: bool = True, use_levy: bool = False) -> Any:
-        start, end = self._at(t0), self._at(t1)
-        w = end[0] - start[0]
+        at_t0, at_t1 = self._at(t0), self._at(t1)
+        w = at_t1[0] - at_t0[0]
         if not use_levy:
             return w
         h = t1 - t0
-        area = (end[1] - start[1]) / h - start[0] - w / 2
+        area = (at_t1[1] - at_t0[1]) / h - at_t0[0] - w / 2
         return diffrax.SpaceTimeLevyArea(dt=h, W=w, H=area)
 
     def _at(self, t: Any) -> tuple[Array, Array]:
@@ -147,7 +146,7 @@ class Grid(diffrax.AbstractBrownianPath):
         return self.values[k], self.integrals[k]
 
 
-class Given(diffrax.AbstractBrownianPath):
+class OneStepPath(diffrax.AbstractBrownianPath):
     """A path for one step, with this increment and this area."""
 
     w: Float[Array, " channels"]
@@ -185,7 +184,7 @@ def unsafe(name: str, shape: tuple[int, ...], key: Any) -> diffrax.UnsafeBrownia
 
 
 def states(name: str, terms: Any, t0: Any, t1: Any, y0: Any, steps: int) -> Array:
-    """After each of the steps. What overflows is not finite, and no error."""
+    """The states after each step. A state that overflows is not finite, and no error."""
     sol = cfjax.integrate(
         terms, SOLVERS[name], t0, t1, y0, num_steps=steps, save_every=1, throw=False
     )
@@ -230,7 +229,7 @@ def strong(noise: str, equation: Equation, quick: bool) -> Iterator[results.Row]
 def ends(name: str, equation: Equation) -> Callable[[Grid, int], Array]:
     """The program for the states at t = 1 on many paths, after any number of steps."""
 
-    def one(path: Grid, count: Any) -> Array:
+    def solve_path(path: Grid, count: Any) -> Array:
         terms, h = equation.terms(name, path), BLOCK / count
 
         def block(k: Any, y: Array) -> Array:
@@ -238,7 +237,7 @@ def ends(name: str, equation: Equation) -> Callable[[Grid, int], Array]:
 
         return lax.fori_loop(0, count // BLOCK, block, jnp.asarray(Y0))
 
-    return jax.jit(jax.vmap(one, in_axes=(0, None)))
+    return jax.jit(jax.vmap(solve_path, in_axes=(0, None)))
 
 
 def root_mean_square(values: Array) -> Array:
@@ -299,32 +298,32 @@ def mean_of_step(name: str) -> Callable[[Any], Array]:
     counts = [NODES] * 4 if name in WITH_AREA else [2 * NODES] * 2 + [1] * 2
     rules = [np.polynomial.hermite_e.hermegauss(n) for n in counts]
     nodes, weights = (
-        np.stack([x.ravel() for x in np.meshgrid(*parts, indexing="ij")])
-        for parts in zip(*rules, strict=True)
+        np.stack([x.ravel() for x in np.meshgrid(*rule_axes, indexing="ij")])
+        for rule_axes in zip(*rules, strict=True)
     )
     weight = weights.prod(axis=0) / np.sqrt(2 * np.pi) ** 4
-    start = np.stack([np.sqrt(1 - Z**2), np.zeros_like(Z), Z], axis=1)
+    initial = np.stack([np.sqrt(1 - Z**2), np.zeros_like(Z), Z], axis=1)
 
     def program(h: Any) -> Array:
         def step(y: Array, w: Any, area: Any) -> Array:
-            path = Given(jnp.sqrt(h) * w, jnp.sqrt(h / 12) * area)
+            path = OneStepPath(jnp.sqrt(h) * w, jnp.sqrt(h / 12) * area)
             return states(name, AXISYMMETRIC.terms(name, path), 0.0, h, y, 1)[-1]
 
         def mean(y: Array) -> Array:
             z = jax.vmap(step, in_axes=(None, 1, 1))(y, nodes[:2], nodes[2:])[:, 2]
             return weight @ legendre(z)
 
-        return lax.map(mean, start)
+        return lax.map(mean, initial)
 
     return jax.jit(program)
 
 
 def legendre(z: Array) -> Array:
     """All polynomials, one in a column."""
-    found = [jnp.ones_like(z), z]
+    polynomials = [jnp.ones_like(z), z]
     for n in range(1, DEGREE):
-        found.append(((2 * n + 1) * z * found[n] - n * found[n - 1]) / (n + 1))
-    return jnp.stack(found, axis=1)
+        polynomials.append(((2 * n + 1) * z * polynomials[n] - n * polynomials[n - 1]) / (n + 1))
+    return jnp.stack(polynomials, axis=1)
 
 
 def generator(*, is_ito: bool) -> np.ndarray:
@@ -338,15 +337,14 @@ def generator(*, is_ito: bool) -> np.ndarray:
     return PROJECTION @ np.stack(columns, axis=1)
 
 
-# What a step costs in a batch.
+# The cost of a step in a batch.
 
 SYSTEMS, TIMED_STEPS = 1000, 32
 
 
 def times_of_steps(problem: str, equation: Equation, quick: bool) -> Iterator[results.Row]:
-    runs = [results.compiled(batch(name, equation)) for name in SOLVERS]
-    seconds = take_turns(runs, repeats=5 if quick else 50)
-    times = dict(zip(SOLVERS, seconds, strict=True))
+    runs = {name: results.compiled(batch(name, equation)) for name in SOLVERS}
+    times = results.in_turns(runs, repeats=5 if quick else 50)
     for name, values in times.items():
         yield {
             "problem": problem,
@@ -358,12 +356,12 @@ def times_of_steps(problem: str, equation: Equation, quick: bool) -> Iterator[re
 
 
 def batch(name: str, equation: Equation) -> Callable[[], Array]:
-    def one(key: Any) -> Array:
+    def solve_path(key: Any) -> Array:
         terms = equation.terms(name, unsafe(name, (equation.channels,), key))
         sol = cfjax.integrate(terms, SOLVERS[name], 0.0, 1.0, Y0, num_steps=TIMED_STEPS)
         return jnp.asarray(sol.ys)[-1]
 
-    return lambda: jax.vmap(one)(jax.random.split(jax.random.key(2), SYSTEMS))
+    return lambda: jax.vmap(solve_path)(jax.random.split(jax.random.key(2), SYSTEMS))
 
 
 # Steps that are too large: a spin at a temperature, whose mean is known.
@@ -405,21 +403,21 @@ def too_large(quick: bool) -> Iterator[results.Row]:
 def equilibrium(name: str) -> Callable[..., tuple[Array, Array]]:
     """The mean height of each copy of the spin, and its distance from the sphere at the end."""
 
-    def one(key: Any, h: Any, forget: Any, keep: Any) -> tuple[Array, Array]:
+    def simulate(key: Any, h: Any, forget: Any, keep: Any) -> tuple[Array, Array]:
         def block(k: Any, carry: tuple[Array, Array]) -> tuple[Array, Array]:
             y, mean = carry
             path = unsafe(name, (3,), jax.random.fold_in(key, k))
             ys = states(name, SPIN.terms(name, path), 0.0, BLOCK * h, y, BLOCK)
             return ys[-1], mean + jnp.where(k < forget, 0, jnp.mean(ys[:, 2]) / keep)
 
-        start = jnp.asarray(Y0), jnp.zeros(())
-        y, mean = lax.fori_loop(0, forget + keep, block, start)
+        initial = jnp.asarray(Y0), jnp.zeros(())
+        y, mean = lax.fori_loop(0, forget + keep, block, initial)
         return mean, jnp.abs(jnp.linalg.norm(y) - 1)
 
-    return jax.jit(jax.vmap(one, in_axes=(0, None, None, None)))
+    return jax.jit(jax.vmap(simulate, in_axes=(0, None, None, None)))
 
 
-# What a step costs: one spin, and a ring of many.
+# The cost of a step: one spin, and a ring of many.
 
 SPINS = (1, 4096)
 MAGNET = spins.Magnet()
@@ -466,7 +464,7 @@ def tree(name: str, shape: tuple[int, ...], key: Any) -> diffrax.VirtualBrownian
 
 
 def of_spins(count: int, steps: int, name: str, path: Any) -> Callable[[], Callable[[], Array]]:
-    """What makes the program of so many steps of a method."""
+    """A function that makes the program of so many steps of a method."""
     y0 = jnp.asarray(spins.y0(count)[0] if count == 1 else spins.y0(count))
 
     def make() -> Callable[[], Array]:
@@ -495,8 +493,8 @@ def numbers_alone(count: int, steps: int, area: Any) -> Callable[[], Callable[[]
                 drawn = path.evaluate(k / steps, (k + 1) / steps, use_levy=True)
                 return jax.tree.map(jnp.add, total, drawn)
 
-            start = jax.tree.map(jnp.zeros_like, path.evaluate(0.0, 1.0, use_levy=True))
-            return lax.fori_loop(0, steps, add, start)
+            zeros = jax.tree.map(jnp.zeros_like, path.evaluate(0.0, 1.0, use_levy=True))
+            return lax.fori_loop(0, steps, add, zeros)
 
         return program
 
@@ -512,7 +510,7 @@ def timed_compile(program: Callable[[], Array]) -> tuple[Callable[[], Array], fl
     return executable, seconds
 
 
-# What a gradient costs, with a state kept for every step or for a group of them.
+# The cost of a gradient, with a checkpoint at every step or at every few steps.
 
 GRADIENT_SPINS = 256
 
@@ -522,32 +520,32 @@ def gradients(quick: bool) -> Iterator[results.Row]:
     for steps in (200, 2000):
         groups = {None: "every step", round(np.sqrt(steps) / 5) * 5: "every {} steps"}
         programs = {"": jax.jit(loss(steps, None)).lower(y0).compile()}
-        for every, kept in groups.items():
-            gradient = jax.jit(jax.grad(loss(steps, every)))
-            programs[kept.format(every)] = gradient.lower(y0).compile()
+        for interval, label in groups.items():
+            gradient = jax.jit(jax.grad(loss(steps, interval)))
+            programs[label.format(interval)] = gradient.lower(y0).compile()
         runs = [lambda program=program: program(y0) for program in programs.values()]
         for run in runs:
             jax.block_until_ready(run())
         seconds = take_turns(runs, repeats=3 if quick else 15)
-        for (kept, program), values in zip(programs.items(), seconds, strict=True):
+        for (label, program), values in zip(programs.items(), seconds, strict=True):
             plan = program.memory_analysis()
             assert plan is not None
-            if kept:
+            if label:
                 yield {
                     "gradient of steps": steps,
-                    "keeps a state": kept,
+                    "keeps a state": label,
                     "MiB": results.digits(plan.temp_size_in_bytes / 2**20),
                     "seconds": results.spread(values),
                     "over the solve": results.ratios(values, seconds[0]),
                 }
 
 
-def loss(steps: int, every: int | None) -> Callable[[Array], Array]:
+def loss(steps: int, interval: int | None) -> Callable[[Array], Array]:
     def height(y0: Array) -> Array:
         noise = unsafe("CF2", y0.shape, jax.random.key(5))
         terms = diffrax.MultiTerm(cfjax.LieTerm(spins.field), cfjax.LieControlTerm(thermal, noise))
         sol = cfjax.integrate(
-            terms, cfjax.CF2(), 0.0, 1.0, y0, MAGNET, num_steps=steps, checkpoint_every=every
+            terms, cfjax.CF2(), 0.0, 1.0, y0, MAGNET, num_steps=steps, checkpoint_every=interval
         )
         return jnp.mean(jnp.asarray(sol.ys)[-1, :, 2])
 
@@ -574,7 +572,8 @@ STYLES |= {
 
 
 def draw() -> dict[str, Figure]:
-    found = results.load("noise")
+    stored = results.load("noise")
+    cores = stored["machine"]["cores"]
     figure = _style.new_figure(
         (10.5, 9.6),
         "Full lines: cfjax, on the sphere. Dashed: diffrax in plain space. Dotted: the same with a "
@@ -582,13 +581,13 @@ def draw() -> dict[str, Figure]:
         "solution in the sense of Itô, all others with that in the sense of Stratonovich. Errors "
         "of a mean are an rms over all starts. Times "
         f"are those of a path in a batch of {SYSTEMS}, random numbers included, in float64 on "
-        f"{found['machine']['cores']} cores. Last panel: thin lines are distances from the sphere, "
+        f"{cores} cores. Last panel: thin lines are distances from the sphere, "
         "and the grey area is twice the standard error; a line ends where a state overflows.",
     )
     panels = figure.subplots(2, 2)
     for axes, (problem, panel) in zip(panels.flat, PANELS.items(), strict=False):
-        _errors(axes, results.pick(found["rows"], problem=problem), panel)
-    _too_large(panels[1, 1], results.pick(found["rows"], problem=TOO_LARGE))
+        _errors(axes, results.pick(stored["rows"], problem=problem), panel)
+    _too_large(panels[1, 1], results.pick(stored["rows"], problem=TOO_LARGE))
     for axes in panels.flat:
         axes.title.set_fontsize(10)
     _style.finish(figure, columns=4)
@@ -599,12 +598,12 @@ ORDERS = {0.5: "1/2", 1: "1", 1.5: "3/2", 2: "2"}
 
 
 class Panel(NamedTuple):
-    """With the orders to draw, and where they begin: parts of the width and of the height."""
+    """Lines of the orders begin at `origin`, in parts of the width and the height."""
 
     title: str
     error: str
     orders: tuple[float, ...]
-    place: tuple[float, float]
+    origin: tuple[float, float]
     bottom: float | None = None
 
 
@@ -642,10 +641,10 @@ def _errors(axes: Axes, rows: list[results.Row], panel: Panel) -> None:
     axes.set_ylim(bottom=panel.bottom)
     axes.yaxis.set_minor_formatter(NullFormatter())
     _style.logarithmic(axes, "time of a path", "s")
-    (left, right), (low, high) = (np.log(limits) for limits in (axes.get_xlim(), axes.get_ylim()))
-    x0, y0 = left + panel.place[0] * (right - left), low + panel.place[1] * (high - low)
+    (x_min, x_max), (y_min, y_max) = np.log([axes.get_xlim(), axes.get_ylim()])
+    x0, y0 = x_min + panel.origin[0] * (x_max - x_min), y_min + panel.origin[1] * (y_max - y_min)
     for order in panel.orders:
-        x1 = x0 + min(0.25 * (right - left), 0.25 * (high - low) / order)
+        x1 = x0 + min(0.25 * (x_max - x_min), 0.25 * (y_max - y_min) / order)
         y1 = y0 - order * (x1 - x0)
         axes.plot(np.exp([x0, x1]), np.exp([y0, y1]), color="0.6", linewidth=1)
         axes.text(np.exp(x1), np.exp(y1), f" {ORDERS[order]}", color="0.4", fontsize=8, va="center")
@@ -653,9 +652,9 @@ def _errors(axes: Axes, rows: list[results.Row], panel: Panel) -> None:
 
 def _too_large(axes: Axes, rows: list[results.Row]) -> None:
     for name, style in STYLES.items():
-        found = results.pick(rows, method=name)
+        points = results.pick(rows, method=name)
         keys = ("step", "mean", "standard error", "off the sphere")
-        step, mean, uncertain, off = (np.array([row[k] for row in found], float) for k in keys)
+        step, mean, uncertain, off = (np.array([row[k] for row in points], float) for k in keys)
         axes.loglog(step, np.abs(mean - MEAN), label=name, markersize=5, **style)
         if name == [*ON_SPHERE][-1]:
             # The methods of diffrax begin a column of the legend.

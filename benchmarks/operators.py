@@ -10,7 +10,7 @@ the vector, and the Lanczos method of matfree, without reorthogonalisation, if t
 Hermitian, otherwise the Arnoldi method of matfree. Both use the exponential of cfjax for the small
 matrix, which is faster than an exponential by eigenvalues. They have no tolerance: each takes the
 smallest number of products from a list for which its error is at most `GOAL` times the norm, found
-by trial. The trials are left out of the time, which is to their advantage. Six products are what a
+by trial. The time does not include the trials, which is to their advantage. Six products are what a
 step of Tsit5 takes in plain space. A gradient is one in the coefficient and the state. All take
 turns. Without matfree there is no Krylov method.
 """
@@ -83,8 +83,7 @@ def rows(
         programs[method] = looped(step, y, gradient)
     length = lengths(programs[base], y)
     compiled = {method: program(length) for method, program in programs.items()}
-    rounds = take_turns(list(compiled.values()), repeats=3 if quick else 15)
-    times = dict(zip(compiled, rounds, strict=True))
+    times = results.in_turns(compiled, repeats=3 if quick else 15)
     for method, seconds in times.items():
         yield {
             "problem": name,
@@ -113,12 +112,12 @@ def looped(step: Action, y: Array, gradient: bool) -> Callable[[int], Callable[[
         in_c, in_y = jax.grad(value, (0, 1))(c, y)
         return y + 1e-9 * (in_c + in_y.conj()), None
 
-    def made(length: int) -> Callable[[], Any]:
+    def make(length: int) -> Callable[[], Any]:
         cs = jnp.ones(length)
         compiled = jax.jit(lambda y, cs: lax.scan(body, y, cs)[0]).lower(y, cs).compile()
         return lambda: compiled(y, cs)
 
-    return made
+    return make
 
 
 def lengths(make: Callable[[int], Callable[[], Any]], y: Array) -> int:
@@ -160,8 +159,8 @@ def spins(norm: float) -> Any:
     matrix = sparse.csr_array((2**SPINS, 2**SPINS))
     flip = sparse.csr_array([[0.0, 1.0], [1.0, 0.0]])
     for j in range(SPINS):
-        left, right = sparse.eye_array(2**j), sparse.eye_array(2 ** (SPINS - 1 - j))
-        matrix = matrix - sparse.kron(sparse.kron(left, flip), right)
+        before, after = sparse.eye_array(2**j), sparse.eye_array(2 ** (SPINS - 1 - j))
+        matrix = matrix - sparse.kron(sparse.kron(before, flip), after)
     matrix = sparse.csr_array(matrix - sparse.diags_array(annealing.couplings(SPINS)))
     y = unit(2**SPINS, True)
     # Halfway, each part has half of its weight.
@@ -203,17 +202,17 @@ def krylov(
     decomp, funm = (importlib.import_module(f"matfree.{name}") for name in ("decomp", "funm"))
     small = lambda t: expm(factor * t)  # noqa: E731
 
-    def made(count: int) -> Any:
+    def make(count: int) -> Any:
         if is_hermitian:
             # matfree has the adjoint of its own for real numbers only.
-            found = decomp.tridiag_sym(count, reortho="none", custom_vjp=False)
-            flow = funm.funm_lanczos_sym(small, found)
+            decomposition = decomp.tridiag_sym(count, reortho="none", custom_vjp=False)
+            flow = funm.funm_lanczos_sym(small, decomposition)
         else:
-            found = decomp.hessenberg(count, reortho="full", custom_vjp=False)
-            flow = funm.funm_arnoldi(small, found)
+            decomposition = decomp.hessenberg(count, reortho="full", custom_vjp=False)
+            flow = funm.funm_arnoldi(small, decomposition)
         return lambda product, c, y: flow(functools.partial(product, c), y)
 
-    return "Lanczos" if is_hermitian else "Arnoldi", made
+    return "Lanczos" if is_hermitian else "Arnoldi", make
 
 
 if __name__ == "__main__":

@@ -1,4 +1,4 @@
-"""The pages' tables, measured numbers and pictures, from what the benchmarks have stored.
+"""The pages' tables, measured numbers and pictures, from the stored results of benchmarks.
 
 Nothing is measured. In a page of `docs/` a table or a number is between `<!-- table: NAME -->` or
 `<!-- number: NAME -->` and `<!-- end -->`, where NAME is the name of a function below, with
@@ -22,9 +22,9 @@ PAGES = sorted((HERE.parent / "docs").rglob("*.md"))
 MARKED = re.compile(r"(<!-- (table|number): ([\w-]+) -->)(.*?)(<!-- end -->)", flags=re.DOTALL)
 # Methods that the results have by their tableaus.
 SHORT = {"RKMK(Tsit5)": "RKMK5", "RKMK(Dopri8)": "RKMK8"}
-# What the pages call a way to solve.
+# Names of ways to solve in the pages.
 WAYS = {"controlled steps": "adaptive steps"}
-# Those that draw, and how fine.
+# Benchmarks with pictures, and dots per inch.
 PICTURES = {
     "batch": 120,
     "chain": 120,
@@ -40,7 +40,9 @@ PICTURES = {
 
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__)
-    parser.add_argument("--check", action="store_true", help="only tell what it would change")
+    parser.add_argument(
+        "--check", action="store_true", help="only list the pages that would change"
+    )
     is_check = parser.parse_args().check
     texts = {page: page.read_text(encoding="utf-8") for page in PAGES}
     new = {page: rendered for page, text in texts.items() if (rendered := render(text)) != text}
@@ -55,9 +57,9 @@ def main() -> None:
 
 def render(text: str) -> str:
     def renewed(match: re.Match[str]) -> str:
-        begin, kind, name, _, end = match.groups()
+        opening, kind, name, _, closing = match.groups()
         lines = RENDERED[kind, name]()
-        return begin + (f"\n\n{lines}\n\n" if kind == "table" else lines) + end
+        return opening + (f"\n\n{lines}\n\n" if kind == "table" else lines) + closing
 
     return MARKED.sub(renewed, text)
 
@@ -113,7 +115,7 @@ def systems(count: int) -> str:
 
 
 def values(rows: Iterable[Row], key: str) -> list:
-    """What the rows have as `key`, without repetition."""
+    """The distinct entries of the rows for `key`."""
     return list(dict.fromkeys(row[key] for row in rows if key in row))
 
 
@@ -130,15 +132,15 @@ def code(program: str) -> str:
 
 @number
 def machine() -> str:
-    found = [load(name) for name in results.names()]
+    stored = [load(name) for name in results.names()]
     kinds = dict.fromkeys(
         "{cores} cores of {processor}, {instructions}, Python {python}, jax {jax}, "
         "diffrax {diffrax}, cfjax {cfjax}".format_map(results["machine"])
-        for results in found
+        for results in stored
     )
-    days = [results["machine"]["date"] for results in found]
+    days = [results["machine"]["date"] for results in stored]
     when = " to ".join(dict.fromkeys((min(days), max(days))))
-    rough = any(results["quick"] for results in found)
+    rough = any(results["quick"] for results in stored)
     return f"{'; '.join(kinds)}; {when}" + ", with `--quick`, so rough" * rough
 
 
@@ -157,9 +159,7 @@ def errors() -> list[list[str]]:
     rows = pick(load("tolerances")["rows"], equal="error")
     counts = values(rows, "systems")
     columns = ("steps", "error", "time over Tsit5's")
-    table = [
-        ["target error", "method", *(f"{what}, {systems(n)}" for n in counts for what in columns)]
-    ]
+    table = [["target error", "method", *(f"{c}, {systems(n)}" for n in counts for c in columns)]]
     for error, method in itertools.product(values(rows, "to"), values(rows, "method")):
         cells = [power(error), code(method)]
         for row in (one(rows, method=method, systems=n, to=error) for n in counts):
@@ -183,14 +183,14 @@ def scenes() -> list[list[str]]:
         + [f"time over Tsit5's, at {power(tolerance)}" for tolerance in at]
     ]
     for scene in values(rows, "scene"):
-        found = pick(rows, scene=scene)
-        same = [row for row in found if "Tsit5's steps" in row]
+        of_scene = pick(rows, scene=scene)
+        same = [row for row in of_scene if "Tsit5's steps" in row]
         timed = {row["tolerance"]: cell(row["over Tsit5"]) for row in same if "over Tsit5" in row}
         table.append(
             [
                 scene,
-                code(found[0]["method"]),
-                between(row["error"] / row["tolerance"] for row in found),
+                code(of_scene[0]["method"]),
+                between(row["error"] / row["tolerance"] for row in of_scene),
                 between(row["steps"] / row["Tsit5's steps"] for row in same),
                 *(timed.get(tolerance, "") for tolerance in at),
             ]
@@ -205,9 +205,9 @@ def attitude() -> list[list[str]]:
     table = [["", "error", "method", "steps", *(f"time, {systems(n)}" for n in counts)]]
     keys = (values(rows, key) for key in ("scene", "to", "method"))
     for scene, error, method in itertools.product(*keys):
-        found = [one(rows, scene=scene, to=error, method=method, systems=n) for n in counts]
-        (steps,) = {row["steps"] for row in found}
-        times = [cell(row["over the better in plain space"]) for row in found]
+        of_method = [one(rows, scene=scene, to=error, method=method, systems=n) for n in counts]
+        (steps,) = {row["steps"] for row in of_method}
+        times = [cell(row["over the better in plain space"]) for row in of_method]
         table.append([scene, power(error), code(method), str(steps), *times])
     return table
 
@@ -231,12 +231,12 @@ def gradients() -> list[list[str]]:
 def fits() -> list[list[str]]:
     rows = load("fits")["rows"]
     problems, forms = values(rows, "problem"), values(rows, "saved")
-    table = [["", "saved", *(f"{p}, {what}" for p in problems for what in ("compile", "gradient"))]]
+    table = [["", "saved", *(f"{p}, {c}" for p in problems for c in ("compile", "gradient"))]]
     for solver, form in itertools.product(values(rows, "solver"), forms):
-        found = [one(rows, problem=p, solver=solver, saved=form) for p in problems]
+        of_solver = [one(rows, problem=p, solver=solver, saved=form) for p in problems]
         cells = [
             (f"{two_digits(row['compile, seconds'])} s", in_units(row["gradient, seconds"][2]))
-            for row in found
+            for row in of_solver
         ]
         table.append([code(solver), form, *itertools.chain(*cells)])
     return table
@@ -247,7 +247,7 @@ def batch() -> list[list[str]]:
     rows = load("batch")["rows"]
     programs = {"chunks of 10000": "chunks of 10 000", "one jax.vmap": "one `jax.vmap`"}
     columns = ("a trajectory", "memory")
-    table = [["members", *(f"{name}, {what}" for name in programs.values() for what in columns)]]
+    table = [["members", *(f"{name}, {c}" for name in programs.values() for c in columns)]]
     for size in values(pick(rows, program="chunks of 10000"), "members"):
         cells = [two_digits(size)]
         for row in (one(rows, program=program, members=size) for program in programs):
@@ -288,24 +288,24 @@ def batch_compile_adaptive() -> list[list[str]]:
 def gpu() -> list[list[str]]:
     rows = [{**row, "is processor": row["device"] == "cpu"} for row in load("gpu")["rows"]]
 
-    def text(where: dict, is_processor: bool, dtype: str) -> str:
-        where = {**where, "is processor": is_processor, "dtype": dtype}
-        return in_units(one(rows, **where)["seconds"][2])
+    def text(case: dict, is_processor: bool, dtype: str) -> str:
+        case = {**case, "is processor": is_processor, "dtype": dtype}
+        return in_units(one(rows, **case)["seconds"][2])
 
     table = [["", "method", "GPU, float64", "GPU, float32", "processor, float64"]]
     for row in pick(rows, **{"is processor": False}, dtype="float64"):
-        where = {key: row[key] for key in ("problem", "members", "method")}
-        what, members = row["problem"], row["members"]
+        case = {key: row[key] for key in ("problem", "members", "method")}
+        problem, members = row["problem"], row["members"]
         count = f"{two_digits(members)} rigid bodies" if members > 1 else "one rigid body"
-        what = what.replace("rigid bodies", count)
-        solver, comma, rest = row["method"].partition(",")
+        problem = problem.replace("rigid bodies", count)
+        solver, comma, variant = row["method"].partition(",")
         table.append(
             [
-                what,
-                f"`{solver}`{comma}{rest}",
-                text(where, False, "float64"),
-                text(where, False, "float32"),
-                text(where, True, "float64"),
+                problem,
+                f"`{solver}`{comma}{variant}",
+                text(case, False, "float64"),
+                text(case, False, "float32"),
+                text(case, True, "float64"),
             ]
         )
     return table
@@ -313,7 +313,7 @@ def gpu() -> list[list[str]]:
 
 @number
 def gpu_name() -> str:
-    """That of most rows."""
+    """The GPU of most rows."""
     names = [row["device"] for row in load("gpu")["rows"] if row["device"] != "cpu"]
     return max(names, key=names.count)
 
@@ -340,10 +340,10 @@ def speed() -> list[list[str]]:
     counts = values(rows, "systems")
 
     def text(program: str, count: int) -> str:
-        found = pick(rows, program=program, systems=count)
-        if not found:  # Chunks are of a batch only.
+        matching = pick(rows, program=program, systems=count)
+        if not matching:  # Chunks are of a batch only.
             return ""
-        (row,) = found
+        (row,) = matching
         key = next(key for key in row if key.startswith("over"))
         is_base = key == f"over {program}"
         return f"1 ({in_units(row['seconds a step'][2])})" if is_base else cell(row[key])
@@ -369,8 +369,8 @@ def exponentials() -> list[list[str]]:
     for program, n in dict.fromkeys((row["program"], row["n"]) for row in rows):
         cells = [names[program].format(n=n)]
         for gradient, count in cases:
-            found = pick(rows, program=program, n=n, batch=count, gradient=gradient)
-            cells.append(between(row["times faster"][2] for row in found))
+            matching = pick(rows, program=program, n=n, batch=count, gradient=gradient)
+            cells.append(between(row["times faster"][2] for row in matching))
         table.append(cells)
     return table
 
@@ -378,15 +378,15 @@ def exponentials() -> list[list[str]]:
 @table
 def operators() -> list[list[str]]:
     rows = pick(load("operators")["rows"], problem="dense")
-    others = ("LeftMatrix", "dense exponential", "Lanczos", "six products")
-    names, norms = ("`OperatorSum`", "`LeftMatrix`", *others[1:]), (5.0, 50.0)
+    alternatives = ("LeftMatrix", "dense exponential", "Lanczos", "six products")
+    names, norms = ("`OperatorSum`", "`LeftMatrix`", *alternatives[1:]), (5.0, 50.0)
     table = [["n", *(f"{name}, {norm:.0f}" for norm in norms for name in names)]]
     for n in values(rows, "n"):
         cells = [str(n)]
         for norm in norms:
-            here = pick(rows, n=n, norm=norm)
-            cells.append(in_units(here[0]["seconds"][2]))
-            cells += [_over(here, name) for name in others]
+            cases = pick(rows, n=n, norm=norm)
+            cells.append(in_units(cases[0]["seconds"][2]))
+            cells += [_over(cases, name) for name in alternatives]
         table.append(cells)
     return table
 
@@ -395,24 +395,24 @@ def operators() -> list[list[str]]:
 def krylov() -> list[list[str]]:
     rows = [row for row in load("operators")["rows"] if row["problem"] != "dense"]
     columns = ("`OperatorSum`", "other / `OperatorSum`")
-    head = ["", "2-norm", "other", *columns, *(f"gradient, {what}" for what in columns)]
+    head = ["", "2-norm", "other", *columns, *(f"gradient, {column}" for column in columns)]
     table = [head]
     for problem, norm in dict.fromkeys((row["problem"], row["norm"]) for row in rows):
-        here = pick(rows, problem=problem, norm=norm)
-        (other,) = {row["program"] for row in here if row["program"] != "OperatorSum"}
-        cells = [problem, f"{norm:g}", other]
+        cases = pick(rows, problem=problem, norm=norm)
+        (method,) = {row["program"] for row in cases if row["program"] != "OperatorSum"}
+        cells = [problem, f"{norm:g}", method]
         for gradient in (False, True):
-            ours = one(here, program="OperatorSum", gradient=gradient)
-            ratio = one(here, program=other, gradient=gradient)["over OperatorSum"]
+            ours = one(cases, program="OperatorSum", gradient=gradient)
+            ratio = one(cases, program=method, gradient=gradient)["over OperatorSum"]
             cells += [in_units(ours["seconds"][2]), two_digits(ratio[2])]
         table.append(cells)
     return table
 
 
 def _over(rows: list[Row], name: str) -> str:
-    found = [row for row in rows if row["program"].startswith(name)]
+    matching = [row for row in rows if row["program"].startswith(name)]
     # The medians alone: the table is wide.
-    return two_digits(found[0]["over OperatorSum"][2]) if found else ""
+    return two_digits(matching[0]["over OperatorSum"][2]) if matching else ""
 
 
 @table
@@ -433,12 +433,12 @@ def heat() -> list[list[str]]:
 def fields() -> list[list[str]]:
     rows = load("fields")["rows"]
     cases = list(itertools.product(values(rows, "program"), values(rows, "systems")))
-    found = {
+    by_loop = {
         (loop, case): pick(rows, loop=loop, program=case[0], systems=case[1])
         for loop in values(rows, "loop")
         for case in cases
     }
-    ours = {case: found["cfjax.integrate", case] for case in cases}
+    ours = {case: by_loop["cfjax.integrate", case] for case in cases}
     table = [["", *(f"{code(program)}, {systems(count)}" for program, count in cases)]]
     for k, way in enumerate(values(rows, "way")):
         table.append([way, *(cell(ours[case][k]["over the best"]) for case in cases)])
@@ -451,7 +451,7 @@ def fields() -> list[list[str]]:
         + [two_digits(x) if g else "" for x, g in zip(slowest, is_gradient, strict=True)]
     )
     for loop in values(rows, "loop")[1:]:
-        worst = [max(row["over the best"][2] for row in found[loop, case]) for case in cases]
+        worst = [max(row["over the best"][2] for row in by_loop[loop, case]) for case in cases]
         table.append([f"`{loop}`, at most", *map(two_digits, worst)])
     return table
 
@@ -460,23 +460,23 @@ def fields() -> list[list[str]]:
 def chain() -> list[list[str]]:
     rows = load("chain")["rows"]
     counts = values(rows, "bodies")
-    shown = dict.fromkeys((counts[len(counts) // 2], counts[-1]))
+    counts_shown = dict.fromkeys((counts[len(counts) // 2], counts[-1]))
     table = [["program", "what", "bodies", "to compile", "memory to compile", "100 steps"]]
-    keys = itertools.product(values(rows, "what"), shown, values(rows, "program"))
+    keys = itertools.product(values(rows, "what"), counts_shown, values(rows, "program"))
     for what, bodies, program in keys:
-        found = pick(rows, program=program, what=what, bodies=bodies)
-        if not found or "ended" in found[0]:
-            last = pick(rows, program=program, what=what)[-1]
-            cells = [f"not in {last['ended']} for {last['bodies']} bodies", "", ""]
+        matching = pick(rows, program=program, what=what, bodies=bodies)
+        if not matching or "ended" in matching[0]:
+            last_row = pick(rows, program=program, what=what)[-1]
+            cells = [f"not in {last_row['ended']} for {last_row['bodies']} bodies", "", ""]
         else:
-            (row,) = found
+            (row,) = matching
             cells = [in_units(row["compile CPU seconds"]), f"{row['compile MiB']:.3g} MiB"]
             cells.append(in_units(row["run seconds"][2]))
         table.append([code(program), what, str(bodies), *cells])
     return table
 
 
-# Those with the same methods.
+# Scenes with the same methods.
 _DETERMINISTIC = ("rigid body", "spacecraft", "4 x 4 matrices")
 
 
@@ -493,9 +493,9 @@ def compiling() -> list[list[str]]:
         seconds = between(r["CPU seconds"][2] for r in pick(rows, program=program, method=base))
         table.append([program, f"{seconds} s"])
         for method in methods:
-            found = pick(rows, program=program, method=method)
-            sizes = between(row["instructions, ratio"] for row in found)
-            table[-1].append(f"{between(r['seconds, ratio'][2] for r in found)} ({sizes})")
+            matching = pick(rows, program=program, method=method)
+            sizes = between(row["instructions, ratio"] for row in matching)
+            table[-1].append(f"{between(r['seconds, ratio'][2] for r in matching)} ({sizes})")
     return table
 
 
@@ -504,11 +504,11 @@ def compiling_families() -> list[list[str]]:
     table = [["", "program", "diffrax", "cfjax"]]
     rows = [row for row in _compiled() if row["scene"] not in _DETERMINISTIC]
     for scene, program in dict.fromkeys((row["scene"], row["program"]) for row in rows):
-        base, *others = pick(rows, scene=scene, program=program)
+        base, *compared = pick(rows, scene=scene, program=program)
         cells = [
             f"`{r['method']}` {two_digits(r['seconds, ratio'][2])} "
             f"({two_digits(r['instructions, ratio'])})"
-            for r in others
+            for r in compared
         ]
         seconds = two_digits(base["CPU seconds"][2])
         table.append([scene, program, f"`{base['method']}`, {seconds} s", ", ".join(cells)])
@@ -527,9 +527,9 @@ def first_call() -> list[list[str]]:
     methods = values(rows, "method")
     table = [["", "", "diffrax, Tsit5", *(f"`{method}`" for method in methods[1:])]]
     for problem, way in itertools.product(values(rows, "problem"), values(rows, "way")):
-        base, *others = (one(rows, problem=problem, way=way, method=m) for m in methods)
+        base, *compared = (one(rows, problem=problem, way=way, method=m) for m in methods)
         cells = [f"1 ({cell(base['CPU seconds'])} s)"]
-        cells += [f"{cell(r['over Tsit5'])}; {two_digits(r['CPU seconds'][2])} s" for r in others]
+        cells += [f"{cell(r['over Tsit5'])}; {two_digits(r['CPU seconds'][2])} s" for r in compared]
         table.append([problem, str(WAYS.get(way, way)), *cells])
     return table
 
@@ -540,9 +540,9 @@ def second_process() -> list[list[str]]:
     methods = values(rows, "method")
     table = [["", "diffrax, Tsit5", *(f"`{method}`" for method in methods[1:])]]
     for program in values(rows, "program"):
-        base, *others = pick(rows, program=program)
+        base, *compared = pick(rows, program=program)
         cells = [f"1 ({cell(base['CPU seconds'])} s)"]
-        cells += [f"{cell(r['over Tsit5'])}; {two_digits(r['CPU seconds'][2])} s" for r in others]
+        cells += [f"{cell(r['over Tsit5'])}; {two_digits(r['CPU seconds'][2])} s" for r in compared]
         table.append([_SECOND[program], *cells])
     return table
 
@@ -571,9 +571,10 @@ def quantum() -> list[list[str]]:
     table = [["", "error", "cfjax", "time", *columns, *norms]]
     for (problem, count, goal), rows in _quantum().items():
         ours = [row for row in rows if row["method"].startswith("cfjax")]
-        others = [row for row in rows if row not in ours]
-        as_given = [row for row in others if not row["method"].endswith("frame")]
-        best, *fastest = (min(few, key=lambda r: r[_OVER][2]) for few in (ours, others, as_given))
+        peers = [row for row in rows if row not in ours]
+        in_lab_frame = [row for row in peers if not row["method"].endswith("frame")]
+        groups = ours, peers, in_lab_frame
+        best, *fastest = (min(group, key=lambda r: r[_OVER][2]) for group in groups)
         cells = [f"{problem}, {systems(count)}", power(goal)]
         cells += [code(best["method"].removeprefix("cfjax, ")), in_units(best["seconds each"][2])]
         for row in fastest:
@@ -590,21 +591,21 @@ def _peers(scene: str) -> list[list[str]]:
     head = ["", "steps or tolerance", "error", *["off the group"] * has_group, "time", *over]
     table = [head]
     for program in values(rows, "program"):
-        row, *others = pick(rows, program=program)
+        row, *in_batches = pick(rows, program=program)
         cells = [power(row["tolerance"]) if "tolerance" in row else two_digits(row["steps"])]
         cells.append(power(row["error"]))
         if has_group:
             cells.append(power(row["distance"]) if row["distance"] else "0")
         cells.append(in_units(row["seconds"][2]))
-        table.append([code(program), *cells, *(cell(r["over cfjax"]) for r in (row, *others))])
+        table.append([code(program), *cells, *(cell(r["over cfjax"]) for r in (row, *in_batches))])
     return table
 
 
 def _by_method(text: Callable[[Row], str]) -> list[list[str]]:
-    """A row for each method with what `text` says of it in each case, if anything."""
+    """A row for each method, with `text` of its result in each case, if there is one."""
     cases = _quantum()
     methods = dict.fromkeys(row["method"] for rows in cases.values() for row in rows)
-    head = ["", *(f"{what}, {power(goal)}, {systems(n)}" for what, n, goal in cases)]
+    head = ["", *(f"{problem}, {power(goal)}, {systems(n)}" for problem, n, goal in cases)]
     return [head] + [
         [code(method.removeprefix("cfjax, "))]
         + ["".join(map(text, pick(rows, method=method))) for rows in cases.values()]
@@ -658,7 +659,7 @@ def peers_versions() -> str:
 
 
 def _noise(problem: str) -> dict[str, list[Row]]:
-    """What is measured of each method."""
+    """The rows of each method."""
     rows = pick(load("noise")["rows"], problem=problem)
     return {name: pick(rows, method=name) for name in values(rows, "method")}
 
@@ -671,22 +672,22 @@ def _noise_errors(problem: str) -> list[list[str]]:
         if not errors:
             continue
         counts = list(errors)
-        shown = (counts[0], counts[len(counts) // 2], counts[-1])
+        counts_shown = (counts[0], counts[len(counts) // 2], counts[-1])
         if not table:
-            table.append(["", *(f"{n} steps" for n in shown), "order", "time over `CF2`"])
+            table.append(["", *(f"{n} steps" for n in counts_shown), "order", "time over `CF2`"])
         logs = ([math.log(x) for x in values] for values in (errors, errors.values()))
         order = -statistics.linear_regression(*logs).slope
         (time,) = (row["over CF2"] for row in rows if "over CF2" in row)
-        cells = [f"{errors[n]:.1e}".replace("e-0", "e-") for n in shown]
+        cells = [f"{errors[n]:.1e}".replace("e-0", "e-") for n in counts_shown]
         table.append([_noise_name(name), *cells, f"{order:.1f}", cell(time)])
     return table
 
 
 def _noise_name(name: str) -> str:
     """With the name of the solver as code."""
-    solver, *others = name.split(", ")
+    solver, *variants = name.split(", ")
     is_solver = solver[0].isupper()
-    return ", ".join([f"`{solver}`" if is_solver else solver, *others])
+    return ", ".join([f"`{solver}`" if is_solver else solver, *variants])
 
 
 @table
@@ -708,7 +709,7 @@ def noise_in_the_mean() -> list[list[str]]:
 def noise_steps() -> list[list[str]]:
     methods = _noise("steps too large")
     steps = values(next(iter(methods.values())), "step")
-    shown = [min(steps, key=lambda h: abs(math.log(h / x))) for x in (0.05, 0.5, 5.0, 50.0)]
+    steps_shown = [min(steps, key=lambda h: abs(math.log(h / x))) for x in (0.05, 0.5, 5.0, 50.0)]
 
     def text(row: Row) -> str:
         if row["mean"] is None:
@@ -717,8 +718,8 @@ def noise_steps() -> list[list[str]]:
         off = row["off the sphere"]
         return f"{row['mean']:.3f}" + (f", off by {two_digits(off)}" if off > 1e-9 else "")
 
-    return [["", *(f"h = {two_digits(h)}" for h in shown)]] + [
-        [_noise_name(name), *(text(one(rows, step=h)) for h in shown)]
+    return [["", *(f"h = {two_digits(h)}" for h in steps_shown)]] + [
+        [_noise_name(name), *(text(one(rows, step=h)) for h in steps_shown)]
         for name, rows in methods.items()
     ]
 
@@ -734,7 +735,7 @@ def noise_cost() -> list[list[str]]:
     rows = [row for row in load("noise")["rows"] if "spins" in row]
     counts = values(rows, "spins")
     names = {1: "one spin", 4096: "4096 spins"}
-    table = [["", *(f"{what}, {names[n]}" for n in counts for what in ("a step", "to compile"))]]
+    table = [["", *(f"{c}, {names[n]}" for n in counts for c in ("a step", "to compile"))]]
     for program in values(rows, "program"):
         cells = []
         for row in (one(rows, spins=n, program=program) for n in counts):
@@ -761,7 +762,7 @@ def noise_gradients() -> list[list[str]]:
     ]
 
 
-# What the pages call the systems whose energy is measured.
+# Names of the systems whose energy is measured, in the pages.
 ENERGY_OF = {
     "top": "heavy top",
     "spins": "six spins",
@@ -772,7 +773,7 @@ ENERGY_OF = {
 
 
 def _energies() -> dict[str, list[Row]]:
-    """What is measured of each system at equal numbers of evaluations."""
+    """The rows of each system at equal numbers of evaluations."""
     rows = [row for row in load("energy")["rows"] if "t" in row]
     systems = {name: pick(rows, system=name) for name in ENERGY_OF}
     rate = "evaluations a unit"
@@ -797,14 +798,14 @@ def energy() -> list[list[str]]:
         slope = f"{row['slope']:.0e}" if row["drifts"] else "flat"
         return f"{row['largest']:.1e}, {slope}".replace("e-0", "e-")
 
-    ends = {name: rows[0]["step"] * rows[0]["steps"] for name, rows in systems.items()}
-    head = ["", *(f"{ENERGY_OF[name]}, to t = {_long(end)}" for name, end in ends.items())]
+    durations = {name: rows[0]["step"] * rows[0]["steps"] for name, rows in systems.items()}
+    head = ["", *(f"{ENERGY_OF[name]}, to t = {_long(t)}" for name, t in durations.items())]
     methods = values(itertools.chain(*systems.values()), "method")
-    splittings, others = methods[:3], [m for m in methods[3:] if m != "ImplicitMidpoint"]
+    splittings, non_symplectic = methods[:3], [m for m in methods[3:] if m != "ImplicitMidpoint"]
     return [head] + [
         [f"`{method}`"]
         + ["".join(map(text, pick(rows, method=method))) for rows in systems.values()]
-        for method in (*splittings, "ImplicitMidpoint", *others)
+        for method in (*splittings, "ImplicitMidpoint", *non_symplectic)
     ]
 
 
@@ -821,11 +822,11 @@ def _break_even(row: Row) -> str:
 @table
 def energy_break_even() -> list[list[str]]:
     rows = [row for row in load("energy")["rows"] if "other" in row]
-    few = {name: pick(rows, system=name) for name in ENERGY_OF}
-    head = ["", *(f"{ENERGY_OF[name]}, `{found[0]['best']}`" for name, found in few.items())]
+    cases = {name: pick(rows, system=name) for name in ENERGY_OF}
+    head = ["", *(f"{ENERGY_OF[name]}, `{few[0]['best']}`" for name, few in cases.items())]
     return [head] + [
-        [f"`{other}`", *(_break_even(one(found, other=other)) for found in few.values())]
-        for other in values(rows, "other")
+        [f"`{method}`", *(_break_even(one(few, other=method)) for few in cases.values())]
+        for method in values(rows, "other")
     ]
 
 
@@ -839,8 +840,8 @@ def energy_lattice() -> str:
 @number
 def energy_ahead() -> str:
     rows = pick(load("energy")["rows"], other="RKMK8")
-    of = [f"{_break_even(one(rows, system=name))} for {ENERGY_OF[name]}" for name in ENERGY_OF]
-    top, spins, vortices, *_ = of
+    times = [f"{_break_even(one(rows, system=name))} for {ENERGY_OF[name]}" for name in ENERGY_OF]
+    top, spins, vortices, *_ = times
     return f"{top.replace('for', 'units of time for a', 1)}, {spins} and {vortices}"
 
 
@@ -850,7 +851,7 @@ def energy_midpoint() -> str:
     return f"{_break_even(one(rows, other='CF4'))} units of time"
 
 
-# What the pages call the programs for stiff equations.
+# Names of the programs for stiff equations in the pages.
 STIFF = {
     "CF4": "`CF4`",
     "CF43": "`CF43`",
@@ -872,13 +873,13 @@ def _stiff(key: str) -> list[Row]:
 
 
 def _stiff_table(text: Callable[[Row], str], targets: Iterable[float]) -> list[list[str]]:
-    """A row for each problem and error, with what `text` says of each program."""
+    """A row for each problem and error, with `text` of the result of each program."""
     rows = _stiff("to")
     programs = [name for name in STIFF if pick(rows, program=name)]
     table = [["", "error", *(STIFF[name] for name in programs)]]
     for problem, target in itertools.product(values(rows, "problem"), targets):
-        few = pick(rows, problem=problem, to=target)
-        cells = ["".join(map(text, pick(few, program=name))) for name in programs]
+        cases = pick(rows, problem=problem, to=target)
+        cells = ["".join(map(text, pick(cases, program=name))) for name in programs]
         table.append([problem, power(target), *cells])
     return table
 
@@ -898,10 +899,10 @@ def stiff_times() -> list[list[str]]:
 @table
 def stiff_others() -> list[list[str]]:
     rows = pick(_stiff("to"), program="ETD54")
-    others = {"exponax": "exponax, ETDRK4", "Kvaerno5": "Kvaerno5", "Tsit5": "Tsit5"}
-    table = [["", "error", *others.values()]]
+    headings = {"exponax": "exponax, ETDRK4", "Kvaerno5": "Kvaerno5", "Tsit5": "Tsit5"}
+    table = [["", "error", *headings.values()]]
     for row in rows:
-        spreads = [row.get(f"over {other}") for other in others]
+        spreads = [row.get(f"over {program}") for program in headings]
         if any(spreads):
             cells = [cell(over) if over else "" for over in spreads]
             table.append([row["problem"], power(row["to"]), *cells])
@@ -919,14 +920,14 @@ def stiff_orders() -> list[list[str]]:
     programs = values(rows, "program")
     table = [["", "steps", *(f"`{name}`" for name in programs)]]
     for problem in values(rows, "problem"):
-        few = pick(rows, problem=problem)
+        cases = pick(rows, problem=problem)
         cells = [
             "overflow"
             if row["slope"] is None
             else f"{power(row['error with many'])}, {row['slope']:.1f}"
-            for row in few
+            for row in cases
         ]
-        table.append([problem, f"{few[0]['few']}, {few[0]['many']}", *cells])
+        table.append([problem, f"{cases[0]['few']}, {cases[0]['many']}", *cells])
     return table
 
 
@@ -942,8 +943,8 @@ def stiff_parts() -> list[list[str]]:
     table = [["in M", "", *(f"{n} steps" for n in counts)]]
     parts = ("mean", "0.8 of the largest", "largest")
     for part, program in itertools.product(parts, values(rows, "program")):
-        found = [one(rows, program=program, steps=n, **{"in M": part})["error"] for n in counts]
-        cells = ["overflow" if e is None else _short(e) for e in found]
+        errors = [one(rows, program=program, steps=n, **{"in M": part})["error"] for n in counts]
+        cells = ["overflow" if e is None else _short(e) for e in errors]
         table.append([part, f"`{program}`", *cells])
     return table
 
@@ -958,13 +959,13 @@ def stiff_whole_operator() -> str:
 def stiff_control() -> list[list[str]]:
     steps, errors = _stiff("step over an equal one"), _stiff("controlled to")
     programs = [name for name in ("ETD43", "ETD54") if pick(errors, program=name)]
-    head = [f"`{name}`, {what}" for name in programs for what in ("a step", "error")]
+    head = [f"`{name}`, {column}" for name in programs for column in ("a step", "error")]
     table = [["", *head]]
     for problem in values(errors, "problem"):
         cells = []
         for name in programs:
-            found = pick(steps, problem=problem, program=f"{name} controlled", to=1e-6)
-            ratio = found[0]["step over an equal one"] if found else None
+            matching = pick(steps, problem=problem, program=f"{name} controlled", to=1e-6)
+            ratio = matching[0]["step over an equal one"] if matching else None
             cells.append(cell(ratio) if ratio else "")
             over = [r["error over tolerance"] for r in pick(errors, problem=problem, program=name)]
             cells.append("not finite" if None in over else between(over))
@@ -975,22 +976,22 @@ def stiff_control() -> list[list[str]]:
 @table
 def stiff_damping() -> list[list[str]]:
     rows = load("stability")["rows"]
-    shown = (-1.5, -1.0, -0.75, -0.5, -0.25)
+    ratios_shown = (-1.5, -1.0, -0.75, -0.5, -0.25)
     columns = ("stable from r =", "stable to y =", "the same over evaluations")
-    table = [["", *(f"r = {r:g}" for r in shown), *columns]]
+    table = [["", *(f"r = {r:g}" for r in ratios_shown), *columns]]
     for row in pick(rows, panel="damping"):
         r, (growth,) = row["x"], row["y"]
         waves = one(rows, panel="oscillation", curve=row["curve"])
         y, (of_y,) = waves["x"], waves["y"]
         # Rounding leaves one a little above one.
-        last = max(x for x, size in zip(r, growth, strict=True) if x < 0 and size > 1 + 1e-9)
+        unstable = max(x for x, size in zip(r, growth, strict=True) if x < 0 and size > 1 + 1e-9)
         stable = itertools.takewhile(lambda pair: pair[1] <= 1 + 1e-9, zip(y, of_y, strict=True))
         longest, _ = max(stable)
         table.append(
             [
                 f"`{row['curve']}`",
-                *(two_digits(dict(zip(r, growth, strict=True))[x]) for x in shown),
-                f"{r[r.index(last) + 1]:.2f}",
+                *(two_digits(dict(zip(r, growth, strict=True))[x]) for x in ratios_shown),
+                f"{r[r.index(unstable) + 1]:.2f}",
                 f"{longest:.2f}",
                 f"{longest / EVALUATIONS[row['curve']]:.2f}",
             ]

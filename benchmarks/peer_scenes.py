@@ -46,8 +46,8 @@ class Scene(NamedTuple):
     programs: dict[str, Program]
 
 
-def steps(first: int) -> list[int]:
-    return [first * 2**k for k in range(4)]
+def steps(smallest: int) -> list[int]:
+    return [smallest * 2**k for k in range(4)]
 
 
 TOLERANCES = [1e-5, 1e-7, 1e-9, 1e-11]
@@ -85,25 +85,25 @@ class Projected(diffrax.Tsit5):
     def step(
         self, terms: Any, t0: Any, t1: Any, y0: Any, args: Any, solver_state: Any, made_jump: Any
     ) -> Any:
-        y1, *rest = super().step(terms, t0, t1, y0, args, solver_state, made_jump)
-        return self.project(y1), *rest
+        y1, *remainder = super().step(terms, t0, t1, y0, args, solver_state, made_jump)
+        return self.project(y1), *remainder
 
 
 def on_host(velocity: Callable, method: Any, t1: float) -> Callable:
-    """SciPy's, of a NumPy array."""
+    """The solve by SciPy, from a NumPy array."""
 
     def solve(y0: np.ndarray, rtol: float) -> np.ndarray:
         def ode(t: float, y: np.ndarray) -> np.ndarray:
             return velocity(t, y.reshape(y0.shape)).ravel()
 
-        answer = solve_ivp(ode, (0.0, t1), y0.ravel(), method=method, rtol=rtol, atol=rtol)
-        return answer.y[:, -1].reshape(y0.shape)
+        solution = solve_ivp(ode, (0.0, t1), y0.ravel(), method=method, rtol=rtol, atol=rtol)
+        return solution.y[:, -1].reshape(y0.shape)
 
     return solve
 
 
 def with_jaxlie(
-    rates: Callable, t1: float, start: Callable, end: Callable, first: int
+    rates: Callable, t1: float, to_state: Callable, from_state: Callable, smallest: int
 ) -> dict[str, Program]:
     """A classical RK4 written by hand around jaxlie's SO3, with a vector m beside the attitude.
 
@@ -135,13 +135,13 @@ def with_jaxlie(
                 turn = jaxlie.SO3.exp(h / 6 * (omega1 + 2 * omega2 + 2 * omega3 + omega4))
                 return r @ turn, m + h / 6 * (m1 + 2 * m2 + 2 * m3 + m4)
 
-            return end(*jax.lax.fori_loop(0, num_steps, step, start(jaxlie.SO3, y0)))
+            return from_state(*jax.lax.fori_loop(0, num_steps, step, to_state(jaxlie.SO3, y0)))
 
         return solve
 
     return {
-        "jaxlie, RK4": Program("jaxlie", solver(False), steps(first)),
-        "jaxlie, RK4, jlog": Program("jaxlie", solver(True), steps(first)),
+        "jaxlie, RK4": Program("jaxlie", solver(False), steps(smallest)),
+        "jaxlie, RK4, jlog": Program("jaxlie", solver(True), steps(smallest)),
     }
 
 
@@ -215,7 +215,7 @@ def of_spacecraft() -> Scene:
     )
 
 
-def of_given_velocity() -> Scene:
+def of_prescribed_velocity() -> Scene:
     t1 = 10.0
 
     def omega(t: Any, like: Any = jnp) -> Any:
@@ -234,7 +234,7 @@ def of_given_velocity() -> Scene:
     def as_quaternion(solve: Callable) -> Callable:
         def solve_matrix(r: Any, num_steps: int) -> Any:
             q = solve(cfjax.quaternion_from_matrix(r, layout="wxyz"), num_steps)
-            # Its length is to be seen in the matrix, which is quadratic in it.
+            # The matrix is quadratic in the length, so that its error shows in the distance.
             length = jnp.linalg.norm(q)
             return length**2 * cfjax.quaternion_to_matrix(q / length, layout="wxyz")
 
@@ -303,12 +303,12 @@ def of_kuramoto() -> Scene:
     k = np.arange(n // 2 + 1)
     derivative = 2j * np.pi / period * k
     spectrum = (-(derivative**2) - derivative**4).real
-    # Those that exponax keeps in the square by default.
-    kept = k <= 2 / 3 * (n // 2) - 1
+    # The wave numbers that exponax keeps in the square by default.
+    mask = k <= 2 / 3 * (n // 2) - 1
 
     def square(c: Any, like: Any) -> Any:
-        u = like.fft.irfft(kept * c, n)
-        return -derivative / 2 * kept * like.fft.rfft(u**2)
+        u = like.fft.irfft(mask * c, n)
+        return -derivative / 2 * mask * like.fft.rfft(u**2)
 
     def field(t: Any, c: Any, args: Any) -> Any:
         return cfjax.Affine(1.0, square(c, jnp), spectrum)
@@ -353,6 +353,6 @@ def of_kuramoto() -> Scene:
 
 SCENES = {
     "spacecraft": of_spacecraft,
-    "given angular velocity": of_given_velocity,
+    "given angular velocity": of_prescribed_velocity,
     "Kuramoto-Sivashinsky": of_kuramoto,
 }

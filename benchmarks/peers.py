@@ -30,8 +30,8 @@ BATCH = 1000
 def prepared(scene: Scene, name: str, y0: Any, setting: float) -> Callable[[], Any]:
     program = scene.programs[name]
     if program.package == "scipy":
-        start = jax.tree.map(np.asarray, y0)
-        return lambda: program.solve(start, setting)
+        y0_on_host = jax.tree.map(np.asarray, y0)
+        return lambda: program.solve(y0_on_host, setting)
 
     def solve(y0: Any) -> Any:
         return program.solve(y0, setting)
@@ -41,22 +41,22 @@ def prepared(scene: Scene, name: str, y0: Any, setting: float) -> Callable[[], A
 
 
 def to_target(scene: Scene, name: str, runs: dict[float, Callable]) -> float:
-    """The setting for the scene's error, by the slope between those in `runs`; more go there."""
+    """The setting for the scene's error, by the slope between those in `runs`; adds its runs."""
     errors = {setting: scene.error(run()) for setting, run in runs.items()}
     for _ in range(5):
         met = {s: e for s, e in errors.items() if e <= scene.target}
         missed = {s: e for s, e in errors.items() if scene.target < e}
         if not missed or (met and max(met.values()) > 0.8 * scene.target):
             break
-        near = min(missed, key=missed.__getitem__)
-        other = max(met or {s: missed[s] for s in missed if s != near}, key=errors.__getitem__)
-        slope = math.log(other / near) / math.log(errors[other] / errors[near])
-        setting = near * (0.9 * scene.target / errors[near]) ** slope
+        nearest = min(missed, key=missed.__getitem__)
+        second = max(met or {s: missed[s] for s in missed if s != nearest}, key=errors.__getitem__)
+        slope = math.log(second / nearest) / math.log(errors[second] / errors[nearest])
+        setting = nearest * (0.9 * scene.target / errors[nearest]) ** slope
         is_tolerance = scene.programs[name].package == "scipy"
         setting = results.digits(setting) if is_tolerance else math.ceil(setting)
         runs[setting] = prepared(scene, name, scene.y0, setting)
         errors[setting] = scene.error(runs[setting]())
-    # Of those that meet it the cheapest is the least exact.
+    # The least exact run that meets the target is the cheapest.
     met = {s: e for s, e in errors.items() if e <= scene.target}
     return max(met, key=met.__getitem__)
 
@@ -135,11 +135,11 @@ def draw() -> dict[str, Figure]:
     figure = _style.new_figure((11, 5.5))
     panels = dict(zip(SCENES, figure.subplots(1, len(SCENES)), strict=True))
     for package, color in COLORS.items():
-        own = [row for row in rows if row["package"].startswith(package)]
-        names = dict.fromkeys(row["program"] for row in own)
+        package_rows = [row for row in rows if row["package"].startswith(package)]
+        names = dict.fromkeys(row["program"] for row in package_rows)
         for name, marker in zip(names, MARKERS, strict=False):
             for scene, axes in panels.items():
-                curve = results.pick(own, program=name, scene=scene)
+                curve = results.pick(package_rows, program=name, scene=scene)
                 curve = sorted(curve, key=lambda row: -row["error"])
                 # The fastest run, which other programs of the machine disturb least.
                 times = [row["seconds"][0] for row in curve]

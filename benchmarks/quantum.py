@@ -38,14 +38,13 @@ from scipy.integrate import solve_ivp
 
 import cfjax
 import results
-from cfjax._measure.work_precision import take_turns
 from cfjax.scenes import annealing, transmon
 
 LEVELS, SPINS = 4, 12
 GOALS = (1e-6, 1e-9)
-# What is imported for those that need not be there.
+# Modules of the optional packages.
 PEERS = {"dynamiqs": "dynamiqs", "QuTiP": "qutip"}
-# Those that are in a batch, and not for the goals in brackets.
+# Methods that run in a batch, and the goals for which they do not.
 BATCHED = {
     "cfjax, Magnus4": (1e-9,),
     "cfjax, Magnus6": (),
@@ -73,7 +72,7 @@ class Problem(NamedTuple):
 
     t1: float
     y0: Complex[np.ndarray, "n *columns"]
-    parts: Callable[[], list[Any]]
+    operators: Callable[[], list[Any]]
     coefficients: Callable[[Any, Any, Any], list[Any]]
     field: Callable[[Any, Any, Any], Any]
     velocity: Callable[[Any, Any, Any], Any]
@@ -94,17 +93,17 @@ def pulses(number: int) -> Float[np.ndarray, "systems 2"]:
 
 
 def levels() -> list[Matrix]:
-    n, one = np.arange(LEVELS), transmon.plain()
-    energies = one.frequency * n + one.anharmonicity * n * (n - 1) / 2
+    n, pulse = np.arange(LEVELS), transmon.plain()
+    energies = pulse.frequency * n + pulse.anharmonicity * n * (n - 1) / 2
     lower = np.diag(np.sqrt(n[1:]), 1)
     return [np.diag(energies) + 0j, lower + lower.T + 0j]
 
 
 def drive(t: Any, args: Any, xp: Any) -> list[Any]:
-    one = transmon.plain()
-    angle, phase = 2 * np.pi / one.duration * t, one.frequency * t
-    first, second = args[0] * (1 - xp.cos(angle)), args[1] * xp.sin(angle)
-    return [1, first * xp.cos(phase) + second * xp.sin(phase)]
+    pulse = transmon.plain()
+    angle, phase = 2 * np.pi / pulse.duration * t, pulse.frequency * t
+    i_amplitude, q_amplitude = args[0] * (1 - xp.cos(angle)), args[1] * xp.sin(angle)
+    return [1, i_amplitude * xp.cos(phase) + q_amplitude * xp.sin(phase)]
 
 
 @functools.cache
@@ -112,8 +111,8 @@ def pair() -> list[Matrix]:
     """The constant part of two transmons, and the number operator of the first; rad/ns."""
     n = np.arange(3)
     hop = np.diag(np.sqrt(n[1:]), 1) + np.diag(np.sqrt(n[1:]), -1)
-    first, second = (2 * np.pi * (f * n - 0.3 * n * (n - 1) / 2) for f in (6.0, 5.0))
-    energies = np.add.outer(first, second).ravel()
+    energies_of_each = (2 * np.pi * (f * n - 0.3 * n * (n - 1) / 2) for f in (6.0, 5.0))
+    energies = np.add.outer(*energies_of_each).ravel()
     energies = energies - (energies.max() + energies.min()) / 2
     constant = np.diag(energies) + 2 * np.pi * 0.02 * np.kron(hop, hop)
     return [constant + 0j, np.kron(np.diag(n), np.eye(3)) + 0j]
@@ -145,7 +144,7 @@ PROBLEMS = {
     "transmon": Problem(
         t1=transmon.plain().duration,
         y0=transmon.y0(LEVELS),
-        parts=levels,
+        operators=levels,
         coefficients=drive,
         field=lambda t, y, args: transmon.field(t, y, transmon.Pulse(args[:1], args[1:])),
         velocity=lambda t, y, args: transmon.velocity(t, y, transmon.Pulse(args[:1], args[1:])),
@@ -171,7 +170,7 @@ PROBLEMS = {
     "two transmons": Problem(
         t1=40.0,
         y0=np.eye(9, dtype=complex),
-        parts=pair,
+        operators=pair,
         coefficients=flux,
         field=lambda t, y, args: cfjax.LeftMatrix(-1j * pair_hamiltonian(t, args)),
         velocity=lambda t, y, args: -1j * (pair_hamiltonian(t, args) @ y),
@@ -197,7 +196,7 @@ PROBLEMS = {
     "annealing": Problem(
         t1=annealing.t1,
         y0=annealing.y0(SPINS),
-        parts=spins,
+        operators=spins,
         coefficients=ramp,
         field=lambda t, y, args: annealing.field(t, y, args[0]),
         velocity=lambda t, y, args: annealing.velocity(t, y, args[0]),
@@ -220,14 +219,14 @@ PROBLEMS = {
 
 
 def in_frame(problem: Problem) -> Problem:
-    """The same in the frame where the levels of the constant part rest."""
-    constant, *others = problem.parts()
+    """The problem in the frame where the levels of the constant part are at rest."""
+    constant, *driven = problem.operators()
     energies = np.real(np.diag(constant))
-    rest = constant - np.diag(energies)
+    coupling = constant - np.diag(energies)
 
     def matrix(t: Any, args: Any) -> Matrix:
         _, *coefficients = problem.coefficients(t, args, jnp)
-        h = sum((c * part for c, part in zip(coefficients, others, strict=True)), rest)
+        h = sum((c * part for c, part in zip(coefficients, driven, strict=True)), coupling)
         turn = jnp.exp(1j * t * energies)
         return turn[:, None] * h * turn.conj()
 
@@ -239,33 +238,33 @@ def in_frame(problem: Problem) -> Problem:
 
 
 def by_cfjax(problem: Problem, method: str) -> Program:
-    def end(args, num_steps):
+    def final_state(args, num_steps):
         term, solver = cfjax.LieTerm(problem.field), getattr(cfjax, method)()
         t1, y0 = problem.t1, problem.y0
         sol = cfjax.integrate(term, solver, 0.0, t1, y0, args, num_steps=num_steps)
         return jax.tree.map(lambda y: y[-1], sol.ys)
 
-    return end
+    return final_state
 
 
 def by_diffrax(problem: Problem, method: str) -> Program:
-    def end(args, num_steps):
+    def final_state(args, num_steps):
         term, solver = diffrax.ODETerm(problem.velocity), getattr(diffrax, method)()
         t1, step, y0 = problem.t1, problem.t1 / num_steps, jnp.asarray(problem.y0)
         sol = diffrax.diffeqsolve(term, solver, 0.0, t1, step, y0, args, max_steps=None)
         return problem.leave(jax.tree.map(lambda y: y[-1], sol.ys))
 
-    return end
+    return final_state
 
 
 def by_dynamiqs(problem: Problem, method: str) -> Program:
-    """Operators as their diagonals, or dense if they are of four levels: what is faster."""
+    """Operators are dense if they are of four levels, otherwise diagonals: whichever is faster."""
     dq = importlib.import_module("dynamiqs")
     dq.set_precision("double")
     dq.set_progress_meter(False)
     layout = dq.dense if len(problem.y0) == LEVELS else dq.dia
-    parts = [h.toarray() if sparse.issparse(h) else h for h in problem.parts()]
-    parts = [dq.asqarray(h, layout=layout) for h in parts]
+    hamiltonians = [h.toarray() if sparse.issparse(h) else h for h in problem.operators()]
+    hamiltonians = [dq.asqarray(h, layout=layout) for h in hamiltonians]
     times = jnp.array([0.0, problem.t1])
 
     def hamiltonian(args: Any) -> Any:
@@ -273,51 +272,52 @@ def by_dynamiqs(problem: Problem, method: str) -> Program:
         if matrix is not None:
             return dq.timecallable(lambda t: dq.asqarray(matrix(t, args)))
 
-        def part(k: int, h: Any) -> Any:
+        def modulated(k: int, h: Any) -> Any:
             if isinstance(problem.coefficients(0.0, args, jnp)[k], int):
                 return dq.constant(h)
             return dq.modulated(lambda t: problem.coefficients(t, args, jnp)[k], h)
 
-        first, *others = (part(k, h) for k, h in enumerate(parts))
-        return sum(others, first)
+        constant, *driven = (modulated(k, h) for k, h in enumerate(hamiltonians))
+        return sum(driven, constant)
 
-    def end(args, tolerance):
+    def final_state(args, tolerance):
         h = hamiltonian(args)
-        how = getattr(dq.method, method)(rtol=tolerance, atol=tolerance, max_steps=1_000_000)
+        solver = getattr(dq.method, method)(rtol=tolerance, atol=tolerance, max_steps=1_000_000)
         if problem.y0.ndim == 1:
-            start = jnp.asarray(problem.y0)[:, None]
-            return dq.sesolve(h, start, times, method=how).final_state.to_jax()[:, 0]
-        return problem.leave(dq.sepropagator(h, times, method=how).final_propagator.to_jax())
+            psi0 = jnp.asarray(problem.y0)[:, None]
+            return dq.sesolve(h, psi0, times, method=solver).final_state.to_jax()[:, 0]
+        return problem.leave(dq.sepropagator(h, times, method=solver).final_propagator.to_jax())
 
-    return end
+    return final_state
 
 
 def by_qutip(problem: Problem, method: str) -> Program:
     qutip = importlib.import_module("qutip")
-    parts = [qutip.Qobj(h) for h in problem.parts()]
+    operators = [qutip.Qobj(h) for h in problem.operators()]
 
-    def end(args, tolerance):
-        def part(k: int, h: Any) -> Any:
+    def final_state(args, tolerance):
+        def modulated(k: int, h: Any) -> Any:
             is_constant = isinstance(problem.coefficients(0.0, args, np)[k], int)
             return h if is_constant else [h, lambda t: problem.coefficients(t, args, np)[k]]
 
-        total = [part(k, h) for k, h in enumerate(parts)]
+        hamiltonian = [modulated(k, h) for k, h in enumerate(operators)]
         options = dict(method=method, rtol=tolerance, atol=tolerance, nsteps=10**7)
         if problem.y0.ndim == 2:
-            return qutip.propagator(total, problem.t1, options=options).full()
-        # Or the norm would be mended.
+            return qutip.propagator(hamiltonian, problem.t1, options=options).full()
+        # Without this option QuTiP would normalise the state.
         options |= dict(normalize_output=False, progress_bar="")
-        found = qutip.sesolve(total, qutip.Qobj(problem.y0), [0.0, problem.t1], options=options)
-        return found.final_state.full()[:, 0]
+        psi0, times = qutip.Qobj(problem.y0), [0.0, problem.t1]
+        solution = qutip.sesolve(hamiltonian, psi0, times, options=options)
+        return solution.final_state.full()[:, 0]
 
-    return end
+    return final_state
 
 
 PACKAGES = {"cfjax": by_cfjax, "diffrax": by_diffrax, "dynamiqs": by_dynamiqs, "QuTiP": by_qutip}
 
 
 class Run(NamedTuple):
-    """Of all systems; the ends are those of the last time."""
+    """A run of all systems; `ends` has the final states of the last call."""
 
     program: Callable[[], Any]
     ends: list[Any]
@@ -328,21 +328,21 @@ class Run(NamedTuple):
 
 def run_of(problem: Problem, name: str, size: Any, data: Any) -> Run:
     package, method, *frame = name.split(", ")
-    end = PACKAGES[package](in_frame(problem) if frame else problem, method)
+    final_state = PACKAGES[package](in_frame(problem) if frame else problem, method)
     if package == "QuTiP":
-        return Run(lambda: np.stack([end(args, size) for args in data]), [])
-    return Run(results.compiled(batched(lambda args: end(args, size)), data), [])
+        return Run(lambda: np.stack([final_state(args, size) for args in data]), [])
+    return Run(results.compiled(batched(lambda args: final_state(args, size)), data), [])
 
 
-def batched(end: Callable[[Any], Any]) -> Callable[[Any], Any]:
-    """Of a batch of one, alone: a batch would not be as fast."""
-    return lambda data: jax.vmap(end)(data) if len(data) > 1 else end(data[0])[None]
+def batched(final_state: Callable[[Any], Any]) -> Callable[[Any], Any]:
+    """A batch of one is not vectorised, which is faster."""
+    return lambda data: jax.vmap(final_state)(data) if len(data) > 1 else final_state(data[0])[None]
 
 
 def error(ends: Any, target: Any) -> float:
-    far = np.abs(np.asarray(ends) - target)
-    each = far.max((1, 2)) if far.ndim == 3 else np.linalg.norm(far, axis=1)
-    return float(np.sqrt(np.mean(each**2)))
+    distances = np.abs(np.asarray(ends) - target)
+    errors = distances.max((1, 2)) if distances.ndim == 3 else np.linalg.norm(distances, axis=1)
+    return float(np.sqrt(np.mean(errors**2)))
 
 
 def off_norm(ends: Any) -> float:
@@ -353,31 +353,31 @@ def off_norm(ends: Any) -> float:
 
 def by_scipy(problem: Problem, args: Any) -> Any:
     """By SciPy's DOP853 with a tolerance of 1e-13. The error is from 1e-11 to 1e-10."""
-    parts = problem.parts()
+    operators = problem.operators()
 
     def rate(t, y):
         y = y.reshape(problem.y0.shape)
-        pairs = zip(problem.coefficients(t, args, np), parts, strict=True)
+        pairs = zip(problem.coefficients(t, args, np), operators, strict=True)
         return np.ravel(-1j * sum(c * (h @ y) for c, h in pairs))
 
-    start = problem.y0.ravel()
-    sol = solve_ivp(rate, (0.0, problem.t1), start, "DOP853", rtol=1e-13, atol=1e-15)
+    psi0 = problem.y0.ravel()
+    sol = solve_ivp(rate, (0.0, problem.t1), psi0, "DOP853", rtol=1e-13, atol=1e-15)
     return sol.y[:, -1].reshape(problem.y0.shape)
 
 
 def measure(quick: bool) -> Iterator[results.Row]:
-    there = {name: importlib.util.find_spec(module) for name, module in PEERS.items()}
-    missing = {name for name, spec in there.items() if spec is None}
-    others = {"diffrax": "diffrax", **PEERS}
+    specs = {name: importlib.util.find_spec(module) for name, module in PEERS.items()}
+    missing = {name for name, spec in specs.items() if spec is None}
+    modules = {"diffrax": "diffrax", **PEERS}
     versions = {
-        name: importlib.metadata.version(others[name]) for name in others if name not in missing
+        name: importlib.metadata.version(modules[name]) for name in modules if name not in missing
     }
-    yield {"others": ", ".join(f"{name} {versions[name]}" for name in others if name in versions)}
+    yield {"others": ", ".join(f"{name} {versions[name]}" for name in modules if name in versions)}
     for label, problem in PROBLEMS.items():
         reference = by_cfjax(problem, "Magnus10")
-        best = jax.jit(batched(lambda args, end=reference, n=problem.best: end(args, n)))
-        one = problem.systems(1)
-        apart = error(best(one), by_scipy(problem, one[0])[None])
+        best = jax.jit(batched(functools.partial(reference, num_steps=problem.best)))
+        single_system = problem.systems(1)
+        apart = error(best(single_system), by_scipy(problem, single_system[0])[None])
         yield {"problem": label, "DOP853 less Magnus10": results.digits(apart)}
         for number, repeats in (problem.quick if quick else problem.repeats).items():
             data = problem.systems(number)
@@ -389,10 +389,9 @@ def measure(quick: bool) -> Iterator[results.Row]:
                     if sizes[k] is not None and name.partition(",")[0] not in missing
                     if number == 1 or goal not in BATCHED.get(name, GOALS)
                 }
-                rounds = take_turns(list(runs.values()), repeats=repeats)
-                times = dict(zip(runs, rounds, strict=True))
-                rest = [name for name in runs if not name.startswith("cfjax")]
-                fastest = min(rest, key=lambda name: np.median(times[name]))
+                times = results.in_turns(runs, repeats=repeats)
+                peers = [name for name in runs if not name.startswith("cfjax")]
+                fastest = min(peers, key=lambda name: np.median(times[name]))
                 for name, seconds in times.items():
                     (ends,) = runs[name].ends
                     yield {

@@ -1,19 +1,22 @@
-"""What benchmarks measure: rows in files, with the machine, the versions and the time it took.
+"""Results of benchmarks: rows in files, with the machine, the versions and the time it took.
 
-A row is a dict of words and numbers. A measured time or ratio is in it as its spread: the minimum,
-the quartiles and the maximum. `python benchmarks/results.py` says what there is, and how long it
-takes to measure it all anew.
+A row is a dict of words and numbers. A measured time or ratio is stored as its spread: the minimum,
+the quartiles and the maximum. `python benchmarks/results.py` lists the results, and how long it
+takes to measure all of them again.
 """
 
 import argparse
+import ctypes
 import datetime
 import importlib.metadata
 import json
 import math
 import os
 import platform
+import shutil
+import subprocess
 import time
-from collections.abc import Callable, Iterable
+from collections.abc import Callable, Iterable, Mapping
 from pathlib import Path
 from typing import Any
 
@@ -38,15 +41,15 @@ def run(file: str, doc: str | None, measure: Measure) -> None:
     from rich.progress import track
 
     jax.config.update("jax_enable_x64", True)
-    name, about, start = Path(file).stem, machine(), time.perf_counter()
+    name, environment, begin = Path(file).stem, machine(), time.perf_counter()
     rows = [_json(row) for row in track(measure(quick), description=name, total=None)]
-    minutes = round((time.perf_counter() - start) / 60, 1)
-    save(name, machine=about, quick=quick, minutes=minutes, rows=rows)
+    minutes = round((time.perf_counter() - begin) / 60, 1)
+    save(name, machine=environment, quick=quick, minutes=minutes, rows=rows)
     show(name)
 
 
 def machine() -> dict[str, Any]:
-    """What the numbers depend on: the processor, how busy it is, and the versions."""
+    """The processor, its load, and the versions, on which the numbers depend."""
     cpuinfo = Path("/proc/cpuinfo")
     lines = cpuinfo.read_text().splitlines() if cpuinfo.exists() else []
     facts = {key.strip(): value.strip() for key, _, value in (x.partition(":") for x in lines)}
@@ -63,9 +66,9 @@ def machine() -> dict[str, Any]:
     }
 
 
-def save(name: str, *, rows: list[Row], **about: Any) -> None:
+def save(name: str, *, rows: list[Row], **header: Any) -> None:
     """Writes a file for `load`, with one row in a line."""
-    lines = [f'"{key}": {json.dumps(value)}' for key, value in about.items()]
+    lines = [f'"{key}": {json.dumps(value)}' for key, value in header.items()]
     body = ",\n".join(json.dumps(row, ensure_ascii=False, allow_nan=False) for row in rows)
     FOLDER.mkdir(exist_ok=True)
     text = "{\n" + ",\n".join([*lines, f'"rows": [\n{body}\n]']) + "\n}\n"
@@ -77,7 +80,7 @@ def load(name: str) -> dict[str, Any]:
 
 
 def names() -> list[str]:
-    """Of the benchmarks whose results there are."""
+    """The names of the benchmarks with stored results."""
     return sorted(path.stem for path in FOLDER.glob("*.json"))
 
 
@@ -106,6 +109,24 @@ def compiled(program: Callable[..., Any], *args: Any, repeats: int = 1) -> Calla
     return run
 
 
+def in_turns(programs: Mapping[str, Callable[[], Any]], **options: Any) -> dict[str, Any]:
+    """Seconds of each program in each round, by name. Options as of `take_turns`."""
+    from cfjax._measure.work_precision import take_turns
+
+    return dict(zip(programs, take_turns(list(programs.values()), **options), strict=True))
+
+
+def compile_c(source: str, folder: Path, *flags: str) -> ctypes.CDLL | None:
+    """The library of a C file in this folder, built in `folder`; None without a compiler."""
+    compiler = shutil.which("cc")
+    if compiler is None:
+        return None
+    path, target = Path(__file__).with_name(source), folder / f"{Path(source).stem}.so"
+    flags = ("-O3", "-march=native", "-shared", "-fPIC", *flags)
+    subprocess.run([compiler, *flags, str(path), "-o", str(target), "-lm"], check=True)
+    return ctypes.CDLL(str(target))
+
+
 def spread(values: Iterable[float]) -> list[float]:
     """The minimum, the quartiles and the maximum."""
     import numpy as np
@@ -119,7 +140,7 @@ def ratios(seconds: Iterable[float], base: Iterable[float]) -> list[float]:
 
 
 def digits(value: Any) -> float:
-    """Five of them."""
+    """The value with five digits."""
     return float(f"{value:.5g}")
 
 
@@ -156,7 +177,7 @@ def show(name: str) -> None:
 
 
 def _json(value: Any) -> Any:
-    """With None for what is not finite, which JSON has no number for."""
+    """With None for numbers that are not finite, which JSON lacks."""
     if isinstance(value, dict):
         return {key: _json(entry) for key, entry in value.items()}
     if isinstance(value, list | tuple):
@@ -184,9 +205,9 @@ def two_digits(value: float) -> str:
 
 def main() -> None:
     for name in names():
-        found = load(name)
-        quick = " (quick)" * found["quick"]
-        print(f"{name}: {found['machine']['date']}, {found['minutes']} minutes{quick}")
+        stored = load(name)
+        quick = " (quick)" * stored["quick"]
+        print(f"{name}: {stored['machine']['date']}, {stored['minutes']} minutes{quick}")
     minutes = sum(load(name)["minutes"] for name in names())
     print(f"The last measurements took {minutes:.0f} minutes in all.")
 

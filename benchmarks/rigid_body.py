@@ -5,8 +5,6 @@ compiler the ratios are to diffrax's Tsit5.
 """
 
 import ctypes
-import shutil
-import subprocess
 import tempfile
 from collections.abc import Callable, Iterator
 from pathlib import Path
@@ -18,7 +16,6 @@ import numpy as np
 
 import cfjax
 import results
-from cfjax._measure.work_precision import take_turns
 from cfjax.scenes import rigid_body
 
 STEP = 0.1
@@ -32,15 +29,16 @@ FIXED = cfjax.CF4(estimate=None)
 def measure(quick: bool) -> Iterator[results.Row]:
     single, batch = _single_programs(), _batch_programs()
     with tempfile.TemporaryDirectory() as folder:
-        library = _compile_c(Path(folder))
+        library = results.compile_c("rigid_body.c", Path(folder))
         if library is not None:
+            pointer = ctypes.POINTER(ctypes.c_double)
+            library.cf4.argtypes = [pointer, pointer, ctypes.c_double, ctypes.c_long]
+            library.cf4_batch.argtypes = [pointer, ctypes.c_long, *library.cf4.argtypes[1:]]
             single = {"C": _c_single(library), **single}
             batch = {"C": _c_batch(library), **batch}
         for systems, programs, steps in ((1, single, STEPS), (BATCH, batch, BATCH * BATCH_STEPS)):
             base = "C" if library is not None else "diffrax, Tsit5"
-            runs = list(programs.values())
-            rounds = take_turns(runs, repeats=3 if quick else 25)
-            times = dict(zip(programs, rounds, strict=True))
+            times = results.in_turns(programs, repeats=3 if quick else 25)
             for name, seconds in times.items():
                 yield {
                     "program": name,
@@ -113,20 +111,6 @@ def _batch_programs() -> dict[str, Callable[[], object]]:
     return {name: results.compiled(program, y0, inertia) for name, program in programs.items()}
 
 
-def _compile_c(folder: Path) -> ctypes.CDLL | None:
-    compiler = shutil.which("cc")
-    if compiler is None:
-        return None
-    source, target = Path(__file__).with_suffix(".c"), folder / "rigid_body.so"
-    flags = ["-O3", "-march=native", "-shared", "-fPIC"]
-    subprocess.run([compiler, *flags, str(source), "-o", str(target), "-lm"], check=True)
-    library = ctypes.CDLL(str(target))
-    pointer = ctypes.POINTER(ctypes.c_double)
-    library.cf4.argtypes = [pointer, pointer, ctypes.c_double, ctypes.c_long]
-    library.cf4_batch.argtypes = [pointer, ctypes.c_long, *library.cf4.argtypes[1:]]
-    return library
-
-
 def _pointer(array: np.ndarray):
     return array.ctypes.data_as(ctypes.POINTER(ctypes.c_double))
 
@@ -151,13 +135,13 @@ def _c_batch(library: ctypes.CDLL) -> Callable[[], object]:
         library.cf4_batch(_pointer(y), BATCH, _pointer(inertia), STEP, BATCH_STEPS)
         return y
 
-    some = jnp.asarray(y0[:3])
-    _check(run()[:3], jax.vmap(lambda y: _integrate(y, inertia, BATCH_STEPS))(some))
+    members = jnp.asarray(y0[:3])
+    _check(run()[:3], jax.vmap(lambda y: _integrate(y, inertia, BATCH_STEPS))(members))
     return run
 
 
 def _check(c, ours) -> None:
-    # Both make the same steps; what differs is rounding, which the flow lets grow with time.
+    # The steps are the same. They differ by rounding, which the flow lets grow with time.
     if not np.allclose(c, ours, atol=1e-9, rtol=0):
         raise RuntimeError(f"C and cfjax disagree: {c} and {ours}.")
 

@@ -1,4 +1,4 @@
-"""Adaptive steps on every scene: what a tolerance leads to, compared with Tsit5 in plain space.
+"""Adaptive steps on every scene: error and time at a tolerance, against Tsit5 in plain space.
 
 On each scene the method that is recommended for such fields runs with
 `diffrax.PIDController(rtol=0, atol=tolerance)`, at tolerances from 1e-4 to 1e-11, and Tsit5 on the
@@ -41,9 +41,9 @@ TIMED = (1e-6, 1e-8, 1e-11)
 class Scene(NamedTuple):
     solver: diffrax.AbstractSolver
     problem: dict[str, Any]
-    # The answer, whose error is at most this.
+    # The exact final state, and a bound of its error.
     reference: Callable[[], Any]
-    known_to: float = 1e-13
+    reference_error: float = 1e-13
     velocity: Callable[[Any, Any, Any], Any] | None = None
 
 
@@ -141,18 +141,18 @@ class Program:
     """A method on a scene, compiled once for all tolerances."""
 
     def __init__(self, scene: Scene, in_space: bool, exact: Any):
-        given, self.exact = scene.problem, exact
-        field = given["term"].field
+        problem, self.exact = scene.problem, exact
+        field = problem["term"].field
         velocity = scene.velocity or (lambda t, y, args: cfjax.tangent(field(t, y, args), y))
-        term = diffrax.ODETerm(velocity) if in_space else given["term"]
+        term = diffrax.ODETerm(velocity) if in_space else problem["term"]
         solver = diffrax.Tsit5() if in_space else scene.solver
 
         def solve(y0: Any, args: Any, dt0: Any, tolerance: Any) -> tuple[Any, Any]:
             sol = diffrax.diffeqsolve(
                 term,
                 solver,
-                given["t0"],
-                given["t1"],
+                problem["t0"],
+                problem["t1"],
                 dt0,
                 y0,
                 args,
@@ -161,9 +161,9 @@ class Program:
             )
             return jax.tree.map(lambda y: y[-1], sol.ys), sol.stats["num_steps"]
 
-        y0 = jax.tree.map(jnp.asarray, given["y0"])
-        args = jax.tree.map(jnp.asarray, given.get("args"))
-        self.start = y0, args, jnp.asarray((given["t1"] - given["t0"]) / 1000)
+        y0 = jax.tree.map(jnp.asarray, problem["y0"])
+        args = jax.tree.map(jnp.asarray, problem.get("args"))
+        self.start = y0, args, jnp.asarray((problem["t1"] - problem["t0"]) / 1000)
         self.solve = jax.jit(solve).lower(*self.start, jnp.asarray(1.0)).compile()
 
     def run(self, tolerance: float) -> Run:
@@ -176,7 +176,7 @@ class Program:
         for _ in range(8):
             if 0.8 < run.error / error < 1.25:
                 break
-            # Not below what rounding allows.
+            # Rounding allows no smaller tolerance.
             run = self.run(max(run.tolerance * error / run.error, 1e-14))
         return run
 
@@ -188,8 +188,8 @@ class Program:
 def _distance(y: Any, exact: Any) -> float:
     # q and -q are the same attitude, but a solution goes to one of them.
     pairs = zip(jax.tree.leaves(y), jax.tree.leaves(exact), strict=True)
-    parts = [np.abs(np.asarray(a) - np.asarray(b)).ravel() for a, b in pairs]
-    return float(np.sqrt(np.mean(np.concatenate(parts) ** 2)))
+    differences = [np.abs(np.asarray(a) - np.asarray(b)).ravel() for a, b in pairs]
+    return float(np.sqrt(np.mean(np.concatenate(differences) ** 2)))
 
 
 def measure(quick: bool) -> Iterator[results.Row]:
@@ -205,8 +205,8 @@ def measure(quick: bool) -> Iterator[results.Row]:
                 "error": results.digits(run.error),
                 "steps": run.num_steps,
             }
-            # Beyond it the error is that of the answer.
-            if run.error > 10 * scene.known_to:
+            # Below it the error is that of the reference.
+            if run.error > 10 * scene.reference_error:
                 same = theirs.to_error(run.error, tolerance)
                 row |= {
                     "Tsit5's error": results.digits(same.error),

@@ -1,4 +1,4 @@
-"""Time of a second process, whose programs JAX has kept on disk, from its start to the result.
+"""Time of a second process, whose programs JAX has cached on disk, from its start to the result.
 
 A process that is not measured fills JAX's compilation cache, in a folder for each program. What is
 left is to import, to trace, to lower and to read the program. `EQX_ON_ERROR=nan` is set, as JAX
@@ -23,7 +23,7 @@ STEPS = 50
 
 
 def solve(program: str, method: str, folder: str) -> None:
-    """All of it in a process that has imported nothing yet."""
+    """The whole solve, imports included."""
     os.environ["EQX_ON_ERROR"] = "nan"
     import diffrax
     import jax
@@ -37,22 +37,22 @@ def solve(program: str, method: str, folder: str) -> None:
     options: dict[str, Any] = dict(throw=False)
     if method == "Tsit5":
         term: Any = diffrax.ODETerm(lambda t, y, args: jnp.cross(-y / inertia, y))
-        solver, make = diffrax.Tsit5(), diffrax.diffeqsolve
+        solver, integrate = diffrax.Tsit5(), diffrax.diffeqsolve
     else:
         import cfjax
 
         term = cfjax.LieTerm(lambda t, y, args: cfjax.Rotation(-y / inertia))
-        solver, make = getattr(cfjax, method)(), cfjax.integrate
-    if make is diffrax.diffeqsolve or program == "diffeqsolve":
-        make, options = diffrax.diffeqsolve, dict(options, dt0=1 / STEPS)
+        solver, integrate = getattr(cfjax, method)(), cfjax.integrate
+    if integrate is diffrax.diffeqsolve or program == "diffeqsolve":
+        integrate, options = diffrax.diffeqsolve, dict(options, dt0=1 / STEPS)
     else:
         options["num_steps"] = STEPS
 
-    def end(y0: Any) -> Any:
-        return make(term, solver, t0=0.0, t1=1.0, y0=y0, **options).ys
+    def final_state(y0: Any) -> Any:
+        return integrate(term, solver, t0=0.0, t1=1.0, y0=y0, **options).ys
 
-    fun = jax.grad(lambda y0: jnp.sum(end(y0) ** 3)) if program == "its gradient" else end
-    jax.block_until_ready(jax.jit(fun)(y0))
+    gradient = jax.grad(lambda y0: jnp.sum(final_state(y0) ** 3))
+    jax.block_until_ready(jax.jit(gradient if program == "its gradient" else final_state)(y0))
 
 
 def measure(quick: bool) -> "Iterator[results.Row]":
@@ -67,16 +67,16 @@ def measure(quick: bool) -> "Iterator[results.Row]":
 
             for method in METHODS:
                 second(method)
-            taken = [[second(m) for m in METHODS] for _ in range(2 if quick else 5)]
-            base = [turn[0][0] for turn in taken]
+            turns = [[second(m) for m in METHODS] for _ in range(2 if quick else 5)]
+            base = [turn[0][0] for turn in turns]
             for k, method in enumerate(METHODS):
-                own = [turn[k][0] for turn in taken]
+                seconds = [turn[k][0] for turn in turns]
                 yield {
                     "program": program,
                     "method": method,
-                    "CPU seconds": results.spread(own),
-                    "seconds": results.spread(turn[k][1] for turn in taken),
-                    "over Tsit5": results.ratios(own, base),
+                    "CPU seconds": results.spread(seconds),
+                    "seconds": results.spread(turn[k][1] for turn in turns),
+                    "over Tsit5": results.ratios(seconds, base),
                 }
 
 

@@ -47,7 +47,7 @@ def draw() -> dict[str, Figure]:
 
 def curves(panel: str) -> Curves:
     for row in results.pick(results.load("stability")["rows"], panel=panel):
-        # What was not finite has no number in the file.
+        # None in the file stands for numbers that are not finite.
         yield row["curve"], row["x"], *(np.array(y, float) for y in row["y"])
 
 
@@ -215,8 +215,8 @@ def contrast() -> Curves:
                 num_steps=200,
                 throw=False,
             )
-            last = jax.tree.map(lambda ys: ys[-1], sol.ys)
-            return jnp.linalg.norm(heat.to_grid(last) - exact)
+            final_state = jax.tree.map(lambda ys: ys[-1], sol.ys)
+            return jnp.linalg.norm(heat.to_grid(final_state) - exact)
 
         yield name, ratios, jax.vmap(error)(np.max(full.mu) / ratios)
 
@@ -243,11 +243,11 @@ SEMILINEAR = {
 
 def damping() -> Curves:
     """The largest growth of a step, over |z| from 1 to 1e4, of `u' = -|z| u + r |z| u`."""
-    parts = np.linspace(-1.5, 1.0, 51)
-    z, r = (x.ravel() for x in np.meshgrid(np.geomspace(1, 1e4, 200), parts))
+    ratios = np.linspace(-1.5, 1.0, 51)
+    z, r = (x.ravel() for x in np.meshgrid(np.geomspace(1, 1e4, 200), ratios))
     for name, solver in SEMILINEAR.items():
-        growth = _growth(solver, -z, r * z).reshape(len(parts), -1)
-        yield name, parts, growth.max(axis=1)
+        growth = _growth(solver, -z, r * z).reshape(len(ratios), -1)
+        yield name, ratios, growth.max(axis=1)
 
 
 def oscillation() -> Curves:
@@ -258,7 +258,7 @@ def oscillation() -> Curves:
 
 
 def _growth(solver: Any, exact: np.ndarray, explicit: np.ndarray) -> np.ndarray:
-    """Of one step of length 1 from u = 1, by the solver itself."""
+    """The growth of one step of length 1 from u = 1, computed with the solver."""
 
     def field(t, u, explicit):
         return cfjax.Affine(1.0, explicit * u, exact)
@@ -330,13 +330,14 @@ def _driven_body(t, y, args):
 
 
 def _driven_error(solver: Any, num_steps: int, dtype: Any) -> float:
-    def end(solver: Any, num_steps: int, dtype: Any) -> np.ndarray:
+    def final_state(solver: Any, num_steps: int, dtype: Any) -> np.ndarray:
         y0, inertia = (jnp.asarray(x, dtype) for x in ([0.48, 0.6, 0.64], [1.0, 2.0, 3.5]))
         term = cfjax.LieTerm(_driven_body)
         sol = cfjax.integrate(term, solver, 0.0, 1.0, y0, inertia, num_steps=num_steps, throw=False)
         return np.asarray(jax.tree.leaves(sol.ys)[0][-1], float)
 
-    return float(np.linalg.norm(end(solver, num_steps, dtype) - end(cfjax.CG5(), 512, np.float64)))
+    exact = final_state(cfjax.CG5(), 512, np.float64)
+    return float(np.linalg.norm(final_state(solver, num_steps, dtype) - exact))
 
 
 if __name__ == "__main__":

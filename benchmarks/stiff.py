@@ -2,7 +2,7 @@
 
 For each program the number of equal steps, or the tolerance, that reaches relative errors of 1e-3,
 1e-6 and 1e-9; the programs with which it is met then take turns. A program that would take too long
-is left out, with the time after which nobody waited for it. Besides, the orders that show between
+is left out, with the time limit. Besides, the orders that show between
 two numbers of steps, what control of the steps costs and how far its errors are from the tolerance,
 how the choice of M for a variable coefficient matters, and what exponax makes of dispersion.
 
@@ -52,7 +52,7 @@ MOST_STEPS = 2**17
 
 
 class Run(NamedTuple):
-    """What came of a setting: a number of steps or a tolerance."""
+    """The result of a setting, which is a number of steps or a tolerance."""
 
     setting: float
     error: float
@@ -71,7 +71,7 @@ class Program:
         self.y0 = problem.y0
         self.executable = jax.jit(solve).lower(self.y0, self.array(1)).compile()
         self.runs: dict[float, Run] = {}
-        self.has_given_up = False
+        self.has_failed = False
 
     def array(self, setting: float) -> Any:
         return jnp.asarray(setting, float if self.is_adaptive else jnp.int32)
@@ -82,33 +82,33 @@ class Program:
 
     def run(self, setting: float) -> Run:
         if setting not in self.runs:
-            program, start = self.timed(setting), time.perf_counter()
-            values, steps, rejected, is_done = jax.block_until_ready(program())
-            seconds = time.perf_counter() - start
+            program, begin = self.timed(setting), time.perf_counter()
+            values, steps, rejected, is_successful = jax.block_until_ready(program())
+            seconds = time.perf_counter() - begin
             with np.errstate(all="ignore"):
                 error = float(np.linalg.norm(np.asarray(values) - self.reference) / self.scale)
-            # An error of an overflow, or of a run that was broken off, is worse than any.
-            error = error if is_done and math.isfinite(error) else math.inf
+            # An overflow, or a run that failed, has an infinite error.
+            error = error if is_successful and math.isfinite(error) else math.inf
             self.runs[setting] = Run(setting, error, int(steps), int(rejected), seconds)
         return self.runs[setting]
 
     def to(self, target: float, cap: float) -> Run | float:
-        """The cheapest run found with at most this error, or the seconds that were not enough."""
+        """The cheapest run with at most this error, or the seconds in which there was none."""
         search = self._tolerance if self.is_adaptive else self._count
-        if self.has_given_up:
-            # On a larger error.
+        if self.has_failed:
+            # It failed for a larger error.
             return cap
         begin = time.perf_counter()
         for setting in search(target):
-            last = max(self.runs.values(), key=lambda run: run.seconds, default=None)
+            longest = max(self.runs.values(), key=lambda run: run.seconds, default=None)
             # The next run takes longer than the longest: by how much is a guess for tolerances.
-            growth = (setting / last.steps if last and not self.is_adaptive else 2.0) if last else 0
-            waited = time.perf_counter() - begin
-            if last and waited + last.seconds * growth > cap:
-                break
+            if longest is not None:
+                growth = 2.0 if self.is_adaptive else setting / longest.steps
+                if time.perf_counter() - begin + longest.seconds * growth > cap:
+                    break
             self.run(setting)
         met = [run for run in self.runs.values() if run.error <= target]
-        self.has_given_up = not met
+        self.has_failed = not met
         return min(met, key=lambda run: run.steps) if met else cap
 
     def _count(self, target: float) -> Iterator[float]:
@@ -125,7 +125,7 @@ class Program:
             low = max(misses, default=1)
             if high <= max(low + 1, 1.04 * low) or self.runs[high].error > 0.85 * target:
                 return
-            # By the slope between both, where the miss is one of accuracy.
+            # By the slope between both, if the larger error is in the range of convergence.
             middle = math.sqrt(low * high)
             if low in self.runs and self.runs[low].error < 0.1:
                 few, many = self.runs[low].error, self.runs[high].error
@@ -159,13 +159,13 @@ def with_equal_steps(problem: Problem, solver: Any) -> Callable:
     return solve
 
 
-def with_control(problem: Problem, term: Any, solver: Any, values: Any, most: int) -> Callable:
+def with_control(problem: Problem, term: Any, solver: Any, values: Any, max_steps: int) -> Callable:
     """The tolerance is relative to the root mean square of the start."""
 
     def controlled(y0: Any, tolerance: Any) -> tuple:
-        start = values(y0)
-        size = jnp.sqrt(jnp.mean(jnp.abs(start) ** 2))
-        # A start of zeros, of a problem whose solution is about one.
+        y = values(y0)
+        size = jnp.sqrt(jnp.mean(jnp.abs(y) ** 2))
+        # For a start of zeros: the solution of that problem is about one.
         size = jnp.where(size > 0, size, 1.0)
         control = diffrax.PIDController(rtol=tolerance, atol=tolerance * size)
         sol = diffrax.diffeqsolve(
@@ -174,22 +174,22 @@ def with_control(problem: Problem, term: Any, solver: Any, values: Any, most: in
             0.0,
             problem.t1,
             problem.t1 / 1000,
-            start,
+            y,
             stepsize_controller=control,
-            max_steps=most,
+            max_steps=max_steps,
             throw=False,
         )
         assert sol.ys is not None
-        end = sol.ys[-1]
-        is_done = sol.result == diffrax.RESULTS.successful
+        y1 = sol.ys[-1]
+        is_successful = sol.result == diffrax.RESULTS.successful
         stats = sol.stats
-        found = problem.values(end) if jnp.iscomplexobj(end) or values is _as_it_is else end
-        return found, stats["num_steps"], stats["num_rejected_steps"], is_done
+        final_values = problem.values(y1) if jnp.iscomplexobj(y1) or values is _identity else y1
+        return final_values, stats["num_steps"], stats["num_rejected_steps"], is_successful
 
     return controlled
 
 
-def _as_it_is(y: Any) -> Any:
+def _identity(y: Any) -> Any:
     return y
 
 
@@ -202,9 +202,9 @@ def with_exponax(problem: Problem) -> Callable:
         # The coefficients of a step, before the loop.
         stepper = make(package, problem.t1 / num_steps)
         has_species = y0.ndim > 2
-        start = y0 if has_species else y0[None]
-        end = jax.lax.fori_loop(0, num_steps, lambda _, c: stepper.step_fourier(c), start)
-        return problem.values(end if has_species else end[0]), num_steps, 0, True
+        c = y0 if has_species else y0[None]
+        c1 = jax.lax.fori_loop(0, num_steps, lambda _, c: stepper.step_fourier(c), c)
+        return problem.values(c1 if has_species else c1[0]), num_steps, 0, True
 
     return solve
 
@@ -214,19 +214,17 @@ def programs(problem: Problem, reference: np.ndarray) -> dict[str, Program]:
     term, space = cfjax.LieTerm(problem.field), diffrax.ODETerm(problem.velocity)
     solves = {name: ("cfjax", with_equal_steps(problem, s)) for name, s in EQUAL.items()}
     for name, solver in ADAPTIVE.items():
-        solves[name + CONTROLLED] = (
-            "cfjax",
-            with_control(problem, term, solver, _as_it_is, 100_000),
-        )
+        solve = with_control(problem, term, solver, _identity, 100_000)
+        solves[name + CONTROLLED] = ("cfjax", solve)
     if problem.exponax and importlib.util.find_spec("exponax"):
         solves["exponax"] = ("exponax", with_exponax(problem))
     if (unknowns := reference.size) <= MOST_UNKNOWNS:
-        # So that a first run with them all takes a minute at most.
-        most = 4000 if unknowns < 150 else 400
-        stock = with_control(problem, space, diffrax.Kvaerno5(), problem.values, most)
-        solves["Kvaerno5"] = ("diffrax", stock)
-    stock = with_control(problem, space, diffrax.Tsit5(), problem.values, 200_000)
-    solves["Tsit5"] = ("diffrax", stock)
+        # A first run with all of these steps takes a minute at most.
+        max_steps = 4000 if unknowns < 150 else 400
+        solve = with_control(problem, space, diffrax.Kvaerno5(), problem.values, max_steps)
+        solves["Kvaerno5"] = ("diffrax", solve)
+    solve = with_control(problem, space, diffrax.Tsit5(), problem.values, 200_000)
+    solves["Tsit5"] = ("diffrax", solve)
     return {
         n: Program(solve, problem, reference, package) for n, (package, solve) in solves.items()
     }
@@ -238,31 +236,31 @@ def measure(quick: bool) -> Iterator[results.Row]:
     for name, make in PROBLEMS.items():
         problem = make()
         reference = problem.reference()
-        found = programs(problem, reference)
+        compiled = programs(problem, reference)
         for target in TARGETS[: 2 if quick else 3]:
-            yield from _to_target(name, found, target, quick)
-        yield from _orders(name, problem, found)
-        yield from _tolerances(name, found)
-        yield from _parts(name, found)
+            yield from _to_target(name, compiled, target, quick)
+        yield from _orders(name, problem, compiled)
+        yield from _tolerances(name, compiled)
+        yield from _diffusivities(name, compiled)
         if name == "Korteweg-de Vries":
-            yield from _dispersion(name, found)
+            yield from _dispersion(name, compiled)
     for name, make in OTHERS.items():
         problem = make()
         reference = problem.reference()
-        few = {
+        compiled = {
             n: Program(with_equal_steps(problem, s), problem, reference, "cfjax")
             for n, s in ORDERS.items()
         }
-        yield from _orders(name, problem, few)
-        yield from _parts(name, few)
+        yield from _orders(name, problem, compiled)
+        yield from _diffusivities(name, compiled)
     yield from _whole_operator()
 
 
 def _to_target(
-    name: str, found: dict[str, Program], target: float, quick: bool
+    name: str, compiled: dict[str, Program], target: float, quick: bool
 ) -> Iterator[results.Row]:
     cap, budget = (5.0, 1.0) if quick else (20.0, 4.0)
-    chosen = {program: p.to(target, cap) for program, p in found.items()}
+    chosen = {program: p.to(target, cap) for program, p in compiled.items()}
     met = {program: run for program, run in chosen.items() if isinstance(run, Run)}
     # In the turns of a slow one the others would have few: it has some of its own, beside a few.
     slow = [n for n, run in met.items() if run.seconds > 0.5 and n not in ORDERS]
@@ -273,7 +271,7 @@ def _to_target(
     keys = [*(f"over {base}" for base in BASES), "step over an equal one"]
     over: dict[str, dict[str, Any]] = {n: dict.fromkeys(keys) for n in met}
     for names in turns:
-        timed = [found[n].timed(met[n].setting) for n in names]
+        timed = [compiled[n].timed(met[n].setting) for n in names]
         # The first of a turn would pay for cold caches, after a slow one: it runs before.
         seconds = take_turns([timed[0], *timed], repeats=200, budget=budget)[1:]
         spent = dict(zip(names, seconds, strict=True))
@@ -286,7 +284,7 @@ def _to_target(
                 a_step, of_equal = (spent[m] / met[m].steps for m in (n, equal))
                 over[n]["step over an equal one"] = results.ratios(a_step, of_equal)
             times.setdefault(n, spent[n])
-    for program, p in found.items():
+    for program, p in compiled.items():
         version = importlib.metadata.version(p.package)
         row = {"problem": name, "program": program, "package": f"{p.package} {version}"}
         if program not in times:
@@ -303,10 +301,10 @@ def _to_target(
         }
 
 
-def _orders(name: str, problem: Problem, found: dict[str, Program]) -> Iterator[results.Row]:
+def _orders(name: str, problem: Problem, compiled: dict[str, Program]) -> Iterator[results.Row]:
     few, many = problem.counts
     for program in ORDERS:
-        errors = [found[program].run(n).error for n in (few, many)]
+        errors = [compiled[program].run(n).error for n in (few, many)]
         finite = all(map(math.isfinite, errors))
         slope = math.log(errors[0] / errors[1]) / math.log(many / few) if finite else math.inf
         yield {
@@ -320,9 +318,9 @@ def _orders(name: str, problem: Problem, found: dict[str, Program]) -> Iterator[
         }
 
 
-def _tolerances(name: str, found: dict[str, Program]) -> Iterator[results.Row]:
+def _tolerances(name: str, compiled: dict[str, Program]) -> Iterator[results.Row]:
     for program, tolerance in ((n, t) for n in ADAPTIVE for t in TOLERANCES):
-        run = found[program + CONTROLLED].run(tolerance)
+        run = compiled[program + CONTROLLED].run(tolerance)
         yield {
             "problem": name,
             "program": program,
@@ -333,22 +331,22 @@ def _tolerances(name: str, found: dict[str, Program]) -> Iterator[results.Row]:
         }
 
 
-def _dispersion(name: str, found: dict[str, Program]) -> Iterator[results.Row]:
-    """Errors of exponax, whose coefficients are real, beside the same method and others."""
+def _dispersion(name: str, compiled: dict[str, Program]) -> Iterator[results.Row]:
+    """Errors of exponax, whose coefficients are real, of the same method in cfjax, and others."""
     for program in ("exponax", "ETDRK4", "CF4", "ETD54"):
         for n in (1000, 2000, 4000, 8000):
-            if program in found:
-                error = results.digits(found[program].run(n).error)
+            if program in compiled:
+                error = results.digits(compiled[program].run(n).error)
                 yield {"problem": name, "program": program, "dispersion, steps": n, "error": error}
 
 
-def _parts(name: str, found: dict[str, Program]) -> Iterator[results.Row]:
+def _diffusivities(name: str, compiled: dict[str, Program]) -> Iterator[results.Row]:
     """Errors of the heat problem, by how much of its diffusivity is in M."""
     if not name.startswith("heat, "):
         return
     for program in ORDERS:
         for n in (50, 100, 200, 400):
-            error = results.digits(found[program].run(n).error)
+            error = results.digits(compiled[program].run(n).error)
             part = name.removeprefix("heat, ").removesuffix(" in M")
             yield {"in M": part, "program": program, "steps": n, "error": error}
 
@@ -358,13 +356,13 @@ def _whole_operator() -> Iterator[results.Row]:
     for n in (1, 10):
         problem = heat_diagonalised()
         solve = with_equal_steps(problem, cfjax.ETD54())
-        found = Program(solve, problem, problem.reference(), "cfjax")
-        error = results.digits(found.run(n).error)
-        seconds = results.spread(take_turns([found.timed(n)], repeats=200, budget=1.0)[0])
+        program = Program(solve, problem, problem.reference(), "cfjax")
+        error = results.digits(program.run(n).error)
+        seconds = results.spread(take_turns([program.timed(n)], repeats=200, budget=1.0)[0])
         yield {"whole operator, steps": n, "error": error, "seconds a solve": seconds}
 
 
-LOOKS: dict[str, tuple[str, str]] = {
+STYLES: dict[str, tuple[str, str]] = {
     "CF4": ("#0072B2", "o"),
     "CF43": ("#56B4E9", "s"),
     "ETDRK4": ("#999999", "D"),
@@ -388,7 +386,7 @@ def draw() -> dict[str, Figure]:
     figure = _style.new_figure((15, 10.5))
     panels = dict(zip(PROBLEMS, figure.subplots(3, 4).flat, strict=True))
     for problem, axes in panels.items():
-        for program in LOOKS:
+        for program in STYLES:
             curve = results.pick(rows, problem=problem, program=program)
             # The fastest run, which other programs of the machine disturb least.
             _line(axes, program, [r["seconds"][0] for r in curve], [r["error"] for r in curve])
@@ -396,7 +394,7 @@ def draw() -> dict[str, Figure]:
         _style.logarithmic(axes, "time", unit="s")
         axes.title.set_fontsize(10)
     # The first panel has them all in the legend, with or without a curve.
-    for program in (name for name in LOOKS if results.pick(rows, program=name)):
+    for program in (name for name in STYLES if results.pick(rows, program=name)):
         _line(figure.axes[0], program, [], [], label=NAMES.get(program, program))
     for axes in figure.axes[::4]:
         axes.set(ylabel="relative error at the end")
@@ -405,10 +403,10 @@ def draw() -> dict[str, Figure]:
 
 
 def _line(axes: Axes, program: str, times: list, errors: list, label: str | None = None) -> None:
-    color, marker = LOOKS[program]
+    color, marker = STYLES[program]
     dashes = "--" if program.endswith(CONTROLLED) else "-"
-    look: dict[str, Any] = dict(color=color, marker=marker, linestyle=dashes, label=label)
-    axes.plot(times, errors, markersize=5, linewidth=1, **look)
+    style: dict[str, Any] = dict(color=color, marker=marker, linestyle=dashes, label=label)
+    axes.plot(times, errors, markersize=5, linewidth=1, **style)
 
 
 if __name__ == "__main__":

@@ -39,7 +39,7 @@ class Problem(NamedTuple):
     counts: tuple[int, int]
     # The exact values on the grid at the end, where they are known.
     exact: np.ndarray | None = None
-    # What has been subtracted from the values at the end: errors are relative to the sum.
+    # Subtracted from the values at the end: errors are relative to the sum.
     lift: np.ndarray | float = 0.0
     # The class of exponax with the same M, g and dealiasing, less its length of a step.
     exponax: Callable[[Any, Any], Any] | None = None
@@ -48,18 +48,18 @@ class Problem(NamedTuple):
         """The values at the end, by an explicit method that shares nothing with the others."""
         if self.exact is not None:
             return self.exact
-        start = np.asarray(self.values(self.y0))
+        u0 = np.asarray(self.values(self.y0))
         velocity = jax.jit(lambda t, u: self.velocity(t, u, None))
 
         def ode(t: float, u: np.ndarray) -> np.ndarray:
-            return np.asarray(velocity(t, u.reshape(start.shape))).ravel()
+            return np.asarray(velocity(t, u.reshape(u0.shape))).ravel()
 
-        found = solve_ivp(ode, (0, self.t1), start.ravel(), "DOP853", rtol=LEAST, atol=LEAST)
-        return found.y[:, -1].reshape(start.shape)
+        solution = solve_ivp(ode, (0, self.t1), u0.ravel(), "DOP853", rtol=LEAST, atol=LEAST)
+        return solution.y[:, -1].reshape(u0.shape)
 
 
 def dirichlet(
-    t1: float, diffusivity: float, length: float, u0: np.ndarray, g: Callable, **more: Any
+    t1: float, diffusivity: float, length: float, u0: np.ndarray, g: Callable, **options: Any
 ) -> Problem:
     """Diffusion by central differences, with the value zero at both ends."""
     n, sine = len(u0), cfjax.SineTransform()
@@ -73,10 +73,10 @@ def dirichlet(
         return scale * jnp.diff(jnp.pad(u, 1), 2) + g(t, u)
 
     y0 = sine.forward(jnp.asarray(u0))
-    return Problem(t1, y0, field, sine.inverse, sine.forward, velocity, **more)
+    return Problem(t1, y0, field, sine.inverse, sine.forward, velocity, **options)
 
 
-def periodic(t1: float, spectrum: Any, u0: np.ndarray, g: Callable, **more: Any) -> Problem:
+def periodic(t1: float, spectrum: Any, u0: np.ndarray, g: Callable, **options: Any) -> Problem:
     """With g of the real Fourier coefficients; the spectrum has an axis for each that u0 has."""
     shape = u0.shape[-spectrum.ndim :] if u0.ndim == 1 else u0.shape[1:]
     axes = tuple(range(-len(shape), 0))
@@ -96,15 +96,15 @@ def periodic(t1: float, spectrum: Any, u0: np.ndarray, g: Callable, **more: Any)
         return values(spectrum * c + g(t, c))
 
     y0 = coefficients(jnp.asarray(u0))
-    return Problem(t1, y0, field, values, coefficients, velocity, **more)
+    return Problem(t1, y0, field, values, coefficients, velocity, **options)
 
 
 def points(n: int, low: float, high: float) -> np.ndarray:
-    """Those inside."""
+    """The n inner points of an equidistant grid."""
     return np.linspace(low, high, n + 2)[1:-1]
 
 
-def kept(k: np.ndarray, n: int, fraction: float) -> np.ndarray:
+def dealiasing_mask(k: np.ndarray, n: int, fraction: float) -> np.ndarray:
     """The wave numbers that exponax keeps in g."""
     return np.abs(k) <= fraction * (n // 2) - 1
 
@@ -113,7 +113,7 @@ def kept(k: np.ndarray, n: int, fraction: float) -> np.ndarray:
 
 
 def of_heat(constant: Callable[[np.ndarray], float]) -> Problem:
-    """The paper's operator, whose g has all of it but a constant diffusivity."""
+    """The paper's operator: M has a constant diffusivity, and g all else."""
     mu = heat.diffusivity().mu
     args = heat.Diffusivity(jnp.asarray(mu), jnp.asarray(constant(np.asarray(mu))))
     return Problem(
@@ -129,7 +129,7 @@ def of_heat(constant: Callable[[np.ndarray], float]) -> Problem:
 
 
 def heat_diagonalised() -> Problem:
-    """All of it in M."""
+    """The heat problem with all of its operator in M."""
     problem, n = of_heat(np.mean), len(heat.y0())
     matrix = jax.jacfwd(lambda u: problem.velocity(0.0, u, None))(jnp.zeros(n))
     spectrum, transform = cfjax.diagonalised(np.asarray(matrix))
@@ -143,46 +143,46 @@ def heat_diagonalised() -> Problem:
 
 def hochbruck_ostermann() -> Problem:
     x = points(199, 0, 1)
-    start = x * (1 - x)
+    u0 = x * (1 - x)
 
     def g(t: Any, u: Any) -> Any:
-        exact = jnp.exp(t) * start
+        exact = jnp.exp(t) * u0
         return 1 / (1 + u**2) + exact + 2 * jnp.exp(t) - 1 / (1 + exact**2)
 
-    return dirichlet(1.0, 1.0, 1.0, start, g, counts=(10, 80), exact=np.e * start)
+    return dirichlet(1.0, 1.0, 1.0, u0, g, counts=(10, 80), exact=np.e * u0)
 
 
 def hochbruck_ostermann_integral() -> Problem:
     x = points(199, 0, 1)
-    start = x * (1 - x)
+    u0 = x * (1 - x)
 
     def g(t: Any, u: Any) -> Any:
-        return jnp.mean(u) + jnp.exp(t) * (start + 2 - np.mean(start))
+        return jnp.mean(u) + jnp.exp(t) * (u0 + 2 - np.mean(u0))
 
-    return dirichlet(1.0, 1.0, 1.0, start, g, counts=(10, 80), exact=np.e * start)
+    return dirichlet(1.0, 1.0, 1.0, u0, g, counts=(10, 80), exact=np.e * u0)
 
 
 def allen_cahn() -> Problem:
     x = points(127, -1, 1)
     # The values are -1 and 1 at the ends: the state is u - x.
-    start = -0.47 * (x + np.sin(1.5 * np.pi * x))
+    u0 = -0.47 * (x + np.sin(1.5 * np.pi * x))
 
     def g(t: Any, v: Any) -> Any:
         u = v + x
         return u - u**3
 
-    return dirichlet(12.0, 0.01, 2.0, start, g, counts=(20, 160), lift=x)
+    return dirichlet(12.0, 0.01, 2.0, u0, g, counts=(20, 160), lift=x)
 
 
 def allen_cahn_in_g() -> Problem:
     """The same with the boundary values in g, where they are constant."""
     n = 127
     x = points(n, -1, 1)
-    ends = np.zeros(n)
-    ends[0], ends[-1] = -1, 1
-    ends *= 0.01 * ((n + 1) / 2) ** 2
-    start = 0.53 * x - 0.47 * np.sin(1.5 * np.pi * x)
-    return dirichlet(12.0, 0.01, 2.0, start, lambda t, u: u - u**3 + ends, counts=(20, 160))
+    boundary_values = np.zeros(n)
+    boundary_values[0], boundary_values[-1] = -1, 1
+    boundary_values *= 0.01 * ((n + 1) / 2) ** 2
+    u0 = 0.53 * x - 0.47 * np.sin(1.5 * np.pi * x)
+    return dirichlet(12.0, 0.01, 2.0, u0, lambda t, u: u - u**3 + boundary_values, counts=(20, 160))
 
 
 def inflow(t: Any) -> Any:
@@ -208,11 +208,11 @@ def advection_diffusion() -> Problem:
 def advection_diffusion_in_g() -> Problem:
     """The same with the boundary value in g, where it varies in time."""
     n = 199
-    first = np.zeros(n)
-    first[0] = 1
+    first_point = np.zeros(n)
+    first_point[0] = 1
 
     def g(t: Any, u: Any) -> Any:
-        return (0.01 * (n + 1) ** 2 + (n + 1) / 2) * inflow(t) * first - slope(u)
+        return (0.01 * (n + 1) ** 2 + (n + 1) / 2) * inflow(t) * first_point - slope(u)
 
     return dirichlet(1.0, 0.01, 1.0, np.zeros(n), g, counts=(40, 160))
 
@@ -229,19 +229,19 @@ def slope(u: Any) -> Any:
 def allen_cahn_periodic() -> Problem:
     n = 128
     x = 2 * np.arange(n) / n
-    start = 0.5 * np.sin(np.pi * x) + 0.3 * np.cos(3 * np.pi * x) + 0.1
+    u0 = 0.5 * np.sin(np.pi * x) + 0.3 * np.cos(3 * np.pi * x) + 0.1
     k = np.pi * np.arange(n // 2 + 1)
 
     def g(t: Any, c: Any) -> Any:
         u = jnp.fft.irfft(c, n)
         return jnp.fft.rfft(u - u**3)
 
-    return periodic(5.0, -0.01 * k**2, start, g, counts=(20, 160))
+    return periodic(5.0, -0.01 * k**2, u0, g, counts=(20, 160))
 
 
 def convection(n: int, derivative: np.ndarray, scale: float) -> Callable:
     """Of u in its conservative form, with two thirds of the wave numbers kept."""
-    mask = kept(np.arange(n // 2 + 1), n, 2 / 3)
+    mask = dealiasing_mask(np.arange(n // 2 + 1), n, 2 / 3)
 
     def g(t: Any, c: Any) -> Any:
         u = jnp.fft.irfft(mask * c, n)
@@ -251,9 +251,9 @@ def convection(n: int, derivative: np.ndarray, scale: float) -> Callable:
 
 
 def truncated(u: np.ndarray) -> np.ndarray:
-    """With the wave numbers alone that g keeps."""
+    """Only the wave numbers that g keeps."""
     n = len(u)
-    return np.fft.irfft(kept(np.arange(n // 2 + 1), n, 2 / 3) * np.fft.rfft(u), n)
+    return np.fft.irfft(dealiasing_mask(np.arange(n // 2 + 1), n, 2 / 3) * np.fft.rfft(u), n)
 
 
 def kuramoto_sivashinsky() -> Problem:
@@ -318,7 +318,7 @@ def schrodinger() -> Problem:
     x = 2 * np.pi * np.arange(n) / n - np.pi
     k = np.fft.fftfreq(n, 1 / n)
     spectrum = jnp.asarray(-0.5j * k**2)
-    start = np.exp(np.cos(x) - 1) * np.exp(1j * np.sin(x))
+    psi0 = np.exp(np.cos(x) - 1) * np.exp(1j * np.sin(x))
 
     def g(psi: Any) -> Any:
         return -1j * (np.cos(x) + jnp.abs(psi) ** 2) * psi
@@ -326,18 +326,18 @@ def schrodinger() -> Problem:
     def field(t: Any, c: Any, args: Any) -> cfjax.Affine:
         return cfjax.Affine(1.0, jnp.fft.fft(g(jnp.fft.ifft(c))), spectrum)
 
-    def parts(psi: Any) -> Any:
+    def real_and_imaginary(psi: Any) -> Any:
         return jnp.stack([psi.real, psi.imag])
 
     def velocity(t: Any, u: Any, args: Any) -> Any:
         psi = u[0] + 1j * u[1]
-        return parts(jnp.fft.ifft(spectrum * jnp.fft.fft(psi)) + g(psi))
+        return real_and_imaginary(jnp.fft.ifft(spectrum * jnp.fft.fft(psi)) + g(psi))
 
     return Problem(
         2.5,
-        jnp.fft.fft(jnp.asarray(start)),
+        jnp.fft.fft(jnp.asarray(psi0)),
         field,
-        lambda c: parts(jnp.fft.ifft(c)),
+        lambda c: real_and_imaginary(jnp.fft.ifft(c)),
         lambda u: jnp.fft.fft(u[0] + 1j * u[1]),
         velocity,
         (50, 400),
@@ -349,10 +349,10 @@ def gray_scott() -> Problem:
     x = np.arange(n) / n
     x, y = x[:, None], x[None, :]
     spots = sum(np.exp(-80 * ((x - a) ** 2 + (y - b) ** 2)) for a, b in ((0.4, 0.45), (0.6, 0.6)))
-    start = np.stack([1 - spots / 2, spots / 4])
+    u0 = np.stack([1 - spots / 2, spots / 4])
     i, j = np.fft.fftfreq(n, 1 / n)[:, None], np.arange(n // 2 + 1)
     laplacian = -((2 * np.pi) ** 2) * (i**2 + j**2)
-    mask = kept(i, n, 1 / 2) & kept(j, n, 1 / 2)
+    mask = dealiasing_mask(i, n, 1 / 2) & dealiasing_mask(j, n, 1 / 2)
 
     def g(t: Any, c: Any) -> Any:
         u, v = jnp.fft.irfft2(mask * c, (n, n))
@@ -362,7 +362,7 @@ def gray_scott() -> Problem:
     return periodic(
         300.0,
         np.multiply.outer([2e-5, 1e-5], laplacian),
-        start,
+        u0,
         g,
         counts=(20, 160),
         exponax=lambda package, dt: package.stepper.reaction.GrayScott(
@@ -385,11 +385,11 @@ def nonlinear_diffusion() -> Problem:
         jacobian = jax.jacfwd(lambda u: velocity(t, u))(u)
         return cfjax.LinearAffine(jacobian, velocity(t, u) - jacobian @ u)
 
-    def as_it_is(u: Any) -> Any:
+    def identity(u: Any) -> Any:
         return u
 
-    start = jnp.asarray(np.sin(np.pi * x))
-    return Problem(0.2, start, field, as_it_is, as_it_is, velocity, (20, 80))
+    u0 = jnp.asarray(np.sin(np.pi * x))
+    return Problem(0.2, u0, field, identity, identity, velocity, (20, 80))
 
 
 PROBLEMS: dict[str, Callable[[], Problem]] = {

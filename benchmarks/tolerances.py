@@ -1,4 +1,4 @@
-"""What error control costs: error against tolerance and against flows, and time to an error.
+"""The cost of error control: error against tolerance and against flows, and time to an error.
 
 The problem is the rigid body to t = 10, and every method runs with
 `diffrax.PIDController(rtol=0, atol=tolerance)`. It measures steps, errors and times at equal
@@ -154,24 +154,24 @@ def _reference(y0: np.ndarray) -> np.ndarray:
         y = y.reshape(y0.shape)
         return np.cross(y, y / rigid_body.inertia).ravel()
 
-    answer = solve_ivp(ode, (0, END), y0.ravel(), method="DOP853", rtol=2.3e-14, atol=1e-15)
-    return answer.y[:, -1].reshape(y0.shape)
+    solution = solve_ivp(ode, (0, END), y0.ravel(), method="DOP853", rtol=2.3e-14, atol=1e-15)
+    return solution.y[:, -1].reshape(y0.shape)
 
 
 def draw() -> dict[str, Figure]:
     rows = results.load("tolerances")["rows"]
     curves = {name: [r for r in results.pick(rows, method=name) if "flows" in r] for name in NAMES}
     figure = _style.new_figure((10, 4))
-    left, right = figure.subplots(1, 2, sharey=True)
+    by_tolerance, by_flows = figure.subplots(1, 2, sharey=True)
     for name, curve in curves.items():
         tolerances, errors, flows = (
             [row[k] for row in curve] for k in ("tolerance", "error", "flows")
         )
-        left.loglog(tolerances, errors, "o-", markersize=3, label=name)
-        right.loglog(flows, errors, "o-", markersize=3)
-    left.loglog(TOLERANCES, TOLERANCES, "k:", label="error = tolerance")
-    left.set(xlabel="tolerance", ylabel=f"error at t = {END:g}")
-    right.set(xlabel="flows")
+        by_tolerance.loglog(tolerances, errors, "o-", markersize=3, label=name)
+        by_flows.loglog(flows, errors, "o-", markersize=3)
+    by_tolerance.loglog(TOLERANCES, TOLERANCES, "k:", label="error = tolerance")
+    by_tolerance.set(xlabel="tolerance", ylabel=f"error at t = {END:g}")
+    by_flows.set(xlabel="flows")
     _style.finish(figure, columns=5)
     return {"tolerances": figure}
 

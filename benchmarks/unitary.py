@@ -5,8 +5,6 @@ machine. Without a C compiler there is no ratio to C.
 """
 
 import ctypes
-import shutil
-import subprocess
 import tempfile
 import warnings
 from collections.abc import Callable, Iterator
@@ -20,12 +18,9 @@ from jax import Array, lax
 
 import cfjax
 import results
-from cfjax._measure.work_precision import take_turns
 from cfjax._numerics.expm import TAYLOR_SCHEMES, by_norm, taylor_from_second
 from cfjax._numerics.matmul import small_product
 from cfjax.scenes import wilson_flow
-
-Programs = dict[str, Callable[[], object]]
 
 T1, STEPS = 1.0, 100
 BATCH = 500
@@ -39,15 +34,10 @@ def measure(quick: bool) -> Iterator[results.Row]:
             for batch in (1, BATCH, 20_000):
                 yield from exponentials(n, gradient, batch, repeats)
     for batch in (1, BATCH):
-        yield from parts(batch, repeats)
+        yield from components(batch, repeats)
         yield from steps(batch, repeats)
     for side in (4, 8):
         yield from links(side, repeats)
-
-
-def timed(programs: Programs, repeats: int) -> dict[str, np.ndarray]:
-    rounds = take_turns(list(programs.values()), repeats=repeats)
-    return dict(zip(programs, rounds, strict=True))
 
 
 def skew(batch: int, n: int, norm: float, seed: int = 0) -> Array:
@@ -84,24 +74,22 @@ def exponentials(n: int, gradient: bool, batch: int, repeats: int) -> Iterator[r
             return (a * (1 - 1e-9), small_product(expm(a), y)), None
 
         def run(a: Array, y: Array) -> Array:
-            end = lax.scan(jax.checkpoint(step) if gradient else step, (a, y), None, length=loops)
-            return jnp.sum(jnp.abs(end[0][1][0]) ** 2)
+            carry = lax.scan(jax.checkpoint(step) if gradient else step, (a, y), None, length=loops)
+            return jnp.sum(jnp.abs(carry[0][1][0]) ** 2)
 
-        one = jax.grad(run) if gradient else run
+        function = jax.grad(run) if gradient else run
         # Alone a batch of one is not vectorised.
-        return (
-            results.compiled(jax.vmap(one), a, y)
-            if batch > 1
-            else results.compiled(one, a[0], y[0])
-        )
+        if batch > 1:
+            return results.compiled(jax.vmap(function), a, y)
+        return results.compiled(function, a[0], y[0])
 
-    times = timed(
+    times = results.in_turns(
         {
             "cfjax.expm": program(cfjax.expm),
             "products of matrices": program(by_products),
             "jax.scipy.linalg.expm": program(jax.scipy.linalg.expm),
         },
-        repeats,
+        repeats=repeats,
     )
     for name, seconds in times.items():
         yield {
@@ -202,7 +190,7 @@ def steps(batch: int, repeats: int) -> Iterator[results.Row]:
     exact = np.asarray(compiled(ours(cfjax.CF54(), 10 * STEPS))())
     programs = {name: compiled(run) for name, (_, run) in methods.items()}
     errors = {name: np.max(np.abs(np.asarray(run()) - exact)) for name, run in programs.items()}
-    times = timed(programs, repeats)
+    times = results.in_turns(programs, repeats=repeats)
     loop, tsit5 = next(iter(methods)), list(methods)[-1]
     for name, seconds in times.items():
         order, _ = methods[name]
@@ -219,24 +207,24 @@ def steps(batch: int, repeats: int) -> Iterator[results.Row]:
         }
 
 
-def parts(batch: int, repeats: int) -> Iterator[results.Row]:
-    """What a step is made of: a field, and a flow. Each feeds the next."""
+def components(batch: int, repeats: int) -> Iterator[results.Row]:
+    """The components of a step: a field, and a flow, each in a loop."""
     loops = 1000
     y0 = starts(batch)
 
-    def program(part: Callable[[Array, Array], Array]) -> Callable[[], object]:
+    def program(operation: Callable[[Array, Array], Array]) -> Callable[[], object]:
         def run(y: Array) -> Array:
-            return lax.scan(lambda y, t: (part(t, y), None), y, jnp.linspace(0, 1, loops))[0]
+            return lax.scan(lambda y, t: (operation(t, y), None), y, jnp.linspace(0, 1, loops))[0]
 
         return results.compiled(jax.vmap(run), y0) if batch > 1 else results.compiled(run, y0[0])
 
     a = 0.05 * skew(1, 3, 1.0)[0]
-    times = timed(
+    times = results.in_turns(
         {
             "field": program(generator),
             "flow": program(lambda t, y: cfjax.LeftMatrix((1 + t) * a).flow(y)),
         },
-        repeats,
+        repeats=repeats,
     )
     for name, seconds in times.items():
         yield {
@@ -263,7 +251,7 @@ def straightforward(y0: Array) -> Array:
 
     def force(y: Array) -> Array:
         d = y.shape[0]
-        out = []
+        forces = []
         for mu in range(d):
             total = jnp.zeros_like(y[mu])
             for nu in set(range(d)) - {mu}:
@@ -273,8 +261,8 @@ def straightforward(y0: Array) -> Array:
             loop = y[mu] @ total
             z = (dagger(loop) - loop) / 2
             trace = jnp.trace(z, axis1=-2, axis2=-1)[..., None, None]
-            out.append(z - trace / 3 * jnp.eye(3).reshape(*[1] * d, 3, 3))
-        return jnp.stack(out)
+            forces.append(z - trace / 3 * jnp.eye(3).reshape(*[1] * d, 3, 3))
+        return jnp.stack(forces)
 
     def step(y: Array, _: None) -> tuple[Array, None]:
         k = jnp.zeros_like(y)
@@ -299,12 +287,13 @@ def links(side: int, repeats: int) -> Iterator[results.Row]:
         "cfjax.integrate": results.compiled(solve, y0),
         "jax.scipy.linalg.expm under vmap": results.compiled(straightforward, y0),
     }
-    end = np.asarray(programs["cfjax.integrate"]())
-    _check(programs["jax.scipy.linalg.expm under vmap"](), end)
+    final_links = np.asarray(programs["cfjax.integrate"]())
+    _check(programs["jax.scipy.linalg.expm under vmap"](), final_links)
     with tempfile.TemporaryDirectory() as folder:
-        if shutil.which("cc") is not None:
-            programs = {"C": _c(Path(folder), side, end), **programs}
-        times = timed(programs, max(3, repeats // 2))
+        library = results.compile_c("wilson_flow.c", Path(folder), f"-DSIDE={side}")
+        if library is not None:
+            programs = {"C": _c(library, side, final_links), **programs}
+        times = results.in_turns(programs, repeats=max(3, repeats // 2))
     base = next(iter(programs))
     for name, seconds in times.items():
         yield {
@@ -315,28 +304,25 @@ def links(side: int, repeats: int) -> Iterator[results.Row]:
         }
 
 
-def _c(folder: Path, side: int, end: np.ndarray) -> Callable[[], object]:
-    source, target = Path(__file__).with_name("wilson_flow.c"), folder / "wilson_flow.so"
-    flags = ["-O3", "-march=native", "-shared", "-fPIC", f"-DSIDE={side}"]
-    subprocess.run(["cc", *flags, str(source), "-o", str(target)], check=True)
-    williamson3 = ctypes.CDLL(str(target)).williamson3
+def _c(library: ctypes.CDLL, side: int, expected: np.ndarray) -> Callable[[], object]:
+    williamson3 = library.williamson3
     pointer = ctypes.POINTER(ctypes.c_double)
     williamson3.argtypes = [pointer, ctypes.c_double, ctypes.c_long]
-    start = np.ascontiguousarray(wilson_flow.y0(side))
+    y0 = np.ascontiguousarray(wilson_flow.y0(side))
 
     def run() -> np.ndarray:
-        y = start.copy()
+        y = y0.copy()
         williamson3(y.ctypes.data_as(pointer), LINK_STEP, LINK_STEPS)
         return y
 
-    _check(run(), end)
+    _check(run(), expected)
     return run
 
 
-def _check(one, other) -> None:
-    # All make the same steps; what differs is rounding.
-    if not np.allclose(one, other, atol=1e-12, rtol=0):
-        raise RuntimeError(f"The programs disagree by {np.max(np.abs(one - other))}.")
+def _check(actual, expected) -> None:
+    # The steps are the same. They differ by rounding.
+    if not np.allclose(actual, expected, atol=1e-12, rtol=0):
+        raise RuntimeError(f"The programs disagree by {np.max(np.abs(actual - expected))}.")
 
 
 if __name__ == "__main__":

@@ -159,11 +159,11 @@ def _failed(values: PyTree) -> Int[np.ndarray, " failures"]:
     return np.flatnonzero(np.any(bad, axis=0))
 
 
-def _not_finite(values: PyTree, where: Any = True) -> list[Bool[np.ndarray, " members"]]:
-    """For each array of numbers, which members have one that is not finite there."""
+def _not_finite(values: PyTree, mask: Any = True) -> list[Bool[np.ndarray, " members"]]:
+    """For each array of numbers, which members have one in the mask that is not finite."""
     arrays: list[Any] = [a for a in jtu.tree_leaves(values) if isinstance(a, np.ndarray)]
     # Not by np.issubdtype: to NumPy bfloat16 is no number.
     arrays = [a for a in arrays if jnp.issubdtype(a.dtype, np.inexact)]
-    places = [np.reshape(where, np.shape(where) + (1,) * (a.ndim - np.ndim(where))) for a in arrays]
-    bad = [~np.isfinite(a) & place for a, place in zip(arrays, places, strict=True)]
+    masks = [np.reshape(mask, np.shape(mask) + (1,) * (a.ndim - np.ndim(mask))) for a in arrays]
+    bad = [~np.isfinite(a) & m for a, m in zip(arrays, masks, strict=True)]
     return [a.reshape(len(a), -1).any(axis=1) for a in bad]

@@ -1,4 +1,4 @@
-"""What is said where the program of a chunk raises an error: which member failed, and why."""
+"""The error of a batch whose program raises one: which member failed, and why."""
 
 import contextlib
 import logging
@@ -11,7 +11,7 @@ import numpy as np
 
 from .program import Program
 
-# What a check of equinox says in an error of a compiled program, before its advice.
+# The message of a check of equinox in an error of a compiled program, before its advice.
 _MESSAGE = re.compile(r"_EquinoxRuntimeError: (.*?)\n\n\n-", re.DOTALL)
 
 
@@ -26,7 +26,7 @@ def solved(
 
     **Raises** `eqx.EquinoxRuntimeError` with the member that failed, in place of the long error of
     a check. The member is found by bisection, with the same program: so it is found whatever
-    raised, and nothing is compiled.
+    raised the error, and nothing is compiled.
     """
     try:
         with _unlogged():
@@ -46,15 +46,15 @@ def solved(
 
 
 def _failing(program: Program, start: int, stop: int) -> str:
-    first, last = start, stop
+    low, high = start, stop
     # Processes solve a chunk together, and may not all know that it failed.
     if jax.process_count() == 1:
-        while last - first > 1:
-            middle = (first + last) // 2
-            first, last = (first, middle) if _fails(program, first, middle) else (middle, last)
-        # What fails by chance, or with others alone, is not blamed on the last one looked at.
-        if _fails(program, first, last):
-            return f"member {first}"
+        while high - low > 1:
+            middle = (low + high) // 2
+            low, high = (low, middle) if _fails(program, low, middle) else (middle, high)
+        # A chunk may also fail by chance, or only with all of its members.
+        if _fails(program, low, high):
+            return f"member {low}"
     return f"one of the members {start} to {stop - 1}"
 
 
@@ -69,15 +69,15 @@ def _fails(program: Program, start: int, stop: int) -> bool:
 
 @contextlib.contextmanager
 def _unlogged() -> Iterator[None]:
-    """Without the traceback that jax logs of a check's error before it raises it."""
+    """Drops the traceback that jax logs of a check's error before it raises the error."""
     logger = logging.getLogger("jax._src.callback")
-    logger.addFilter(_is_other)
+    logger.addFilter(_is_unrelated)
     try:
         yield
     finally:
-        logger.removeFilter(_is_other)
+        logger.removeFilter(_is_unrelated)
 
 
-def _is_other(record: logging.LogRecord) -> bool:
+def _is_unrelated(record: logging.LogRecord) -> bool:
     kind = record.exc_info[0] if record.exc_info else None
     return kind is None or kind.__name__ != "_EquinoxRuntimeError"

@@ -1,4 +1,4 @@
-"""What tells one computation from another, in every process alike."""
+"""Digests that identify a computation, the same in every process."""
 
 import functools
 import hashlib
@@ -18,15 +18,15 @@ _SYMBOL = re.compile(r'@("[^"]*"|[\w.$-]+)')
 _FUNCTION = re.compile(rf"^  func\.func \w+ {_SYMBOL.pattern}", re.MULTILINE)
 # A function of the host whose result enters the program: on a CPU, on a GPU, on a TPU.
 _HOST_FUNCTION = re.compile(r"= stablehlo\.(custom_call @\w*python\w*callback|recv\b)")
-# All that the text has of one: a number, in the order in which they were met.
+# The text identifies one only by a number, in the order in which they were lowered.
 _HOST_NUMBER = re.compile(r"(@\w*python\w*callback.*?)\{index = \d+ : ui64\}")
-# Within it equinox calls the host to raise an error, and takes no other value from there.
+# In this one equinox calls the host to raise an error, and takes no value from it.
 _EQUINOX_CHECK = re.compile(r"branched_error_if_impl(_\d+)?")
 
 
 def environment(devices: Iterable[Any]) -> dict[str, Any]:
-    """Versions and kinds of device, as to which one text of a program may mean other arithmetic."""
-    from .. import __version__  # Here, as it is there last.
+    """Versions and kinds of device, on which the arithmetic of a program's text may depend."""
+    from .. import __version__  # not at the top: the package defines it last
 
     return {
         "cfjax": __version__,
@@ -39,23 +39,21 @@ def environment(devices: Iterable[Any]) -> dict[str, Any]:
 def fingerprint(traced: Traced, lowered: Lowered, environment: dict[str, Any]) -> bytes:
     """A digest of all that decides the values of a program, given its inputs.
 
-    It is that of the text which is compiled. A jaxpr will not do: constants hide in nested ones, in
-    parameters of equations and in the static objects of others' primitives, from where lowering
-    alone takes them out. The text has each in full and to the last bit, and what settings there are
-    of precision, random numbers and sharding. Which calls share a function, and so the functions'
-    names and order, depends on what jax remembers from other programs: so a call counts as the
-    text that it calls.
+    It is the digest of the text that is compiled, and of the environment. A jaxpr would not do:
+    constants may be in nested ones, in parameters of equations and in static objects of primitives.
+    The text has each to the last bit, and the settings of precision, random numbers and sharding.
+    Which calls share a function, and so the functions' names and order, depends on what jax has
+    cached from other programs: so a call counts as the text that it calls. Flags of the compiler
+    are no part of the digest.
 
-    To it comes the environment. Flags of the compiler are no part of it.
-
-    **Raises** `ValueError` if the program takes values from a function of the host, of which it
-    knows nothing. A print gives no value, and of equinox's checks nothing is kept but success.
+    **Raises** `ValueError` if the program takes values from a function of the host, which the text
+    does not contain. A print returns no value, and a check of equinox none but success.
     """
-    rest, *functions = _FUNCTION.split(_HOST_NUMBER.sub(r"\1", lowered.as_text()))
+    outside, *functions = _FUNCTION.split(_HOST_NUMBER.sub(r"\1", lowered.as_text()))
     bodies: dict[str, str] = {}
     for name, function in zip(functions[::2], functions[1::2], strict=True):
         bodies[name], _, after = function.partition("\n  }\n")
-        rest += after
+        outside += after
         if _HOST_FUNCTION.search(function) and not _EQUINOX_CHECK.fullmatch(name):
             raise ValueError(
                 "folder needs a solve whose values jax alone computes, got one that calls a "
@@ -68,17 +66,17 @@ def fingerprint(traced: Traced, lowered: Lowered, environment: dict[str, Any]) -
         inner = lambda symbol: content(symbol[1]) if symbol[1] in bodies else symbol[0]  # noqa: E731
         return hashlib.sha256(_SYMBOL.sub(inner, bodies[name]).encode()).hexdigest()
 
-    text = "\n".join([repr(environment), rest, content("main")])
+    text = "\n".join([repr(environment), outside, content("main")])
     return digest(text.encode(), *_arrays(traced.jaxpr))
 
 
-def digest(*parts: bytes | Shaped[Array | np.ndarray, "..."]) -> bytes:
-    result = hashlib.sha256()
-    for part in parts:
-        array = np.frombuffer(part, np.uint8) if isinstance(part, bytes) else np.asarray(part)
-        result.update(f"{array.shape} {array.dtype};".encode())
-        result.update(np.ascontiguousarray(array).tobytes())
-    return result.digest()
+def digest(*items: bytes | Shaped[Array | np.ndarray, "..."]) -> bytes:
+    state = hashlib.sha256()
+    for item in items:
+        array = np.frombuffer(item, np.uint8) if isinstance(item, bytes) else np.asarray(item)
+        state.update(f"{array.shape} {array.dtype};".encode())
+        state.update(np.ascontiguousarray(array).tobytes())
+    return state.digest()
 
 
 def _arrays(jaxpr: Jaxpr | ClosedJaxpr) -> Iterator[np.ndarray]:

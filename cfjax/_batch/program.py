@@ -24,10 +24,10 @@ OUTSIDE = (
 
 
 class Structure(NamedTuple):
-    """That of a pytree of arrays, whose leaves are kept apart, and PRNG keys as their numbers."""
+    """The structure of a pytree of arrays, with PRNG keys stored as arrays of numbers."""
 
     treedef: Any
-    kinds: list[Any]  # For each leaf, what kind of PRNG key it is, or None.
+    kinds: list[Any]  # for each leaf the implementation of the PRNG key, or None
 
     @classmethod
     def of(cls, tree: PyTree) -> tuple["Structure", list[Any]]:
@@ -60,26 +60,28 @@ class Program:
         self.chunk_size = chunk_size
         # An array on a device is small enough for the host; a memory map stays where it is.
         self.members = [np.asarray(a) if isinstance(a, jax.Array) else a for a in leaves]
-        # In the order of bytes of this machine, whatever that of a file is.
+        # In the byte order of this machine, whatever that of a file is.
         native = [a.dtype.newbyteorder("=") for a in leaves]
         self.dtypes = [jax.dtypes.canonicalize_dtype(dtype) for dtype in native]
         self.mesh, self.sharding = mesh, None
         if mesh is not None:
             self.sharding = NamedSharding(mesh, PartitionSpec(mesh.axis_names))
-        found: dict[str, Any] = {}
+        captured: dict[str, Any] = {}
 
-        def one(member: list[Array]) -> list[Array]:
+        def solve_member(member: list[Array]) -> list[Array]:
             value = solve(structure.tree(member))
-            arrays, found["static"] = eqx.partition(value, eqx.is_array_like)
-            found["structure"], leaves = Structure.of(arrays)
+            arrays, captured["static"] = eqx.partition(value, eqx.is_array_like)
+            captured["structure"], leaves = Structure.of(arrays)
             return [jnp.asarray(a) for a in leaves]
 
         shapes = [
             jax.ShapeDtypeStruct((chunk_size, *a.shape[1:]), dtype)
             for a, dtype in zip(leaves, self.dtypes, strict=True)
         ]
-        run = jax.jit(jax.vmap(one), in_shardings=self.sharding, out_shardings=self.sharding)
-        self.traced = run.trace(shapes)
+        solve_chunk = jax.jit(
+            jax.vmap(solve_member), in_shardings=self.sharding, out_shardings=self.sharding
+        )
+        self.traced = solve_chunk.trace(shapes)
         if captures_traced(self.traced, shapes):
             raise TypeError(
                 "solve must not capture values that are traced, and it captures one of the "
@@ -87,11 +89,11 @@ class Program:
             )
         self.lowered = self.traced.lower()
         self.outputs = jtu.tree_leaves(self.traced.out_info)
-        self.static, self.structure = found["static"], found["structure"]
+        self.static, self.structure = captured["static"], captured["structure"]
 
     @functools.cached_property
     def run(self) -> jax.stages.Compiled:
-        # Where all chunks are read, nothing is compiled.
+        # Lazily: nothing is compiled if all chunks are read from files.
         return self.lowered.compile()
 
     @property

@@ -29,7 +29,7 @@ class Problem(NamedTuple):
 
 
 class Calls(NamedTuple):
-    """How often a step calls them. Flows and brackets of all parts of a state count as one."""
+    """How often a step calls each. Flows, or brackets, of all parts of a state count as one."""
 
     evaluations: float
     flows: float
@@ -37,7 +37,7 @@ class Calls(NamedTuple):
 
 
 class Cost(NamedTuple):
-    """Evaluations, flows and flops: of the first step with what comes before it, of any other."""
+    """Evaluations, flows and flops of the first step with initialisation, and of a later one."""
 
     first: Float[np.ndarray, "3"]
     later: Float[np.ndarray, "3"]
@@ -47,11 +47,14 @@ class Cost(NamedTuple):
 
 
 def cost_of_steps(problem: Problem, is_adaptive: bool) -> Cost:
-    if _is_implicit(problem.solver):
-        # How often its steps repeat depends on a tolerance that the controller may give it.
+    solver = problem.solver
+    while isinstance(solver, diffrax.AbstractWrappedSolver):
+        solver = solver.solver
+    if isinstance(solver, diffrax.AbstractImplicitSolver):
+        # The iterations of its steps depend on a tolerance that the controller may set.
         unknown = np.full(3, np.nan)
         return Cost(unknown, unknown)
-    # First, because it refuses a solver before anything is compiled.
+    # First: it raises its errors before anything is compiled.
     flops = flops_of_steps(problem, is_adaptive)
     calls = calls_of_steps(problem)
     first, later = (
@@ -61,12 +64,6 @@ def cost_of_steps(problem: Problem, is_adaptive: bool) -> Cost:
     return Cost(first, later)
 
 
-def _is_implicit(solver: diffrax.AbstractSolver) -> bool:
-    while isinstance(solver, diffrax.AbstractWrappedSolver):
-        solver = solver.solver
-    return isinstance(solver, diffrax.AbstractImplicitSolver)
-
-
 def _unrolled(solver: diffrax.AbstractSolver) -> diffrax.AbstractSolver:
     if isinstance(solver, diffrax.AbstractWrappedSolver):
         return eqx.tree_at(lambda s: s.solver, solver, _unrolled(solver.solver))
@@ -74,8 +71,8 @@ def _unrolled(solver: diffrax.AbstractSolver) -> diffrax.AbstractSolver:
 
 
 def flops_of_steps(problem: Problem, is_adaptive: bool = False) -> tuple[float, float]:
-    """Of the first step with what comes before it, and of any other."""
-    # A loop whose passes differ cannot be counted.
+    """Flops of the first step, initialisation included, and of a later one."""
+    # A loop whose iterations differ cannot be counted.
     problem = problem._replace(solver=_unrolled(problem.solver))
     arrays, static = eqx.partition(problem, eqx.is_array)
 
@@ -85,9 +82,6 @@ def flops_of_steps(problem: Problem, is_adaptive: bool = False) -> tuple[float, 
 
     state = eqx.filter_eval_shape(init, arrays)
     state, static_state = eqx.partition(state, lambda x: isinstance(x, jax.ShapeDtypeStruct))
-
-    def start(arrays):
-        return eqx.filter(init(arrays), eqx.is_array)
 
     def step(arrays, t1, state):
         term, solver, t0, _, _, y0, args = eqx.combine(arrays, static)
@@ -103,23 +97,24 @@ def flops_of_steps(problem: Problem, is_adaptive: bool = False) -> tuple[float, 
 
     try:
         later = float(count_flops(step, arrays, problem.t0 + problem.dt0, state))
-        return count_flops(start, arrays) + later, later
+        initialisation = count_flops(lambda x: eqx.filter(init(x), eqx.is_array), arrays)
+        return initialisation + later, later
     except NotImplementedError:
         return np.nan, np.nan
 
 
 def calls_of_steps(problem: Problem) -> tuple[Calls, Calls]:
-    """Of the first step with what comes before it, and of any other."""
+    """Calls of the first step, initialisation included, and of a later one."""
     try:
-        return _counted_steps(problem, sees_flows=True)
+        return _counted_steps(problem, counts_flows=True)
     except (AttributeError, TypeError, ValueError):
         # The solver asks more of a field than a flow and a bracket.
-        calls = _counted_steps(problem, sees_flows=False)
+        calls = _counted_steps(problem, counts_flows=False)
         first, later = (call._replace(flows=np.nan, brackets=np.nan) for call in calls)
         return first, later
 
 
-def _counted_steps(problem: Problem, sees_flows: bool) -> tuple[Calls, Calls]:
+def _counted_steps(problem: Problem, counts_flows: bool) -> tuple[Calls, Calls]:
     """Counted while the steps run: what a loop repeats cannot be seen in its trace."""
     term, solver, t0, _, dt0, y0, args = problem
     tally = _Tally()
@@ -128,7 +123,7 @@ def _counted_steps(problem: Problem, sees_flows: bool) -> tuple[Calls, Calls]:
         # A sum of terms must be seen as one: solvers add its frozen fields themselves.
         return isinstance(x, diffrax.AbstractTerm) and not isinstance(x, diffrax.MultiTerm)
 
-    term = jtu.tree_map(lambda t: _CountingTerm(t, tally, sees_flows), term, is_leaf=is_term)
+    term = jtu.tree_map(lambda t: _CountingTerm(t, tally, counts_flows), term, is_leaf=is_term)
     step = eqx.filter_jit(functools.partial(solver.step, made_jump=False))
     t1, t2 = t0 + dt0, t0 + 2 * dt0
     state = eqx.filter_jit(solver.init)(term, t0, t1, y0, args)
@@ -139,18 +134,18 @@ def _counted_steps(problem: Problem, sees_flows: bool) -> tuple[Calls, Calls]:
 
 
 class _Tally:
-    """Counts what happens while a program runs."""
+    """Counts calls while a program runs."""
 
     def __init__(self):
         self.counts = Counter()
 
-    def add(self, what: str) -> None:
-        jax.debug.callback(lambda: self.counts.update([what]))
+    def add(self, event: str) -> None:
+        jax.debug.callback(lambda: self.counts.update([event]))
 
     def read(self) -> Calls:
-        """What happened since the last time."""
+        """The calls since the previous reading."""
         jax.effects_barrier()
-        calls = Calls(*(float(self.counts[what]) for what in Calls._fields))
+        calls = Calls(*(float(self.counts[event]) for event in Calls._fields))
         self.counts.clear()
         return calls
 
@@ -158,13 +153,13 @@ class _Tally:
 class _CountingTerm(diffrax.AbstractTerm):
     term: diffrax.AbstractTerm
     tally: _Tally = eqx.field(static=True)
-    sees_flows: bool = eqx.field(static=True)
+    counts_flows: bool = eqx.field(static=True)
 
     def vf(self, t, y, args):
         self.tally.add("evaluations")
         value = self.term.vf(t, y, args)
         has_field = any(map(is_field, jtu.tree_leaves(value, is_leaf=is_field)))
-        return _CountedField(value, self.tally) if self.sees_flows and has_field else value
+        return _CountedField(value, self.tally) if self.counts_flows and has_field else value
 
     def contr(self, t0, t1, **kwargs):
         return self.term.contr(t0, t1, **kwargs)

@@ -40,8 +40,8 @@ def count_flops(fun: Callable[..., PyTree], *args: PyTree) -> int:
     - Changes of sign, comparisons, selections, roundings, conversions, moves of data and integer
       arithmetic count nothing.
 
-    What does not reach the result, and the same operation on the same operands, counts once at
-    most, as compilers drop both.
+    Operations that do not reach the result count nothing, and the same operation on the same
+    operands counts once, as compilers drop both.
 
     **Raises** `NotImplementedError` for floating-point operations without a rule, and for loops
     whose length is not known when the program is traced.
@@ -58,11 +58,11 @@ class _Operation(NamedTuple):
 
 
 class _Program(NamedTuple):
-    """Operations in the order of the program, and the values that are known before it runs."""
+    """Operations in the order of the program, and the values that do not depend on inputs."""
 
     operations: dict[Hashable, _Operation]
     values: dict[Hashable, Any]
-    # Values are only worth their time where a branch may depend on them.
+    # Without branches no values are computed, as only a branch may depend on them.
     has_branches: bool
 
 
@@ -121,7 +121,9 @@ def _flatten(
                 results = [object() for _ in eqn.outvars]
                 program.operations[key] = _Operation(_cost(eqn), operands, results)
                 if program.has_branches and all(x in program.values for x in operands):
-                    values = _evaluate(eqn, operands, program)
+                    inputs = [program.values[x] for x in operands]
+                    values = eqn.primitive.bind(*inputs, **eqn.params)
+                    values = values if eqn.primitive.multiple_results else [values]
                     program.values.update(zip(results, values, strict=True))
             results = program.operations[key].results
         names.update(zip(eqn.outvars, results, strict=True))
@@ -131,65 +133,61 @@ def _flatten(
 def _inlined(
     eqn: JaxprEqn, operands: Sequence[Hashable], program: _Program
 ) -> list[Hashable] | None:
-    """The results of an equation that stands for a program of its own, if it is known which."""
+    """The results of an equation that calls a program, unless the program depends on values."""
     kind, params = eqn.primitive.name, eqn.params
     if eqn.primitive is step_p:
         return _flatten(whole(eqn), operands, program)
     if kind in _CALLS:
         return _flatten(params[_CALLS[kind]], operands, program)
     if kind == "custom_linear_solve":
-        first = sum(params["const_lengths"][:2])
-        last = first + params["const_lengths"].solve
-        rest = operands[sum(params["const_lengths"]) :]
-        return _flatten(params["jaxprs"].solve, [*operands[first:last], *rest], program)
+        start = sum(params["const_lengths"][:2])
+        stop = start + params["const_lengths"].solve
+        right_sides = operands[sum(params["const_lengths"]) :]
+        return _flatten(params["jaxprs"].solve, [*operands[start:stop], *right_sides], program)
     if kind == "cond" and operands[0] in program.values:
-        taken = int(np.clip(program.values[operands[0]], 0, len(params["branches"]) - 1))
-        return _flatten(params["branches"][taken], operands[1:], program)
+        branch = int(np.clip(program.values[operands[0]], 0, len(params["branches"]) - 1))
+        return _flatten(params["branches"][branch], operands[1:], program)
     if kind == "scan" and _has_branches(params["jaxpr"]):
         return _unrolled(eqn, operands, program)
     return None
 
 
-def _count_of_one_rank(outside: Sequence[Any], inside: Sequence[Any]) -> int:
-    """How many of a scan's values have no axis that it scans over."""
+def _count_unscanned(outside: Sequence[Any], inside: Sequence[Any]) -> int:
+    """How many of a scan's values are constants or carried: these have no axis of the steps."""
     return sum(len(_shape(a)) == len(_shape(b)) for a, b in zip(outside, inside, strict=True))
 
 
 def _unrolled(
     eqn: JaxprEqn, operands: Sequence[Hashable], program: _Program
 ) -> list[Hashable] | None:
-    """A scan step by step, as its branches may differ from step to step."""
+    """The results of a scan, counted step by step, as its branches may differ between steps."""
     params = eqn.params
     if not all(x in program.values for x in operands):
         return None
-    # By the axis that is scanned over: the names of the parameters change with JAX's version.
+    # Not by parameters of the equation, whose names change with JAX's version.
     inner = params["jaxpr"].jaxpr
-    last = _count_of_one_rank(eqn.invars, inner.invars)
-    first = last - _count_of_one_rank(eqn.outvars, inner.outvars)
-    carry, outputs = operands[first:last], []
+    num_unscanned = _count_unscanned(eqn.invars, inner.invars)
+    num_consts = num_unscanned - _count_unscanned(eqn.outvars, inner.outvars)
+    consts, carry = operands[:num_consts], operands[num_consts:num_unscanned]
+    scanned, outputs = operands[num_unscanned:], []
     order = range(params["length"])
     for i in reversed(order) if params["reverse"] else order:
-        slices: list[Hashable] = [("slice", x, i) for x in operands[last:]]
+        slices: list[Hashable] = [("slice", x, i) for x in scanned]
         program.values.update(
-            (x, program.values[whole][i]) for x, whole in zip(slices, operands[last:], strict=True)
+            (x, program.values[array][i]) for x, array in zip(slices, scanned, strict=True)
         )
-        results = _flatten(params["jaxpr"], [*operands[:first], *carry, *slices], program)
+        results = _flatten(params["jaxpr"], [*consts, *carry, *slices], program)
         carry = results[: len(carry)]
         outputs.append(results[len(carry) :])
     if params["reverse"]:
         outputs.reverse()
     stacked: list[Hashable] = []
-    for parts in zip(*outputs, strict=True):
+    for entries in zip(*outputs, strict=True):
         stacked.append(object())
-        program.operations[stacked[-1]] = _Operation(0, parts, [stacked[-1]])
-        if all(x in program.values for x in parts):
-            program.values[stacked[-1]] = jnp.stack([program.values[x] for x in parts])
+        program.operations[stacked[-1]] = _Operation(0, entries, [stacked[-1]])
+        if all(x in program.values for x in entries):
+            program.values[stacked[-1]] = jnp.stack([program.values[x] for x in entries])
     return [*carry, *stacked]
-
-
-def _evaluate(eqn: JaxprEqn, operands: Sequence[Hashable], program: _Program) -> Sequence[Any]:
-    values = eqn.primitive.bind(*(program.values[x] for x in operands), **eqn.params)
-    return values if eqn.primitive.multiple_results else [values]
 
 
 def _open(jaxpr: Jaxpr | ClosedJaxpr) -> Jaxpr:
@@ -199,7 +197,8 @@ def _open(jaxpr: Jaxpr | ClosedJaxpr) -> Jaxpr:
 def _cost(eqn: JaxprEqn) -> int:
     name = eqn.primitive.name
     dtypes = [_dtype(v) for v in (*eqn.invars, *eqn.outvars)]
-    if name not in _CONTROL and not any(d is not None and _is_inexact(d) for d in dtypes):
+    is_inexact = any(d is not None and jnp.issubdtype(d, jnp.inexact) for d in dtypes)
+    if name not in _CONTROL and not is_inexact:
         return 0
     if name not in _COSTS:
         raise NotImplementedError(
@@ -211,10 +210,6 @@ def _cost(eqn: JaxprEqn) -> int:
             raise NotImplementedError(f"count_flops has no rule for {name} of complex numbers.")
         return _COMPLEX[name] * cost
     return cost
-
-
-def _is_inexact(dtype: Any) -> bool:
-    return jnp.issubdtype(dtype, jnp.inexact)
 
 
 def _is_complex(dtype: Any) -> bool:
@@ -234,15 +229,11 @@ def _size(v: Any) -> int:
 
 
 def _batch(v: Any) -> int:
-    """How many matrices."""
+    """The number of matrices."""
     return prod(_shape(v)[:-2])
 
 
-def _nothing(eqn: JaxprEqn) -> int:
-    return 0
-
-
-def _each_entry(eqn: JaxprEqn) -> int:
+def _elementwise(eqn: JaxprEqn) -> int:
     return _size(eqn.outvars[0])
 
 
@@ -373,8 +364,8 @@ _FREE = (
     "scatter select_n sign slice split squeeze stack stop_gradient transpose"
 )
 _COSTS: dict[str, Callable[[JaxprEqn], int]] = {
-    **dict.fromkeys(_ARITHMETIC.split(), _each_entry),
-    **dict.fromkeys(_FREE.split(), _nothing),
+    **dict.fromkeys(_ARITHMETIC.split(), _elementwise),
+    **dict.fromkeys(_FREE.split(), lambda eqn: 0),
     **_CONTROL,
     "abs": _modulus,
     "pure_callback": _check,

@@ -24,7 +24,7 @@ from rich.table import Table
 from .._batch.progress import on_terminal, progress_bar
 from .._integrate import integrate
 from .._signals import busy
-from .style import new_figure
+from .style import about_times, new_figure
 from .work_precision import WorkPrecision, compiled, take_turns
 
 
@@ -39,7 +39,7 @@ class Report(NamedTuple):
 def run(output: Path, experiments: Sequence[Callable[[Progress], Report]], patience: str) -> None:
     """Prints tables and writes figures as PNG and PDF, and data as CSV, to the folder `output`.
 
-    Says before the work how long it takes: `patience`.
+    Prints `patience`, which says how long the work takes, before it begins.
 
     **Raises** `OSError` if the folder cannot be made or written to.
     """
@@ -51,8 +51,8 @@ def run(output: Path, experiments: Sequence[Callable[[Progress], Report]], patie
     for experiment in experiments:
         with on_terminal(transient=True) as progress:
             report = experiment(progress)
-        for part in report.printed:
-            console.print(part)
+        for renderable in report.printed:
+            console.print(renderable)
         for name in _write(report, output):
             console.print(f"Wrote {output / name}", soft_wrap=True)
 
@@ -84,10 +84,7 @@ def chart(
     The first line of the docstring of `measure` is in the chart's caption.
     """
     work = measure(budget=budget, progress=progress)
-    caption = (
-        f"{_first_line(measure, name)} Time: the fastest of {work.seconds.shape[1]} runs in turns "
-        f"on one {jax.default_backend().upper()}; bars reach to the upper quartile."
-    )
+    caption = f"{_first_line(measure, name)} Time: {about_times(work.seconds)}"
     if np.any(np.isfinite(work.flops)):
         caption += " Flops: operations of one step as traced, times the steps."
     figure = new_figure((7.0, 4.8), caption)
@@ -109,25 +106,16 @@ def scene(
     """One solve of a scene by its solver: its invariants, what it takes, and its picture.
 
     The scene has a `solver`, and functions `problem`, `invariants` and `picture`. Invariants are
-    looked at in `num_saves` states, and times measured for `budget` seconds. The picture may be of
+    evaluated in `num_saves` states, and times measured for `budget` seconds. The picture may be of
     another run: the first line of its docstring is printed.
     """
     problem = {"args": None} | module.problem()
     names = "t0", "t1", "y0", "args"
     arrays = tuple(jtu.tree_map(jnp.asarray, problem[name]) for name in names)
 
-    def solve(t0: Any, t1: Any, y0: Any, args: Any) -> diffrax.Solution:
-        save_every = num_steps // num_saves
-        return integrate(
-            problem["term"],
-            module.solver,
-            t0,
-            t1,
-            y0,
-            args,
-            num_steps=num_steps,
-            save_every=save_every,
-        )
+    def solve(*arrays: Any) -> diffrax.Solution:
+        term, save_every = problem["term"], num_steps // num_saves
+        return integrate(term, module.solver, *arrays, num_steps=num_steps, save_every=save_every)
 
     y0, args = arrays[2:]
     with progress_bar(progress, "Compiling", 2) as update:
@@ -150,11 +138,11 @@ def scene(
     for heading in ("start", "end"):
         table.add_column(heading, justify="right")
     table.add_column("largest\nchange", justify="right", no_wrap=True)
-    start = module.invariants(y0, args)
-    found = jax.vmap(lambda y: module.invariants(y, args))(ys)
-    for label, value in start.items():
-        change = np.max(np.abs(np.asarray(found[label]) - np.asarray(value)))
-        table.add_row(label, _span(value), _span(found[label][-1]), f"{change:.1e}")
+    initial = module.invariants(y0, args)
+    saved = jax.vmap(lambda y: module.invariants(y, args))(ys)
+    for label, value in initial.items():
+        change = np.max(np.abs(np.asarray(saved[label]) - np.asarray(value)))
+        table.add_row(label, _span(value), _span(saved[label][-1]), f"{change:.1e}")
     fastest = float(np.min(seconds))
     show = EngFormatter("s", places=1)
     times = (

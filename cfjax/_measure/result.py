@@ -16,7 +16,7 @@ if TYPE_CHECKING:
 
 
 class WorkPrecision(NamedTuple):
-    """What each method costs and how far it is off: one row for each method and setting.
+    """The cost and the error of each method: one row for each method and setting.
 
     NaN stands for unknown values. Rows of runs that failed have NaN as `error` and `seconds`.
 
@@ -82,25 +82,22 @@ class WorkPrecision(NamedTuple):
         if figure is not None and not isinstance(figure, FigureBase):
             raise TypeError(f"figure must be a matplotlib figure, got {figure!r}.")
         figure = _style.new_figure((7.0, 4.2)) if figure is None else figure
-        left, right = figure.subplots(1, 2, sharey=True)
+        time_axes, work_axes = figure.subplots(1, 2, sharey=True)
         counts_flops = bool(np.any(np.isfinite(self.flops)))
         work = self.flops if counts_flops else self.num_evaluations
         names = dict.fromkeys(self.method)
         unknown = []
         for name, style in _style.styles(names).items():
             rows = np.array(self.method) == name
-            best, upper = np.percentile(self.seconds[rows], (0, 75), axis=-1)
-            # Lists: matplotlib before 3.11 takes an array of one entry for a number.
-            spread = np.zeros_like(best).tolist(), (upper - best).tolist()
-            left.errorbar(best, self.error[rows], xerr=spread, capsize=3, label=name, **style)
-            right.plot(work[rows], self.error[rows], **style)
+            _style.times(time_axes, self.seconds[rows], self.error[rows], label=name, **style)
+            work_axes.plot(work[rows], self.error[rows], **style)
             if not np.any(np.isfinite(work[rows])):
                 unknown.append(name)
-        left.set(yscale="log", ylabel="error of the final state")
-        _style.logarithmic(left, "time", unit="s")
+        time_axes.set(yscale="log", ylabel="error of the final state")
+        _style.logarithmic(time_axes, "time", unit="s")
         label = "flops" if counts_flops else "evaluations of the field"
         label += f" (not known: {', '.join(unknown)})" * bool(unknown)
-        _style.logarithmic(right, textwrap.fill(label, 50))
+        _style.logarithmic(work_axes, textwrap.fill(label, 50))
         figure.align_xlabels()
         _style.finish(figure, 4)
         return figure
@@ -119,8 +116,8 @@ class WorkPrecision(NamedTuple):
 
         is_adaptive = bool(np.any(np.isfinite(self.tolerance)))
         best, upper = np.percentile(self.seconds, (0, 75), axis=-1)
-        spread = [f" +{more:.0%}" for more in upper / best - 1]
-        times = [f"{1e3 * x:.3g}{more}" for x, more in zip(best, spread, strict=True)]
+        spread = [f" +{excess:.0%}" for excess in upper / best - 1]
+        times = [f"{1e3 * x:.3g}{excess}" for x, excess in zip(best, spread, strict=True)]
         columns = {
             "tol": [f"{x:.0e}" for x in self.tolerance],
             "error": [f"{x:.1e}" for x in self.error],
@@ -132,26 +129,26 @@ class WorkPrecision(NamedTuple):
             "compile\n(s)": [f"{x:.2f}" for x in self.compile_seconds],
             "time\n(ms)": times,
         }
-        blank = {
-            heading: ["" if cell.startswith("nan") else cell for cell in cells]
-            for heading, cells in columns.items()
-        }
-        shown = {heading: cells for heading, cells in blank.items() if any(cells)}
+        for heading, cells in columns.items():
+            columns[heading] = ["" if cell.startswith("nan") else cell for cell in cells]
+        columns = {heading: cells for heading, cells in columns.items() if any(cells)}
 
         settings = self.tolerance if is_adaptive else self.num_steps
-        failed: dict[tuple[str, str], list[str]] = {}
+        failures: dict[tuple[str, str], list[str]] = {}
         for name, setting, note in zip(self.method, settings, self.note, strict=True):
             if note:
-                failed.setdefault((name, note), []).append(f"{setting:g}")
-        notes = [f"{name}, {', '.join(some)}: {note}" for (name, note), some in failed.items()]
+                failures.setdefault((name, note), []).append(f"{setting:g}")
+        notes = [
+            f"{name}, {', '.join(failed)}: {note}" for (name, note), failed in failures.items()
+        ]
         caption = "\n".join(notes) or None
         table = Table(box=box.SIMPLE_HEAD, padding=0, caption=caption, caption_justify="left")
         table.add_column("method", no_wrap=True)
-        for heading in shown:
+        for heading in columns:
             table.add_column(heading, justify="right", no_wrap=True)
         for i, name in enumerate(self.method):
-            last = i + 1 == len(self.method) or self.method[i + 1] != name
-            table.add_row(name, *(cells[i] for cells in shown.values()), end_section=last)
+            is_last = i + 1 == len(self.method) or self.method[i + 1] != name
+            table.add_row(name, *(cells[i] for cells in columns.values()), end_section=is_last)
         return table
 
     def to_csv(self, path: str | os.PathLike[str]) -> None:

@@ -49,9 +49,9 @@ def absolute_tolerance(tolerance: Float[Array, ""]) -> diffrax.AbstractStepSizeC
 
 def distance(y: PyTree, reference: PyTree) -> float:
     """The 2-norm of the difference, all parts of the state together."""
-    parts = jtu.tree_map(lambda a, b: np.ravel(np.asarray(a) - np.asarray(b)), y, reference)
+    differences = jtu.tree_map(lambda a, b: np.ravel(np.asarray(a) - np.asarray(b)), y, reference)
     with np.errstate(over="ignore"):
-        return float(np.linalg.norm(np.concatenate(jtu.tree_leaves(parts))))
+        return float(np.linalg.norm(np.concatenate(jtu.tree_leaves(differences))))
 
 
 def work_precision(
@@ -118,7 +118,9 @@ def work_precision(
         if not callable(function):
             raise TypeError(f"{name} must be a function, got {function!r}.")
     y0 = as_state(y0)
-    _check_reference(reference, y0)
+    shape, expected_shape = (jtu.tree_map(jnp.shape, y) for y in (reference, y0))
+    if shape != expected_shape:
+        raise ValueError(f"reference must be shaped like y0, {expected_shape}, got {shape}.")
     dtype = time_dtype(y0)
     t0, t1 = time_scalar("t0", t0, dtype), time_scalar("t1", t1, dtype)
     if dt0 is None:
@@ -140,7 +142,7 @@ def work_precision(
     with progress_bar(progress, "Compiling", len(solvers)) as update:
         for name, (own_term, solver) in solvers.items():
             update(description=f"Compiling {name}")
-            with _about(name):
+            with _naming_method(name):
                 solver = solver if is_adaptive else as_own(solver).without_estimate()
                 problem = Problem(own_term, solver, t0, t1, dt0, y0, args)
                 cost = cost_of_steps(problem, is_adaptive)
@@ -150,21 +152,23 @@ def work_precision(
                 program = functools.partial(executable, eqx.filter((problem, value), eqx.is_array))
                 # The first run also warms up.
                 y, attempted, rejected, note = _first_run(program)
-                with _about(name):
-                    found = np.nan if note else _checked_error(error(y, reference))
-                if not note and not np.isfinite(found):
-                    found, note = np.nan, "The error is not finite."
-                if not is_adaptive:
-                    # Known also where the run broke off.
-                    attempted, rejected = float(setting), 0.0
+                with _naming_method(name):
+                    final_error = np.nan if note else _checked_error(error(y, reference))
+                if not note and not np.isfinite(final_error):
+                    final_error, note = np.nan, "The error is not finite."
                 tolerance = setting if is_adaptive else np.nan
-                rows.append((tolerance, found, attempted, rejected, *cost.of(attempted), seconds))
+                if not is_adaptive:
+                    # A run that failed returns no numbers.
+                    attempted, rejected = float(setting), 0.0
+                rows.append(
+                    (tolerance, final_error, attempted, rejected, *cost.of(attempted), seconds)
+                )
                 names.append(name)
                 notes.append(note)
                 programs.append(program)
             update(advance=1)
     runs = [i for i, note in enumerate(notes) if not note]
-    # Methods with one setting run one after the other: these are compared, and last about as long.
+    # Methods with one setting run one after the other: these are compared, and take about as long.
     runs.sort(key=lambda i: i % len(settings))
     measured = take_turns(
         [programs[i] for i in runs], repeats=repeats, budget=budget, progress=progress
@@ -182,7 +186,7 @@ def compiled(fun: Callable[..., PyTree], *args: PyTree) -> tuple[Callable[[PyTre
     """
     arrays, static = eqx.partition(args, eqx.is_array)
     start = time.perf_counter()
-    # A new function each time, or jax would remember the old program.
+    # A new function each time, or jax would use its cached program.
     traced = jax.jit(lambda arrays: fun(*eqx.combine(arrays, static))).trace(arrays)
     if captures_traced(traced, arrays):
         raise TypeError(_TRACED)
@@ -196,23 +200,23 @@ def take_turns(
     budget: int | float = np.inf,
     progress: "bool | rich.progress.Progress" = False,
 ) -> Float[np.ndarray, "programs rounds"]:
-    """Seconds of each program in each round; in a round each runs once, in the order given.
+    """Seconds of each program in each round; in a round each runs once, in this order.
 
-    So what else the machine does falls on all alike. There are `repeats` rounds, or as many as
-    begin within `budget` seconds, but at least one.
+    So other work on the machine affects all programs alike. There are `repeats` rounds, or as many
+    as begin within `budget` seconds, but at least one.
     """
     rounds: list[list[float]] = []
     begin = time.perf_counter()
-    done = 0.0
+    fraction = 0.0
     with progress_bar(progress, "Measuring time", 1.0) as update:
-        while done < 1:
+        while fraction < 1:
             rounds.append([])
             for program in programs:
                 start = time.perf_counter()
                 jax.block_until_ready(program())
                 rounds[-1].append(time.perf_counter() - start)
-            done = max(len(rounds) / repeats, (time.perf_counter() - begin) / budget)
-            update(completed=done)
+            fraction = max(len(rounds) / repeats, (time.perf_counter() - begin) / budget)
+            update(completed=fraction)
     return np.array(rounds).T
 
 
@@ -221,8 +225,8 @@ def _equal_steps(problem: Problem, num_steps: Int[Array, ""]) -> tuple:
     solution, fault = equal_steps(
         term, as_own(solver), t0, t1, y0, args, num_steps, None, False, None, False, throw=False
     )
-    y, *rest = _end(solution, num_steps, 0)
-    return needing(fault.error(jnp.zeros(())), y), *rest
+    y, *statistics = _outcome(solution, num_steps, 0)
+    return needing(fault.error(jnp.zeros(())), y), *statistics
 
 
 def _adaptive_steps(controller: Callable, max_steps: int) -> Callable[..., tuple]:
@@ -234,12 +238,12 @@ def _adaptive_steps(controller: Callable, max_steps: int) -> Callable[..., tuple
             throw=False,
         )
         stats = solution.stats
-        return _end(solution, stats["num_steps"], stats["num_rejected_steps"])
+        return _outcome(solution, stats["num_steps"], stats["num_rejected_steps"])
 
     return solve
 
 
-def _end(solution: diffrax.Solution, num_steps: Any, num_rejected: Any) -> tuple:
+def _outcome(solution: diffrax.Solution, num_steps: Any, num_rejected: Any) -> tuple:
     return jtu.tree_map(lambda y: y[-1], solution.ys), solution.result, num_steps, num_rejected
 
 
@@ -248,7 +252,7 @@ def _first_run(program: Callable[[], tuple]) -> tuple[PyTree, float, float, str]
     try:
         y, result, num_steps, num_rejected = jax.block_until_ready(program())
     except jax.errors.JaxRuntimeError as failure:
-        # Of a check within the program; its message is among many lines of Python's.
+        # A check within the program failed: its message is among many lines of Python's.
         _, _, message = str(failure).rpartition("RuntimeError: ")
         return None, np.nan, np.nan, message.partition("\n")[0]
     if result != diffrax.RESULTS.successful:
@@ -260,18 +264,18 @@ def _first_run(program: Callable[[], tuple]) -> tuple[PyTree, float, float, str]
     return y, float(num_steps), float(num_rejected), note
 
 
-# What the caller gives.
+# Checks of arguments.
 
 
 def _checked_settings(num_steps: Any, tolerances: Any) -> list[Any]:
     if (num_steps is None) == (tolerances is None):
         raise ValueError("Give either num_steps or tolerances, not both.")
-    name, given = ("num_steps", num_steps) if tolerances is None else ("tolerances", tolerances)
-    if isinstance(given, np.ndarray | jax.Array) and given.ndim == 1:
-        given = given.tolist()
-    if not isinstance(given, Sequence) or isinstance(given, str):
-        raise TypeError(f"{name} must be a sequence of numbers, got {given!r}.")
-    settings = list(given)
+    name, value = ("num_steps", num_steps) if tolerances is None else ("tolerances", tolerances)
+    if isinstance(value, np.ndarray | jax.Array) and value.ndim == 1:
+        value = value.tolist()
+    if not isinstance(value, Sequence) or isinstance(value, str):
+        raise TypeError(f"{name} must be a sequence of numbers, got {value!r}.")
+    settings = list(value)
     if not settings:
         raise ValueError(f"{name} must have at least one entry, got none.")
     if tolerances is None:
@@ -290,43 +294,37 @@ def _checked_methods(
         raise TypeError(f"methods must be a dict of solvers by name, got {methods!r}.")
     if not methods:
         raise ValueError("methods must have at least one solver, got none.")
-    found = {}
+    pairs = {}
     for name, method in methods.items():
         is_pair = isinstance(method, tuple) and len(method) == 2
-        found[name] = method if is_pair else (term, method)
-        with _about(name):
-            check_term_and_solver(*found[name])
+        pairs[name] = method if is_pair else (term, method)
+        with _naming_method(name):
+            check_term_and_solver(*pairs[name])
             if not is_adaptive:
-                check_own_tolerances(found[name][1])
-    return found
+                check_own_tolerances(pairs[name][1])
+    return pairs
 
 
 def _check_controller(controller: Callable, tolerance: Float[Array, ""]) -> None:
-    found = eqx.filter_eval_shape(controller, tolerance)
-    if not isinstance(found, diffrax.AbstractStepSizeController):
-        raise TypeError(f"controller must return a diffrax step size controller, got {found!r}.")
+    result = eqx.filter_eval_shape(controller, tolerance)
+    if not isinstance(result, diffrax.AbstractStepSizeController):
+        raise TypeError(f"controller must return a diffrax step size controller, got {result!r}.")
 
 
-def _checked_error(found: Any) -> float:
-    is_real = isinstance(found, jax.Array | np.ndarray | np.generic | int | float)
-    if not is_real or np.ndim(found) or np.iscomplexobj(found):
-        raise TypeError(f"error must return a real number, got {eqx.tree_pformat(found)}.")
-    value = float(found)
+def _checked_error(result: Any) -> float:
+    is_real = isinstance(result, jax.Array | np.ndarray | np.generic | int | float)
+    if not is_real or np.ndim(result) or np.iscomplexobj(result):
+        raise TypeError(f"error must return a real number, got {eqx.tree_pformat(result)}.")
+    value = float(result)
     if value < 0:
         raise ValueError(f"error must return a number of at least 0, got {value}.")
     return value
 
 
-def _check_reference(reference: PyTree, y0: PyTree) -> None:
-    found, expected = (jtu.tree_map(jnp.shape, y) for y in (reference, y0))
-    if found != expected:
-        raise ValueError(f"reference must be shaped like y0, {expected}, got {found}.")
-
-
 @contextlib.contextmanager
-def _about(name: str) -> Iterator[None]:
+def _naming_method(name: str) -> Iterator[None]:
     try:
         yield
-    except Exception as mistake:
-        mistake.add_note(f"This is about methods[{name!r}].")
+    except Exception as exception:
+        exception.add_note(f"This is about methods[{name!r}].")
         raise

@@ -19,15 +19,15 @@ from .coefficients import ContinuousExtension
 from .order_conditions import exact_tree_weight, exact_weight, order, trees, word_weights, words
 from .tableau import Tableau
 
-# The conditions of one order: what they multiply the coefficients of one power of theta with, and
-# what the results must be, one column for each power.
+# The conditions of one order: the matrix that multiplies the coefficients of a power of theta, and
+# the right-hand sides, one column for each power.
 Conditions: TypeAlias = tuple[np.ndarray, np.ndarray]
 
 # Of words, the conditions of order 5 are no longer all linear.
 _MAX_ORDER = 4
 # The highest power of theta.
 _MAX_POWER = 8
-# What is zero but for rounding: for the methods here singular values are above 7e-6 or below 1e-14.
+# Smaller numbers are zero: for the methods here singular values are above 7e-6 or below 1e-14.
 _ROUNDING = 1e-9
 STORED = Path(__file__).with_name("extensions.json")
 
@@ -39,24 +39,24 @@ def continuous_extension(tableau: Tableau) -> ContinuousExtension:
 
 
 def derived_extension(tableau: Tableau) -> ContinuousExtension:
-    """What the order conditions give.
+    """The extension that satisfies the order conditions.
 
     It uses the field at the end of the step only where the stages do not suffice.
 
-    With `B_j` the sum of row j of beta, flow j is given a sum of `theta B_j`. Then the conditions
-    are linear in the rest: in the weight of a word that has one letter besides single nodes, the
-    stages' fields occur in that letter only, and up to order 4 one word has two such letters, whose
-    weight is half the square of a letter's. Nor do the powers of theta mix.
+    With `B_j` the sum of row j of beta, the row of flow j sums to `theta B_j`. Then the conditions
+    are linear in the remaining coefficients: in the weight of a word that has one letter besides
+    single nodes, the stages' fields occur in that letter only, and up to order 4 one word has two
+    such letters, whose weight is half the square of a letter's. The powers of theta do not mix.
     """
-    found, reached = _solve(tableau.beta, _flow_conditions(tableau), _MAX_ORDER)
-    if reached < _MAX_ORDER and reached < order(tableau) - 1:
-        with_end = Tableau((*tableau.alpha, tableau.beta), tableau.beta)
-        found, _ = _solve(with_end.beta, _flow_conditions(with_end), _MAX_ORDER)
-    return found
+    extension, attained = _solve(tableau.beta, _flow_conditions(tableau), _MAX_ORDER)
+    if attained < _MAX_ORDER and attained < order(tableau) - 1:
+        fsal = Tableau((*tableau.alpha, tableau.beta), tableau.beta)
+        extension, _ = _solve(fsal.beta, _flow_conditions(fsal), _MAX_ORDER)
+    return extension
 
 
 class RungeKuttaExtension(NamedTuple):
-    """Weights of the stages, and the rows and times of those that the method itself has not."""
+    """Weights of the stages, and the rows and times of the stages added to the method's own."""
 
     weights: ContinuousExtension
     rows: tuple[tuple[float, ...], ...]
@@ -71,53 +71,54 @@ def runge_kutta_extension(
 
     `a[i]` and `b[i]` belong to stage i.
     """
-    found = _stored(a, b, order)
-    return RungeKuttaExtension(*found) if found else derived_runge_kutta_extension(a, b, order)
+    stored = _stored(a, b, order)
+    return RungeKuttaExtension(*stored) if stored else derived_runge_kutta_extension(a, b, order)
 
 
 def derived_runge_kutta_extension(
     a: tuple[tuple[float, ...], ...], b: tuple[float, ...], order: int
 ) -> RungeKuttaExtension:
-    """What the order conditions give.
+    """The extension that satisfies the order conditions.
 
     The method's own stages suffice up to order 5 with as few as diffrax has. `diffrax.Dopri8` takes
-    4 more, which evaluate the field at the end of the step and at three points within. These points
-    are where the stages so far reach one order more than elsewhere. Where there are no such points
-    the order is what the stages reach.
+    4 more, which evaluate the field at the end of the step and at three points within. At these
+    points the stages so far reach one order more than elsewhere. Where there are no such points
+    the order is the one that the stages reach.
     """
-    more = []
-    found, reached = _solve((b,), _tree_conditions(a, len(b)), _MAX_POWER)
-    if reached < order - 1:
-        more.append((b, 1.0))
+    extra_stages = []
+    weights, attained = _solve((b,), _tree_conditions(a, len(b)), _MAX_POWER)
+    if attained < order - 1:
+        extra_stages.append((b, 1.0))
         points = [1.0]
         while points:
-            stages = (*a, *(row for row, _ in more))
+            stages = (*a, *(row for row, _ in extra_stages))
             padded = (*b, *[0.0] * (len(stages) - len(b)))
             conditions = list(islice(_tree_conditions(stages, len(stages)), order - 1))
-            found, reached = _solve((padded,), iter(conditions), _MAX_POWER)
-            if reached >= order - 1:
+            weights, attained = _solve((padded,), iter(conditions), _MAX_POWER)
+            if attained >= order - 1:
                 break
-            points, matrix, values = _points_of_order(conditions[: reached + 1])
+            points, matrix, values = _points_of_order(conditions[: attained + 1])
             for c in points:
-                right = values @ c ** np.arange(1, 1 + _MAX_POWER)
-                row = np.linalg.lstsq(matrix, right, rcond=_ROUNDING)[0]
-                more.append((tuple(row.tolist()), c))
-    return RungeKuttaExtension(found, tuple(row for row, _ in more), tuple(c for _, c in more))
+                right_side = values @ c ** np.arange(1, 1 + _MAX_POWER)
+                row = np.linalg.lstsq(matrix, right_side, rcond=_ROUNDING)[0]
+                extra_stages.append((tuple(row.tolist()), c))
+    rows, times = zip(*extra_stages, strict=True) if extra_stages else ((), ())
+    return RungeKuttaExtension(weights, rows, times)
 
 
 def identity(*method: Any) -> str:
-    """A short text that says which coefficients these are."""
+    """The key of these coefficients in the stored file."""
     return sha256(repr(method).encode()).hexdigest()[:16]
 
 
 def _stored(*method: Any) -> Any:
-    """What is stored for these coefficients; None for those of a user."""
+    """The stored extension, or None for coefficients of a user."""
     return _as_tuples(_by_identity().get(identity(*method)))
 
 
 @cache
 def _by_identity() -> dict[str, Any]:
-    return {each["of"]: each["extension"] for each in json.loads(STORED.read_text()).values()}
+    return {entry["of"]: entry["extension"] for entry in json.loads(STORED.read_text()).values()}
 
 
 def _as_tuples(tree: Any) -> Any:
@@ -127,14 +128,14 @@ def _as_tuples(tree: Any) -> Any:
 def _points_of_order(conditions: list[Conditions]) -> tuple[list[float], np.ndarray, np.ndarray]:
     """Where within a step all conditions can be met, though not everywhere; and the conditions.
 
-    What is left over is a polynomial in theta for each condition. Here all are multiples of one,
-    and that has roots besides the ends of the step.
+    The residual of each condition is a polynomial in theta. Where all are multiples of one
+    polynomial, the points are the roots of that one within the step.
     """
-    matrix, values = (np.concatenate(parts) for parts in zip(*conditions, strict=True))
-    left, sizes, _ = np.linalg.svd(matrix)
-    rest = left[:, int(np.sum(sizes > _ROUNDING)) :].T @ values
-    _, sizes, powers = np.linalg.svd(rest)
-    if sizes[1] > _ROUNDING * sizes[0]:
+    matrix, values = (np.concatenate(blocks) for blocks in zip(*conditions, strict=True))
+    u, singular_values, _ = np.linalg.svd(matrix)
+    residual = u[:, int(np.sum(singular_values > _ROUNDING)) :].T @ values
+    _, singular_values, powers = np.linalg.svd(residual)
+    if singular_values[1] > _ROUNDING * singular_values[0]:
         return [], matrix, values
     roots = np.roots([*powers[0, ::-1], 0.0])
     inside = roots.real[(np.abs(roots.imag) < _ROUNDING) & (np.abs(roots.real - 0.5) < 0.49)]
@@ -142,54 +143,54 @@ def _points_of_order(conditions: list[Conditions]) -> tuple[list[float], np.ndar
 
 
 def _solve(
-    end: tuple, conditions: Iterator[Conditions], max_order: int
+    weights: tuple, conditions: Iterator[Conditions], max_order: int
 ) -> tuple[ContinuousExtension, int]:
-    """Coefficients by flow, power and stage that sum to `end`, and the order that they reach.
+    """Coefficients by flow, power and stage that sum to `weights`, and the order that they reach.
 
-    Order by order; the first that cannot be reached is missed by as little as possible. Of all
-    such coefficients these are the smallest.
+    The conditions are solved order by order; those of the first order that cannot be reached hold
+    as nearly as possible. Of all such coefficients these are the smallest.
     """
-    shape = len(end), len(end[0])
-    total = np.array(end, float).ravel()
-    found = np.zeros((total.size, _MAX_POWER))
-    free = np.eye(total.size)
-    reached = 0
+    shape = len(weights), len(weights[0])
+    flat_weights = np.array(weights, float).ravel()
+    coefficients = np.zeros((flat_weights.size, _MAX_POWER))
+    null_space = np.eye(flat_weights.size)
+    attained = 0
     for matrix, values in conditions:
-        if np.abs(matrix @ total - values.sum(axis=1)).max() > _ROUNDING:
+        if np.abs(matrix @ flat_weights - values.sum(axis=1)).max() > _ROUNDING:
             # The order of the method itself ends here.
             break
-        left, sizes, right = np.linalg.svd(matrix @ free)
-        rank = int(np.sum(sizes > _ROUNDING))
-        error = left[:, :rank].T @ (values - matrix @ found)
-        found += free @ right[:rank].T @ (error / sizes[:rank, None])
-        if reached == max_order or np.abs(matrix @ found - values).max() > _ROUNDING:
+        u, singular_values, vt = np.linalg.svd(matrix @ null_space)
+        rank = int(np.sum(singular_values > _ROUNDING))
+        residual = u[:, :rank].T @ (values - matrix @ coefficients)
+        coefficients += null_space @ vt[:rank].T @ (residual / singular_values[:rank, None])
+        if attained == max_order or np.abs(matrix @ coefficients - values).max() > _ROUNDING:
             break
-        free = free @ right[rank:].T
-        reached += 1
-    num_powers = min(reached + 1, _MAX_POWER)
-    found = found[:, :num_powers]
-    # What no condition decides, in equal parts; the conditions hold at the end of the step.
-    found += ((total - found.sum(axis=1)) / num_powers)[:, None]
-    coefficients = found.reshape(*shape, num_powers).swapaxes(1, 2).tolist()
-    return tuple(tuple(map(tuple, powers)) for powers in coefficients), reached
+        null_space = null_space @ vt[rank:].T
+        attained += 1
+    num_powers = min(attained + 1, _MAX_POWER)
+    coefficients = coefficients[:, :num_powers]
+    # Equal parts of what no condition decides: the conditions hold at the end of the step.
+    coefficients += ((flat_weights - coefficients.sum(axis=1)) / num_powers)[:, None]
+    coefficients = coefficients.reshape(*shape, num_powers).swapaxes(1, 2)
+    return _as_tuples(coefficients.tolist()), attained
 
 
 def _flow_conditions(tableau: Tableau) -> Iterator[Conditions]:
     rows = [[(k, float(a)) for k, a in enumerate(p[-1]) if a] for p in tableau.prefixes]
     sums = np.array(tableau.beta, float).sum(axis=1)
-    before = np.concatenate([[0], np.cumsum(sums)])
+    partial_sums = np.concatenate([[0], np.cumsum(sums)])
     num_flows, num_stages = len(sums), tableau.num_stages
 
-    def parts(left: int, right: int) -> np.ndarray:
-        """By flow, the weight of a word for a letter there, so many single nodes to its sides."""
+    def letter_factors(num_left: int, num_right: int) -> np.ndarray:
+        """By flow, the weight of a letter in a word with so many single nodes on each side."""
         weights = [
-            before[:-1] ** (left - i)
-            / factorial(left - i)
+            partial_sums[:-1] ** (num_left - i)
+            / factorial(num_left - i)
             * (sums ** (i + j) / factorial(i + j + 1))
-            * (1 - before[1:]) ** (right - j)
-            / factorial(right - j)
-            for i in range(left + 1)
-            for j in range(right + 1)
+            * (1 - partial_sums[1:]) ** (num_right - j)
+            / factorial(num_right - j)
+            for i in range(num_left + 1)
+            for j in range(num_right + 1)
         ]
         return np.sum(weights, axis=0)
 
@@ -203,10 +204,10 @@ def _flow_conditions(tableau: Tableau) -> Iterator[Conditions]:
         matrix, values = [], []
         for size in range(2, n + 1):
             for tree, letter in letters[size - 1].items():
-                for left in range(n - size + 1):
-                    right = n - size - left
-                    word = ((),) * left + (tree,) + ((),) * right
-                    matrix.append(np.kron(parts(left, right), letter))
+                for num_left in range(n - size + 1):
+                    num_right = n - size - num_left
+                    word = ((),) * num_left + (tree,) + ((),) * num_right
+                    matrix.append(np.kron(letter_factors(num_left, num_right), letter))
                     values.append(_at_power(size, [float(exact_weight(word))]))
         yield np.array(matrix), np.concatenate(values)
 

@@ -10,10 +10,10 @@ from typing import Any
 
 # `sum_i weight_i phi_(k_i)(c_i z)`, with terms (k, c, weight).
 Combination = tuple[tuple[int, F, F], ...]
-# Of column j. The first column follows from the others.
+# The combination of each column j. The first column follows from the others.
 Columns = tuple[tuple[int, Combination], ...]
 
-_MOST = 5
+_MAX_PHI = 5
 
 
 @dataclass(frozen=True, init=False)
@@ -26,7 +26,7 @@ class ExponentialTableau:
         u_1 = e^z u + h sum_j b_j(z) g(t + c_j h, U_j).
 
     Every coefficient is a combination of functions `phi_k(c z)`, in which
-    `phi_k(z) = sum_j z^j / (j + k)!`. The first column is not given: it makes each row sum
+    `phi_k(z) = sum_j z^j / (j + k)!`. The first column is not an argument: it makes each row sum
     `c_i phi_1(c_i z)` and that of b `phi_1(z)`, so that a constant g is integrated exactly.
 
     **Arguments:**
@@ -62,24 +62,24 @@ class ExponentialTableau:
         s = len(nodes)
         if not nodes or nodes[0] != 0:
             raise ValueError(f"c must begin with the node 0, got {[*map(str, nodes)]}.")
-        wrong = [i for i in a if not 1 < i <= s]
-        if wrong:
-            raise ValueError(f"a must have rows of stages 2 to {s}, got row {wrong[0]}.")
+        out_of_range = [i for i in a if not 1 < i <= s]
+        if out_of_range:
+            raise ValueError(f"a must have rows of stages 2 to {s}, got row {out_of_range[0]}.")
         rows = tuple(
             _columns(f"a[{i}]", a.get(i, {}), nodes[i - 1], i - 1) for i in range(1, s + 1)
         )
-        end = _columns("b", b, F(1), s)
-        if any(k < 2 or x != 1 for _, terms in end for k, x, _ in terms):
+        weights = _columns("b", b, F(1), s)
+        if any(k < 2 or x != 1 for _, terms in weights for k, x, _ in terms):
             raise ValueError("b must be made of phi_2(z) to phi_5(z) alone beyond column 1.")
         estimate = None if error is None else _columns("error", error, F(1), s + 1)
-        for name, value in dict(c=nodes, a=rows, b=end, error=estimate).items():
+        for name, value in dict(c=nodes, a=rows, b=weights, error=estimate).items():
             # The only way to set a field of a frozen dataclass; it is never changed after this.
             object.__setattr__(self, name, value)
 
     def __hash__(self) -> int:
         return self._hash
 
-    # As that of a `Tableau`.
+    # Cached as that of a `Tableau`.
     @cached_property
     def _hash(self) -> int:
         return hash((self.c, self.a, self.b))
@@ -104,16 +104,16 @@ class ExponentialTableau:
         if self.error is None:
             return None
         rows = {
-            i: {j: _mapping(terms) for j, terms in columns}
+            i: {j: {(k, c): w for k, c, w in terms} for j, terms in columns}
             for i, columns in enumerate((*self.a, self.b), 1)
             if columns
         }
-        end = {j: {k: w for k, _, w in terms} for j, terms in self.b}
+        weights = {j: {k: w for k, _, w in terms} for j, terms in self.b}
         for j, terms in self.error:
+            column = weights.setdefault(j, {})
             for k, _, w in terms:
-                end.setdefault(j, {})
-                end[j][k] = end[j].get(k, F(0)) - w
-        return ExponentialTableau((*self.c, 1), rows, end)
+                column[k] = column.get(k, F(0)) - w
+        return ExponentialTableau((*self.c, 1), rows, weights)
 
     @cached_property
     def powers(self) -> tuple[tuple[tuple[int, F], ...], ...]:
@@ -121,34 +121,30 @@ class ExponentialTableau:
         weight of each stage j in its coefficient, as pairs (j, weight).
         """
         # The flow of s^m is m! phi_(m+1).
-        most = max((k for _, terms in self.b for k, _, _ in terms), default=1)
+        max_phi = max((k for _, terms in self.b for k, _, _ in terms), default=1)
         return tuple(
             tuple((j, w / factorial(k - 1)) for j, terms in self.b for n, _, w in terms if n == k)
-            for k in range(2, most + 1)
+            for k in range(2, max_phi + 1)
         )
 
 
-def _columns(name: str, columns: Mapping[int, Any], c: F, most: int) -> Columns:
-    found = []
+def _columns(name: str, columns: Mapping[int, Any], c: F, last_column: int) -> Columns:
+    result = []
     for j, terms in sorted(columns.items()):
-        if not 2 <= j <= most:
-            raise ValueError(f"{name} must have columns 2 to {most}, got column {j}.")
-        found.append((j, _combination(f"{name}[{j}]", terms, c)))
-    return tuple(found)
+        if not 2 <= j <= last_column:
+            raise ValueError(f"{name} must have columns 2 to {last_column}, got column {j}.")
+        result.append((j, _combination(f"{name}[{j}]", terms, c)))
+    return tuple(result)
 
 
 def _combination(name: str, terms: Mapping[Any, Any], c: F) -> Combination:
-    found = []
+    result = []
     for key, weight in terms.items():
         k, node = key if isinstance(key, tuple) else (key, c)
-        if not isinstance(k, int) or not 1 <= k <= _MOST:
-            raise ValueError(f"{name} must be made of phi_1 to phi_{_MOST}, got phi_{k}.")
-        found.append((k, _rational(f"{name}[{key}]", node), _rational(f"{name}[{key}]", weight)))
-    return tuple(found)
-
-
-def _mapping(terms: Combination) -> dict[tuple[int, F], F]:
-    return {(k, c): w for k, c, w in terms}
+        if not isinstance(k, int) or not 1 <= k <= _MAX_PHI:
+            raise ValueError(f"{name} must be made of phi_1 to phi_{_MAX_PHI}, got phi_{k}.")
+        result.append((k, _rational(f"{name}[{key}]", node), _rational(f"{name}[{key}]", weight)))
+    return tuple(result)
 
 
 def _rational(name: str, value: Any) -> F:
@@ -163,7 +159,7 @@ def _divided_difference(nodes: Mapping[int, F], factor: Mapping[int, F]) -> dict
     It is the difference of the flows of two interpolants of g that have all but one node in common.
     """
     weights = {j: F(1, 1) / prod(x - y for y in nodes.values() if y != x) for j, x in nodes.items()}
-    return {j: {k: w * part for k, part in factor.items()} for j, w in weights.items() if j != 1}
+    return {j: {k: w * b for k, b in factor.items()} for j, w in weights.items() if j != 1}
 
 
 _HALF = F(1, 2)

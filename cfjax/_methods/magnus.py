@@ -5,8 +5,8 @@ A step of length h from t is
     y_1 = exp(h sum_k rows[J][k] A(t + c_k h)) ... exp(h sum_k rows[0][k] A(t + c_k h)) y_0
 
 with the nodes c_k. Row j stands for a linear functional of `A(t + theta h)`, as a function of theta
-in [0, 1]. It is given here by its values on the shifted Legendre polynomials, `P_n(2 theta - 1)`:
-row 0 comes first, what is left out is zero. On K nodes it is applied to the polynomial of degree
+in [0, 1]. It is stored here as its values on the shifted Legendre polynomials, `P_n(2 theta - 1)`:
+row 0 comes first, values left out are zero. On K nodes it is applied to the polynomial of degree
 K - 1 through the values there. That keeps a method's order p where quadrature on the nodes is of
 order p.
 
@@ -23,8 +23,8 @@ from typing import TypeAlias
 
 from .coefficients import ContinuousExtension, Product
 
-# Values on Legendre polynomials, by flow and degree.
-Letters: TypeAlias = Sequence[Sequence[Decimal]]
+# Values of linear functionals on Legendre polynomials, by flow and degree.
+Functionals: TypeAlias = Sequence[Sequence[Decimal]]
 
 _DIGITS = 50
 
@@ -65,31 +65,33 @@ class MagnusTableau:
         cls,
         order: int,
         nodes: Sequence[Decimal],
-        letters: Letters,
-        embedded: Letters | None = None,
+        functionals: Functionals,
+        embedded: Functionals | None = None,
         embedded_order: int | None = None,
     ) -> "MagnusTableau":
         with localcontext(prec=_DIGITS):
-            extension = _continuous_extension(letters, nodes)
+            extension = _continuous_extension(functionals, nodes)
             rows = _ends(extension)
-            other = None if embedded is None else _ends(_continuous_extension(embedded, nodes))
+            embedded_rows = _ends(_continuous_extension(embedded or (), nodes)) or None
         return cls(
             order,
             tuple(map(float, nodes)),
             rows,
             tuple(tuple(tuple(map(float, row)) for row in powers) for powers in extension),
-            other,
+            embedded_rows,
             embedded_order,
         )
 
 
-def _continuous_extension(letters: Letters, nodes: Sequence[Decimal]) -> list[list[list[Decimal]]]:
+def _continuous_extension(
+    functionals: Functionals, nodes: Sequence[Decimal]
+) -> list[list[list[Decimal]]]:
     """By flow, power of theta and node."""
     basis = _lagrange(nodes)
     size = len(nodes)
     return [
         [[_moment(values, m) * basis[k][m] for k in range(size)] for m in range(size)]
-        for values in letters
+        for values in functionals
     ]
 
 
@@ -104,29 +106,29 @@ def _moment(values: Sequence[Decimal], m: int) -> Decimal:
     """The value on `theta^m = sum_n (2 n + 1) m!^2 / ((m - n)! (m + n + 1)!) P_n(2 theta - 1)`."""
     total = Decimal(0)
     for n, value in enumerate(values[: m + 1]):
-        over = math.factorial(m - n) * math.factorial(m + n + 1)
-        total += value * (2 * n + 1) * math.factorial(m) ** 2 / over
+        denominator = math.factorial(m - n) * math.factorial(m + n + 1)
+        total += value * (2 * n + 1) * math.factorial(m) ** 2 / denominator
     return total
 
 
 def _lagrange(nodes: Sequence[Decimal]) -> list[list[Decimal]]:
     """The polynomials that are one at one node and zero at the others, by node and power."""
     basis = []
-    for k, here in enumerate(nodes):
+    for k, node in enumerate(nodes):
         powers = [Decimal(1)]
-        for j, other in enumerate(nodes):
+        for j, root in enumerate(nodes):
             if j != k:
                 shifted = zip([*powers, 0], [0, *powers], strict=True)
-                powers = [(b - other * a) / (here - other) for a, b in shifted]
+                powers = [(b - root * a) / (node - root) for a, b in shifted]
         basis.append(powers)
     return basis
 
 
 def _symmetric(nodes: Sequence[str]) -> list[Decimal]:
     """All nodes, from those up to the middle."""
-    left = [Decimal(c) for c in nodes]
+    first_half = [Decimal(c) for c in nodes]
     with localcontext(prec=_DIGITS):
-        return left + [1 - c for c in reversed(left) if 2 * c != 1]
+        return first_half + [1 - c for c in reversed(first_half) if 2 * c != 1]
 
 
 def _decimals(rows: Sequence[Sequence[str]]) -> list[list[Decimal]]:
@@ -135,9 +137,9 @@ def _decimals(rows: Sequence[Sequence[str]]) -> list[list[Decimal]]:
 
 def _palindrome(rows: Sequence[Sequence[str]], num_rows: int) -> list[list[Decimal]]:
     """All rows of a symmetric method, from those up to the middle."""
-    left = _decimals(rows)
-    right = [[-v if n % 2 else v for n, v in enumerate(row)] for row in reversed(left)]
-    return left + right[2 * len(left) - num_rows :]
+    first_half = _decimals(rows)
+    mirrored = [[-v if n % 2 else v for n, v in enumerate(row)] for row in reversed(first_half)]
+    return first_half + mirrored[2 * len(first_half) - num_rows :]
 
 
 _MIDPOINT = [Decimal("0.5")]
@@ -181,7 +183,7 @@ _MAGNUS4 = (
     ("0.275", "-0.229885057471264367816092", "0.14"),
     ("0.45", "0", "-0.28"),
 )
-# Embedded: what is left of the weights, but for a part that sees the quadrature.
+# Embedded: the remaining weights, except for a part that detects the error of the quadrature.
 _magnus4 = _palindrome(_MAGNUS4, 3)
 MAGNUS4 = MagnusTableau.of(
     4,

@@ -1,13 +1,13 @@
 """The order of a tableau, decided by its order conditions.
 
 The solution of a Lie group method is a sum over products of frozen fields and their derivatives,
-and an ordered rooted tree says how one such derivative is made up. Fields do not commute, so the
+and an ordered rooted tree stands for one such derivative. Fields do not commute, so the
 order of the factors counts:
 
 - a *letter* is an ordered rooted tree. It stands for one factor;
 - a *word* is a finite sequence of letters, the first applied first. It stands for one product;
-- a *forest* is what is left of a tree when its root is taken away: the sequence of its children's
-  trees. So a forest is a word as well, and a tree is given by its forest.
+- a *forest* is a tree without its root: the sequence of its children's trees. So a forest is a
+  word as well, and determines its tree.
 
 Here both are nested tuples: a word is the tuple of its letters, and a letter is the tuple of its
 forest's. `()` is the empty word, and as a letter the single node. A letter's order, its number of
@@ -31,9 +31,8 @@ from .tableau import Tableau
 class _Rounded:
     """A number that is computed from rounded coefficients.
 
-    `value` is exact for the coefficients as they are given, so no rounding happens here. Entry i
-    of `change` is how much the number changes to first order when float coefficient i moves by
-    its `uncertainty`.
+    `value` is exact for the rounded coefficients: no rounding happens here. Entry i of `change` is
+    how much the number changes to first order when float coefficient i moves by its `uncertainty`.
     """
 
     def __init__(self, value: Fraction, change: np.ndarray) -> None:
@@ -62,12 +61,12 @@ class _Rounded:
     __rmul__ = __mul__
 
 
-# Of words again. Written without recursion, which run-time type checkers cannot follow.
+# A tuple of words. Written without recursion, which run-time type checkers cannot follow.
 Word: TypeAlias = tuple[Any, ...]
 # A Fraction, a _Rounded, or a float where nothing is to be proved.
 Number: TypeAlias = Any
 Weights: TypeAlias = dict[Word, Number]
-# How far each weight of one order is off, and how far it may be.
+# The defect of each weight of one order, and its tolerance.
 Defects: TypeAlias = list[tuple[Fraction, float]]
 
 
@@ -84,7 +83,7 @@ def order(tableau: Any) -> int:
     **Raises:** `TypeError` if `tableau` is neither a `Tableau` nor an `ExponentialTableau`.
     """
     if not isinstance(tableau, Tableau):
-        # Here, as an import of cfjax makes few of the methods.
+        # Not at the top: an import of cfjax makes few of the methods.
         from .exponential import ExponentialTableau
         from .stiff_order import classical_order
 
@@ -155,10 +154,10 @@ def words(n: int) -> tuple[Word, ...]:
     if n == 0:
         return ((),)
     return tuple(
-        (tree, *rest)
-        for first in range(1, n + 1)
-        for tree in words(first - 1)
-        for rest in words(n - first)
+        (tree, *suffix)
+        for size in range(1, n + 1)
+        for tree in words(size - 1)
+        for suffix in words(n - size)
     )
 
 
@@ -195,8 +194,8 @@ def exact_tree_weight(tree: Word) -> Fraction:
 def _end_weights(tableau: Tableau) -> Iterator[Weights]:
     """The weights of all words at the end point, order by order from 1."""
     rows = _nonzero([prefix[-1] for prefix in tableau.prefixes])
-    for n, (_, end) in enumerate(word_weights(tableau, rows), 1):
-        yield {word: end[word] for word in words(n)}
+    for n, (_, end_weights) in enumerate(word_weights(tableau, rows), 1):
+        yield {word: end_weights[word] for word in words(n)}
 
 
 def word_weights(
@@ -207,30 +206,30 @@ def word_weights(
     `rows` holds the last row of each of the tableau's prefixes, as its nonzero coefficients with
     their stages, in the arithmetic that is wanted.
     """
-    # At each point on the way, by the flows that lead there. Before the first flow every word but
-    # the empty one has weight 0, and zeros are left out.
+    # At each point of the step, by the flows that lead there. Before the first flow only the empty
+    # word has a weight. Zeros are left out.
     points: dict[Product, Weights] = {(): {(): Fraction(1)}}
     flows = []
     for prefix, row in zip(tableau.prefixes, rows, strict=True):
         before, after = points[prefix[:-1]], points.setdefault(prefix, {(): Fraction(1)})
-        alone: Weights = {(): Fraction(1)}
+        flow_weights: Weights = {(): Fraction(1)}
         letters: Weights = {}
-        flows.append((row, before, after, alone, letters))
+        flows.append((row, before, after, flow_weights, letters))
     stages = [points[product] for product in tableau.alpha]
-    end = points[tableau.beta]
+    end_weights = points[tableau.beta]
     n = 0
     while True:
         n += 1
-        for row, before, after, alone, letters in flows:
+        for row, before, after, flow_weights, letters in flows:
             for tree in words(n - 1):
                 letters[tree] = _sum(a * stages[k][tree] for k, a in row if tree in stages[k])
             for word in words(n):
-                # 1/m! times the product over the word's m letters: the flow by itself.
-                alone[word] = alone[word[:-1]] * letters[word[-1]] / len(word)
+                # The flow alone: 1/m! times the product over the word's m letters.
+                flow_weights[word] = flow_weights[word[:-1]] * letters[word[-1]] / len(word)
             for word in words(n):
                 splits = ((word[:i], word[i:]) for i in range(len(word) + 1))
-                after[word] = _sum(before[u] * alone[v] for u, v in splits if u in before)
-        yield stages, end
+                after[word] = _sum(before[u] * flow_weights[v] for u, v in splits if u in before)
+        yield stages, end_weights
 
 
 def _tree_weights(tableau: Tableau) -> Iterator[Weights]:
@@ -239,21 +238,21 @@ def _tree_weights(tableau: Tableau) -> Iterator[Weights]:
     There flows add up. For brevity each point must have at most one.
     """
     products = (*tableau.alpha, tableau.beta)
-    *rows, end = _nonzero([row[0] if row else () for row in products])
-    # At each stage: of the tree itself, and of its root's children multiplied.
-    grown: list[Weights] = [{} for _ in rows]
-    values: list[Weights] = [{} for _ in rows]
+    *rows, end_row = _nonzero([row[0] if row else () for row in products])
+    # At each stage: the weight of a tree, and the product of the weights of its root's children.
+    tree_weights: list[Weights] = [{} for _ in rows]
+    branch_products: list[Weights] = [{} for _ in rows]
     n = 0
     while True:
         n += 1
         for tree in trees(n):
-            for branches, value in zip(grown, values, strict=True):
-                value[tree] = value[tree[:-1]] * branches[tree[-1]] if tree else Fraction(1)
-        yield {tree: _sum(a * values[k][tree] for k, a in end) for tree in trees(n)}
+            for weights, products in zip(tree_weights, branch_products, strict=True):
+                products[tree] = products[tree[:-1]] * weights[tree[-1]] if tree else Fraction(1)
+        yield {tree: _sum(a * branch_products[k][tree] for k, a in end_row) for tree in trees(n)}
         # Only for the next order, and the most work of all.
         for tree in trees(n):
-            for row, branches in zip(rows, grown, strict=True):
-                branches[tree] = _sum(a * values[k][tree] for k, a in row)
+            for row, weights in zip(rows, tree_weights, strict=True):
+                weights[tree] = _sum(a * branch_products[k][tree] for k, a in row)
 
 
 def _nonzero(rows: Sequence[Row]) -> list[list[tuple[int, Number]]]:

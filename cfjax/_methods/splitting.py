@@ -7,7 +7,7 @@ order for two terms is its order for any number (McLachlan, SIAM J. Sci. Comput.
 
 from collections.abc import Sequence
 from functools import lru_cache
-from itertools import product
+from itertools import accumulate, chain, product
 from math import factorial
 
 # Rounding of coefficients with 15 digits, in sums of some hundred products.
@@ -16,19 +16,15 @@ _MAX_ORDER = 8
 
 
 def stages(a: Sequence[float], b: Sequence[float]) -> tuple[float, ...]:
-    """Those of the symmetric method exp(a1 A) exp(b1 B) exp(a2 A) .. of two terms.
+    """The numbers of the symmetric method exp(a1 A) exp(b1 B) exp(a2 A) .. of two terms.
 
-    `a` and `b` are its first halves without the entries in the middle, which the sums 1 give.
+    `a` and `b` are its first halves without the entries in the middle, as each must sum to 1.
     """
     b = [*b, 0.5 - sum(b)]
     a = [*a, 1 - 2 * sum(a), *reversed(a)]
     b = [*b, *reversed(b)]
-    found, last = [], 0.0
-    for pair in zip(a, b, strict=False):
-        for x in pair:
-            last = x - last
-            found.append(last)
-    return tuple(found)
+    in_turn = chain.from_iterable(zip(a, b, strict=False))
+    return tuple(accumulate(in_turn, lambda s, x: x - s))
 
 
 STRANG = (0.5, 0.5)
@@ -51,9 +47,9 @@ BLANES_MOAN_6 = stages(
 )
 
 
-def _palindrome(*first: float) -> tuple[float, ...]:
+def _palindrome(*first_half: float) -> tuple[float, ...]:
     """A symmetric composition with sum 1, from the first half without the middle."""
-    return (*first, 1 - 2 * sum(first), *reversed(first))
+    return (*first_half, 1 - 2 * sum(first_half), *reversed(first_half))
 
 
 # Parts of a step, by the order of the composition of a symmetric method of order 2: Suzuki, Phys.
@@ -101,9 +97,9 @@ def splitting_order(stages: Sequence[float]) -> int:
 
 
 def _times_exponential(series: dict[str, float], letter: str, s: float) -> dict[str, float]:
-    out: dict[str, float] = {}
+    result: dict[str, float] = {}
     for word, x in series.items():
         for n in range(_MAX_ORDER - len(word) + 1):
-            longer = word + n * letter
-            out[longer] = out.get(longer, 0.0) + x * s**n / factorial(n)
-    return out
+            extended = word + n * letter
+            result[extended] = result.get(extended, 0.0) + x * s**n / factorial(n)
+    return result

@@ -6,11 +6,11 @@ stage j with trees of orders q, q', .. the stage i gets `sum_j a_ij(z) c_j^m tre
 of order 1 + m + q + q' + ... Derivatives of g stand between them, so each function of z has an
 argument of its own, and a condition holds if it holds for all arguments.
 
-All functions are combinations of `phi_k(c z)`. Beyond these numbers are known of two kinds:
+All functions are combinations of `phi_k(c z)`. They are expanded in one of two ways:
 
-- `e^(c z) z^(-m)` are linearly independent for different c and m, so a function is zero if and only
-  if all its coefficients in these are;
-- Taylor's series, cut off at some degree.
+- in `e^(c z) z^(-m)`, which are linearly independent for different c and m, so that a function is
+  zero if and only if all its coefficients are;
+- in Taylor's series, truncated at some degree.
 
 Source: Luan & Ostermann, Exponential B-series: the stiff case, SIAM J. Numer. Anal. 51 (2013),
 doi:10.1137/130920204; Hochbruck & Ostermann, Explicit exponential Runge-Kutta methods for
@@ -30,11 +30,11 @@ from .exponential import Combination, ExponentialTableau
 Function: TypeAlias = dict[tuple[Any, ...], F]
 # A leaf of order k is (k, ()), and (m, children) is c^m times its children.
 Tree: TypeAlias = tuple[int, tuple[Any, ...]]
-# What a combination of phi functions is made of.
+# The expansion of a combination of phi functions.
 Expansion: TypeAlias = Callable[[Combination], Function]
 
-# Conditions of a higher order are not known to be needed, and take long.
-_MOST = 6
+# No method needs the conditions of a higher order, which take long.
+_MAX_ORDER = 6
 
 
 @lru_cache
@@ -50,19 +50,21 @@ def stiff_order(tableau: ExponentialTableau) -> int:
     Source: Luan & Ostermann, Exponential B-series: the stiff case, SIAM J. Numer. Anal. 51 (2013),
     doi:10.1137/130920204.
     """
-    _check(tableau)
+    if not isinstance(tableau, ExponentialTableau):
+        raise TypeError(
+            f"stiff_order: tableau must be a cfjax.ExponentialTableau, got {tableau!r}."
+        )
 
     def holds(p: int) -> bool:
-        below = (_conditions(tableau, q, _exactly, _exactly) for q in range(2, p))
-        return all(map(_is_zero, below)) and _is_zero(_conditions(tableau, p, _exactly, _at_zero))
+        below = (_conditions(tableau, q, _exact, _exact) for q in range(2, p))
+        return all(map(_is_zero, below)) and _is_zero(_conditions(tableau, p, _exact, _at_zero))
 
     return _largest(holds)
 
 
 @lru_cache
 def classical_order(tableau: ExponentialTableau) -> int:
-    """The order for steps that are short for the linear part too, as `cfjax.order` says it."""
-    _check(tableau)
+    """The order for steps that are short for the linear part too, which is `cfjax.order`."""
 
     def holds(p: int) -> bool:
         # Each argument is of the order of the step.
@@ -75,16 +77,9 @@ def classical_order(tableau: ExponentialTableau) -> int:
 
 def _largest(holds: Callable[[int], bool]) -> int:
     p = 1
-    while p < _MOST and holds(p + 1):
+    while p < _MAX_ORDER and holds(p + 1):
         p += 1
     return p
-
-
-def _check(tableau: Any) -> None:
-    if not isinstance(tableau, ExponentialTableau):
-        raise TypeError(
-            f"stiff_order: tableau must be a cfjax.ExponentialTableau, got {tableau!r}."
-        )
 
 
 def _is_zero(conditions: Iterator[Function], degree: int | None = None) -> bool:
@@ -99,52 +94,51 @@ def _is_zero(conditions: Iterator[Function], degree: int | None = None) -> bool:
 def _conditions(
     tableau: ExponentialTableau, p: int, inner: Expansion, outer: Expansion
 ) -> Iterator[Function]:
-    """What must be zero for order p, with b in terms of `outer` and all else of `inner`."""
+    """The functions that must be zero for order p. `outer` expands b, and `inner` all else."""
     a = [[(j, inner(terms)) for j, terms in columns] for columns in tableau.a]
     b = [(j, outer(terms)) for j, terms in tableau.b]
 
     # The first column never counts: its node is zero, and its stage exact.
-    def at(columns: Any, c: F, expand: Expansion, tree: Tree) -> Function:
+    def tree_function(columns: Any, c: F, expand: Expansion, tree: Tree) -> Function:
         k, children = tree
         total = {} if children else expand(((k, c, -(c**k)),) if c else ())
         for j, function in columns:
             node = tableau.c[j - 1]
             term = _times(function, node**k if children else node ** (k - 1) / factorial(k - 1))
             for child in children:
-                term = _product(term, stage(j, child))
+                term = _product(term, stage_function(j, child))
             total = _sum(total, term)
         return total
 
     @lru_cache
-    def stage(i: int, tree: Tree) -> Function:
-        return at(a[i - 1], tableau.c[i - 1], inner, tree)
+    def stage_function(i: int, tree: Tree) -> Function:
+        return tree_function(a[i - 1], tableau.c[i - 1], inner, tree)
 
-    return (at(b, F(1), outer, tree) for tree in _trees(p))
+    return (tree_function(b, F(1), outer, tree) for tree in _trees(p))
 
 
 @lru_cache
 def _trees(order: int) -> tuple[Tree, ...]:
-    found: list[Tree] = [(order, ())]
+    result: list[Tree] = [(order, ())]
     for size in range(1, order):
         for orders in combinations_with_replacement(range(2, order), size):
             m = order - 1 - sum(orders)
             if m >= 0:
-                forests = {tuple(sorted(each)) for each in product(*map(_trees, orders))}
-                found += [(m, forest) for forest in sorted(forests)]
-    return tuple(found)
+                forests = {tuple(sorted(trees)) for trees in product(*map(_trees, orders))}
+                result += [(m, forest) for forest in sorted(forests)]
+    return tuple(result)
 
 
-def _exactly(terms: Combination) -> Function:
-    """By `e^(c z) z^(-m)`, of key (c, m)."""
+def _exact(terms: Combination) -> Function:
+    """The coefficients of `e^(c z) z^(-m)`, with the key (c, m)."""
     total: Function = {}
     for k, c, weight in terms:
         if c == 0:
-            total = _sum(total, {((F(0), 0),): weight / factorial(k)})
-            continue
-        total = _sum(total, {((c, k),): weight / c**k})
-        total = _sum(
-            total, {((F(0), k - j),): -weight / (c ** (k - j) * factorial(j)) for j in range(k)}
-        )
+            term = {((F(0), 0),): weight / factorial(k)}
+        else:
+            term = {((F(0), k - j),): -weight / (c ** (k - j) * factorial(j)) for j in range(k)}
+            term[((c, k),)] = weight / c**k
+        total = _sum(total, term)
     return total
 
 
@@ -153,7 +147,7 @@ def _at_zero(terms: Combination) -> Function:
 
 
 def _taylor(degree: int) -> Expansion:
-    """By powers of z up to a degree, which is the key."""
+    """The coefficients of powers of z, up to a degree. The key is the power."""
     return lambda terms: {
         (m,): sum((weight * c**m / factorial(m + k) for k, c, weight in terms), F(0))
         for m in range(degree + 1)

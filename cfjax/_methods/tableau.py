@@ -1,4 +1,4 @@
-"""Tableaus of commutator-free Lie group methods: plain data, checked in full when made."""
+"""Tableaus of commutator-free Lie group methods: plain data, checked when constructed."""
 
 from collections.abc import Iterable
 from dataclasses import dataclass
@@ -70,23 +70,23 @@ class Tableau:
             raise ValueError("alpha must have at least one stage, got none.")
         s = len(stages)
         # The only way to set a field of a frozen dataclass; it is never changed after this.
-        put = partial(object.__setattr__, self)
-        put("alpha", tuple(checked_product(f"alpha[{r}]", p, s, r) for r, p in enumerate(stages)))
-        put("beta", checked_end("beta", beta, s))
+        store = partial(object.__setattr__, self)
+        store("alpha", tuple(checked_product(f"alpha[{r}]", p, s, r) for r, p in enumerate(stages)))
+        store("beta", checked_end("beta", beta, s))
         if embedded is not None:
             embedded = checked_end("embedded", embedded, s + 1)
-        put("embedded", embedded)
+        store("embedded", embedded)
         if continuous_extension is not None:
             continuous_extension = checked_extension(continuous_extension, s + 1, self.beta)
-        put("continuous_extension", continuous_extension)
+        store("continuous_extension", continuous_extension)
 
     def __repr__(self) -> str:
         stages = ", ".join(map(_show_product, self.alpha))
-        more = "" if self.embedded is None else f", embedded={_show_product(self.embedded)}"
+        optional = "" if self.embedded is None else f", embedded={_show_product(self.embedded)}"
         if self.continuous_extension is not None:
             flows = ", ".join(map(_show_product, self.continuous_extension))
-            more += f", continuous_extension=[{flows}]"
-        return f"Tableau(alpha=[{stages}], beta={_show_product(self.beta)}{more})"
+            optional += f", continuous_extension=[{flows}]"
+        return f"Tableau(alpha=[{stages}], beta={_show_product(self.beta)}{optional})"
 
     def __hash__(self) -> int:
         return self._hash
@@ -127,14 +127,14 @@ class Tableau:
 
     @cached_property
     def prefixes(self) -> tuple[Product, ...]:
-        """The distinct beginnings of the stages' and the end point's rows, each after its own.
+        """The distinct prefixes of the rows of stages and end point, each after its own prefixes.
 
         Each is one flow: the point after `prefix` is the flow of its last row from the point
         after `prefix[:-1]`. Rows that begin alike share these flows.
         """
         products = (*self.alpha, self.beta)
-        every = (rows[: j + 1] for rows in products for j in range(len(rows)))
-        return tuple(dict.fromkeys(every))
+        beginnings = (rows[: j + 1] for rows in products for j in range(len(rows)))
+        return tuple(dict.fromkeys(beginnings))
 
     @property
     def num_flows(self) -> int:
@@ -155,11 +155,11 @@ class Tableau:
 
 
 def _show_product(rows: Product) -> str:
-    shown = []
+    texts = []
     for row in rows:
-        last = max((k for k, a in enumerate(row) if a), default=0)
-        shown.append("(" + ", ".join(map(str, row[: last + 1])) + ")")
-    return "[" + ", ".join(shown) + "]"
+        last_nonzero = max((k for k, a in enumerate(row) if a), default=0)
+        texts.append("(" + ", ".join(map(str, row[: last_nonzero + 1])) + ")")
+    return "[" + ", ".join(texts) + "]"
 
 
 def crouch_grossman(

@@ -53,15 +53,15 @@ def report(progress: Progress) -> Report:
 
 def flows_and_brackets(method: diffrax.AbstractSolver) -> tuple[int, int]:
     """How many flows and brackets a step of `method` takes."""
-    term = LieTerm(lambda t, y, args: _Anything(y))
+    term = LieTerm(lambda t, y, args: _Translation(y))
     t0, h, y0 = jnp.asarray(0.0), jnp.asarray(0.1), jnp.ones(3)
     method = cast(Any, method).without_estimate()
     _, step = calls_of_steps(Problem(term, method, t0, h, h, y0, None))
     return int(step.flows), int(step.brackets)
 
 
-class _Anything(AbstractAlgebraElement):
-    """What is quickly compiled. Of its flows and brackets only the number is asked."""
+class _Translation(AbstractAlgebraElement):
+    """A field that compiles quickly: only the numbers of its flows and brackets matter."""
 
     v: Float[Array, "3"]
 

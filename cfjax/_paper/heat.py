@@ -23,8 +23,8 @@ from .._measure.style import STYLES, finish, new_figure
 from ..scenes import heat
 
 TOLERANCES = tuple(10.0**-k for k in range(2, 8))
-# What the paper does not say: the first step, the interval, and the maximum norm for the estimate.
-# These make its numbers of steps.
+# The paper does not state the first step, the interval, and the maximum norm for the estimate. With
+# these the numbers of steps are the paper's.
 FIRST_STEP = 5e-3
 INTERVALS = 100
 FIGURE_TOLERANCES = (1e-3, 1e-6)
@@ -76,7 +76,7 @@ class Method(NamedTuple):
 class Run(NamedTuple):
     """One integration with adaptive steps."""
 
-    t: Float[np.ndarray, " steps"]  # the ends of the steps that were kept
+    t: Float[np.ndarray, " steps"]  # the ends of accepted steps
     num_steps: int  # attempted
     num_rejected: int
     error: float  # of the grid values at the end, in the 2-norm
@@ -91,10 +91,10 @@ METHODS = {
 
 
 class Controller(diffrax.AbstractAdaptiveStepSizeController):
-    """The paper's step sizes, `h_new = 0.9 (atol / err)^(1/(p+1)) h`, kept where `err <= atol`.
+    """The paper's step sizes: `h_new = 0.9 (atol / err)^(1/(p+1)) h`, accepted if `err <= atol`.
 
-    `diffrax.PIDController` has the same rule, but never shrinks the step after one that was kept.
-    So at the limit of stability every eighth step is rejected, which the paper's are not.
+    `diffrax.PIDController` has the same rule, but never shrinks the step after an accepted one. So
+    at the limit of stability it rejects every eighth step, unlike the paper.
     """
 
     atol: Any
@@ -111,12 +111,12 @@ class Controller(diffrax.AbstractAdaptiveStepSizeController):
         self, t0, t1, y0, y1_candidate, args, y_error, error_order, controller_state
     ):
         error = self.norm(y_error)
-        keep = error <= self.atol
+        accepted = error <= self.atol
         # Bounds for estimates of zero and infinity only.
         factor = jnp.clip(0.9 * (self.atol / error) ** (1 / error_order), 1e-3, 1e3)
-        start = jnp.where(keep, t1, t0)
-        end = start + (t1 - t0) * factor
-        return keep, start, end, False, controller_state, diffrax.RESULTS.successful
+        next_t0 = jnp.where(accepted, t1, t0)
+        next_t1 = next_t0 + (t1 - t0) * factor
+        return accepted, next_t0, next_t1, False, controller_state, diffrax.RESULTS.successful
 
 
 def report(
@@ -198,8 +198,8 @@ def table_4(runs: Mapping[tuple[str, float], Run]) -> Table:
     for tol in sorted({tol for _, tol in runs}, reverse=True):
         printed = [PRINTED[name][TOLERANCES.index(tol)] for name in METHODS]
         table.add_row(f"{tol:.0e}", "paper", *(_cell(*row) for row in printed))
-        found = [runs[name, tol] for name in METHODS]
-        cells = [_cell(run.error, run.num_steps, run.num_rejected) for run in found]
+        measured = [runs[name, tol] for name in METHODS]
+        cells = [_cell(run.error, run.num_steps, run.num_rejected) for run in measured]
         table.add_row("", "here", *cells, end_section=True)
     return table
 
@@ -226,11 +226,11 @@ def figure_4(runs: Mapping[tuple[str, float], Run]) -> Figure:
     upper, lower = figure.subplots(2, 1, sharex=True)
     for axes, tol in ((upper, loose), (lower, strict)):
         for name in METHODS:
-            start = np.concatenate([[heat.t0], runs[name, tol].t])
+            t = np.concatenate([[heat.t0], runs[name, tol].t])
             # Without the last step, which is cut to meet the end.
             label = name if axes is upper else None
             style = STYLES[name] | {"marker": ""}
-            axes.semilogy(start[:-2], np.diff(start)[:-1], label=label, **style)
+            axes.semilogy(t[:-2], np.diff(t)[:-1], label=label, **style)
         axes.set_ylabel(f"step size, tolerance {tol:g}")
     lower.set_xlabel("time t (dimensionless)")
     lower.set_xlim(heat.t0, heat.t1)
@@ -241,13 +241,13 @@ def figure_4(runs: Mapping[tuple[str, float], Run]) -> Figure:
 def figure_stiffness(runs: Mapping[tuple[str, int], Run]) -> Figure:
     """Attempted steps against the number of intervals."""
     sizes = sorted({size for _, size in runs})
-    found = ", ".join(f"{name} {runs[name, sizes[-1]].num_steps}" for name in METHODS)
+    counts = ", ".join(f"{name} {runs[name, sizes[-1]].num_steps}" for name in METHODS)
     figure = new_figure(
         (7.0, 4.8),
         f"Heat conduction: steps attempted to t = 1/2 at tolerance {STIFFNESS_TOLERANCE:g} against "
         "the number of intervals N. Stability bounds the steps of RK4, through the whole operator, "
         "and of RKMK4, through the commutator, which contains M undamped. So their number grows "
-        f"like N². Attempted steps at N = {sizes[-1]}: {found}.",
+        f"like N². Attempted steps at N = {sizes[-1]}: {counts}.",
     )
     axes = figure.subplots()
     for name in METHODS:

@@ -18,7 +18,7 @@ from rich.table import Table
 from .. import CF3, CF4, RKMK, RKMK3, RKMK4, LieTerm, WorkPrecision, integrate, work_precision
 from .._measure.flops import count_flops
 from .._measure.report import Report
-from .._measure.style import STYLES, finish, new_figure, number
+from .._measure.style import STYLES, about_times, finish, new_figure, number
 from ..scenes import rigid_body
 
 METHODS: dict[str, diffrax.AbstractSolver] = {
@@ -35,8 +35,6 @@ series kept the ranking is the paper's."""
 NUM_STEPS = 1000  # h = 0.1
 STEP_COUNTS = tuple(500 * 2**k for k in range(7))
 REPEATS = 100
-
-_TERM = LieTerm(rigid_body.field)
 
 
 class Trajectory(NamedTuple):
@@ -85,22 +83,14 @@ def series_in_full() -> dict[str, diffrax.AbstractSolver]:
 
 def trajectory(method: diffrax.AbstractSolver) -> Trajectory:
     """The errors of `method` with h = 0.1."""
-    solution = integrate(
-        _TERM,
-        method,
-        rigid_body.t0,
-        rigid_body.t1,
-        rigid_body.y0,
-        rigid_body.inertia,
-        num_steps=NUM_STEPS,
-        save_every=1,
-    )
+    problem = rigid_body.problem()
+    solution = integrate(**problem, solver=method, num_steps=NUM_STEPS, save_every=1)
     t, y = np.asarray(solution.ts), np.asarray(solution.ys)
     energy = rigid_body.energy(y, rigid_body.inertia)
-    start = rigid_body.energy(rigid_body.y0, rigid_body.inertia)
+    initial_energy = rigid_body.energy(rigid_body.y0, rigid_body.inertia)
     return Trajectory(
         t=t,
-        energy_error=np.abs(np.asarray(energy) - float(start)),
+        energy_error=np.abs(np.asarray(energy) - float(initial_energy)),
         error=np.linalg.norm(y - rigid_body.reference(t), axis=-1),
     )
 
@@ -108,11 +98,12 @@ def trajectory(method: diffrax.AbstractSolver) -> Trajectory:
 def flops_of_step(method: diffrax.AbstractSolver) -> int:
     """Floating-point operations of one step, evaluations of the field included."""
     method = cast(Any, method).without_estimate().unrolled()
+    term = LieTerm(rigid_body.field)
 
     def step(t0, t1, y, inertia):
-        state = method.init(_TERM, t0, t1, y, inertia)
-        y, _, _, state, _ = method.step(_TERM, t0, t1, y, inertia, state, made_jump=False)
-        # What the next step needs: the end, and what its compensated sum has lost.
+        state = method.init(term, t0, t1, y, inertia)
+        y, _, _, state, _ = method.step(term, t0, t1, y, inertia, state, made_jump=False)
+        # The next step needs the state and the remainder of its compensated sum.
         return y, jax.tree.leaves(state)
 
     scalar, vector = jax.ShapeDtypeStruct((), float), jax.ShapeDtypeStruct((3,), float)
@@ -122,11 +113,7 @@ def flops_of_step(method: diffrax.AbstractSolver) -> int:
 def efficiencies(step_counts: Sequence[int], repeats: int, progress: Progress) -> WorkPrecision:
     """The cost and error at t = 100 of every method, for every number of steps."""
     return work_precision(
-        _TERM,
-        rigid_body.t0,
-        rigid_body.t1,
-        rigid_body.y0,
-        rigid_body.inertia,
+        **rigid_body.problem(),
         methods=METHODS,
         reference=rigid_body.reference(rigid_body.t1),
         num_steps=step_counts,
@@ -205,8 +192,7 @@ def figure_2(work: WorkPrecision) -> Figure:
         "Global error at t = 100 against the work of the whole integration with h = "
         f"{max(steps):g} to {min(steps):g}, after Figure 2 of "
         "Celledoni, Marthinsen & Owren (2003). Flops: operations of one step as traced, times the "
-        f"steps. Times: the fastest of {work.seconds.shape[-1]} runs in turns on one "
-        f"{jax.default_backend().upper()}; bars reach to the upper quartile. The paper finds CF4 "
+        f"steps. Times: {about_times(work.seconds)} The paper finds CF4 "
         "the best, and CF3 and RKMK3 roughly the same. Here, at the smallest step and for equal "
         f"error, CF4 takes {flops:.2f} times the flops and {seconds:.2f} times the time of RKMK4, "
         f"and CF3 {flops_3:.2f} times the flops and {seconds_3:.2f} times the time of RKMK3. RKMK4 "
@@ -221,8 +207,8 @@ def cost_at_equal_error(work: WorkPrecision, a: str, b: str, *, order: int) -> t
     An error C h^p takes work proportional to C^(1/p). The ratio of times is the median of those
     measured one after the other, which disturbances of the machine change least.
     """
-    one, other = work.select(a), work.select(b)
-    steps = (one.error[-1] / other.error[-1]) ** (1 / order)
-    flops = one.flops[-1] / other.flops[-1]
-    seconds = np.median(one.seconds[-1] / other.seconds[-1])
+    of_a, of_b = work.select(a), work.select(b)
+    steps = (of_a.error[-1] / of_b.error[-1]) ** (1 / order)
+    flops = of_a.flops[-1] / of_b.flops[-1]
+    seconds = np.median(of_a.seconds[-1] / of_b.seconds[-1])
     return float(flops * steps), float(seconds * steps)

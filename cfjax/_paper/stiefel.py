@@ -17,10 +17,10 @@ from matplotlib.ticker import LogLocator, NullLocator
 from rich.progress import Progress
 from rich.table import Table
 
-from .. import CF4, RKMK4, CayleyRK4, LieTerm, WorkPrecision, combine, work_precision
+from .. import CF4, RKMK4, CayleyRK4, WorkPrecision, combine, work_precision
 from .._measure.flops import count_flops
 from .._measure.report import Report
-from .._measure.style import STYLES, finish, new_figure
+from .._measure.style import STYLES, about_times, finish, new_figure, times
 from .._solvers.munthe_kaas import AbstractMuntheKaas
 from ..scenes import stiefel
 from .rigid_body import cost_at_equal_error, series_in_full
@@ -31,7 +31,7 @@ METHODS: dict[str, diffrax.AbstractSolver] = {
     "CF4": CF4(),
     "RKR-C4": CayleyRK4(),
 }
-PROBLEMS = {"first": stiefel.first, "second": stiefel.second}
+PROBLEMS = ("first", "second")
 # Flops of one step by problem and n, in the order of METHODS: Tables 2 and 3 of the paper.
 PRINTED = {
     ("first", 100): (3325345, 1040361, 991389, 769353),
@@ -46,7 +46,7 @@ brackets leave the form of the field, and RKR-C4, which does not use that form, 
 Here: the ranking is the same in the second experiment. In the first the fields and all their \
 brackets stay in the span of 5p columns, whatever the method, so both RKMK4 cost about as much as \
 CF4."""
-N, P = 1000, 4
+N, P = 1000, 4  # p is the scene's
 STEP_COUNTS = (2, 4, 8, 16)  # h = 2^-1 .. 2^-4
 REPEATS = 50
 
@@ -62,19 +62,15 @@ def report(
     return Report(printed=[*tables, FINDINGS], figures={"figure3": figure_3(work)})
 
 
-def _start(problem: str, n: int) -> tuple[jax.Array, Any]:
-    args = stiefel.diagonals(n, P) if problem == "first" else None
-    return jnp.asarray(stiefel.y0(n, P)), args
-
-
 @functools.cache
 def flops_of_step(method: str, problem: str, n: int, num_steps: int) -> int:
     """Floating-point operations of the first of so many steps from 0 to 1, evaluations included."""
-    term, (y0, args) = LieTerm(PROBLEMS[problem]), _start(problem, n)
+    scene = stiefel.problem(problem, n)
+    term, y0, args = scene["term"], jnp.asarray(scene["y0"]), scene["args"]
     t0, t1 = jnp.asarray(0.0), jnp.asarray(1 / num_steps)
-    # Each stage is counted where it stands by itself.
+    # Unrolled: in a loop a stage could not be counted by itself.
     solver = cast(Any, METHODS[method]).without_estimate().unrolled()
-    # Not counted: the checks of the start are none of the step.
+    # Outside of the step: the checks of the start are not counted.
     state, _ = solver.start(term, t0, t1, y0, args)
 
     def step(t0, t1, y, args):
@@ -83,16 +79,15 @@ def flops_of_step(method: str, problem: str, n: int, num_steps: int) -> int:
     return count_flops(step, t0, t1, y0, args)
 
 
-def rank_of_step(method: str, problem: str) -> int | None:
+def rank_of_step(method: str, problem: str) -> int:
     """The largest rank of a matrix whose exponential the step takes."""
-    solver, (y0, args) = METHODS[method], _start(problem, 10 * P)
+    solver, scene = METHODS[method], stiefel.problem(problem, 10 * P)
 
     def field(c, y):
-        return combine((0.5,), (PROBLEMS[problem](0.0, y, args),))
+        return combine((0.5,), (scene["term"].field(0.0, y, scene["args"]),))
 
     if isinstance(solver, AbstractMuntheKaas):
-        v = jax.eval_shape(lambda y: solver.logarithm(field, y), y0)
-        return len(v.k)
+        return len(jax.eval_shape(lambda y: solver.logarithm(field, y), scene["y0"]).k)
     if isinstance(solver, CF4):
         # The span of all columns, or the form of the field.
         return 5 * P if problem == "first" else 2 * P
@@ -103,15 +98,10 @@ def efficiencies(
     problem: str, step_counts: Sequence[int], repeats: int, progress: Progress
 ) -> WorkPrecision:
     """The cost and error at t = 1 of every method for n = 1000 and every number of steps."""
-    y0, args = _start(problem, N)
     work = work_precision(
-        LieTerm(PROBLEMS[problem]),
-        stiefel.t0,
-        stiefel.t1,
-        y0,
-        args,
+        **stiefel.problem(problem, N),
         methods=METHODS,
-        reference=stiefel.reference(problem, N, P),
+        reference=stiefel.reference(problem, N),
         num_steps=step_counts,
         repeats=repeats,
         budget=np.inf,
@@ -139,49 +129,37 @@ def flops_table(problem: str) -> Table:
             long, short = (flops_of_step(name, problem, n, k) for k in (2, 16))
             ratios = f"{short / printed:.2f} to {long / printed:.2f}"
             rank = rank_of_step(name, problem)
-            end = name == list(METHODS)[-1]
-            table.add_row(
-                str(n), name, *map(str, (printed, long, short)), ratios, str(rank), end_section=end
-            )
+            row = n, name, printed, long, short, ratios, rank
+            table.add_row(*map(str, row), end_section=name == list(METHODS)[-1])
     return table
 
 
 def figure_3(work: Mapping[str, WorkPrecision]) -> Figure:
     """Global error against flops and against time, for both experiments."""
-    found = []
-    for costs in work.values():
-        others = {
-            name: cost_at_equal_error(costs, "CF4", name, order=4)
-            for name in METHODS
-            if name != "CF4"
-        }
-        found.append(
-            ", ".join(
-                f"{flops:.2f} and {seconds:.2f} ({name})"
-                for name, (flops, seconds) in others.items()
-            )
-        )
+
+    def ratios(costs: WorkPrecision) -> str:
+        pairs = {n: cost_at_equal_error(costs, "CF4", n, order=4) for n in METHODS if n != "CF4"}
+        return ", ".join(f"{flops:.2f} and {t:.2f} ({n})" for n, (flops, t) in pairs.items())
+
     steps = work["first"].num_steps
     figure = new_figure(
         (7.0, 7.8),
         f"Global error at t = 1 for h = 1/{min(steps):g} to 1/{max(steps):g}, n = {N}, p = {P}, "
         "after Figure 3 of Celledoni, Marthinsen & Owren (2003); above the first experiment (a), "
         "below the second (b). Flops: operations of the first step as traced, times the steps. "
-        f"Times: the fastest of {work['first'].seconds.shape[1]} runs in turns on one "
-        f"{jax.default_backend().upper()}; bars reach to the upper quartile. The paper finds CF4 "
+        f"Times: {about_times(work['first'].seconds)} The paper finds CF4 "
         "far ahead of RKMK4 with the full series and moderately ahead of the others in (a), and "
         "far ahead of all in (b). Here, for equal error at the smallest step, CF4 takes these "
-        f"parts of the flops and the time of the others. (a): {found[0]}. (b): {found[1]}. In (a) "
-        "the step lives in a span of 5p columns, brackets included, so they cost little.",
+        f"parts of the flops and the time of the others. (a): {ratios(work['first'])}. (b): "
+        f"{ratios(work['second'])}. In (a) the step lives in a span of 5p columns, brackets "
+        "included, so they cost little.",
     )
     panels = figure.subplots(2, 2, sharey="row")
     for (left, right), label, costs in zip(panels, "ab", work.values(), strict=True):
         for name in METHODS:
             cost, style = costs.select(name), STYLES[name] | dict(markersize=4)
             left.loglog(cost.flops / 1e6, cost.error, label=name if label == "a" else None, **style)
-            best, upper = 1e3 * np.percentile(cost.seconds, (0, 75), axis=-1)
-            spread = (np.zeros_like(best), upper - best)
-            right.errorbar(best, cost.error, xerr=spread, capsize=3, **style)
+            times(right, 1e3 * cost.seconds, cost.error, **style)
         right.set_xscale("log")
         for axes in (left, right):
             axes.xaxis.set_major_locator(LogLocator(subs=(1, 2, 5)))
