@@ -1,8 +1,8 @@
-"""Ctrl-C and SIGTERM end the command at once: one line, and nothing left behind.
+"""Ctrl-C and SIGTERM end the command at once, with one line and without partial files.
 
-A thread of its own waits for them. Python's own handlers run in the main thread, which is busy for
-as long as a program compiles; and what they raise there may come out of JAX as another error, or
-crash the interpreter while it ends.
+A separate thread waits for them. Python's handlers run in the main thread, which is busy as long as
+a program compiles; and their exceptions may come out of JAX as another error, or crash the
+interpreter while it ends.
 """
 
 import os

@@ -140,9 +140,9 @@ def _batch_size(members: PyTree) -> int:
 
 
 def _is_of_jax(dtype: Any) -> bool:
-    """Whether jax has arrays of it. Of NumPy's numbers it lacks those of extended precision.
+    """Whether jax has arrays of this dtype. It lacks NumPy's numbers of extended precision.
 
-    Not by the names of these: on some machines `np.longdouble` is a double.
+    Names do not identify these: on some machines `np.longdouble` is a double.
     """
     if jnp.issubdtype(dtype, jax.dtypes.prng_key):
         return True
@@ -154,7 +154,7 @@ def _failed(values: PyTree) -> Int[np.ndarray, " failures"]:
     if not isinstance(values, diffrax.Solution):
         return np.flatnonzero(np.any(_not_finite(values), axis=0))
     bad = [np.asarray(values.result != diffrax.RESULTS.successful)]
-    # diffrax fills what is left of the room for saved times and states with infinity.
+    # diffrax fills unused entries of saved times and states with infinity.
     jtu.tree_map(lambda ts, ys: bad.extend(_not_finite(ys, np.isfinite(ts))), values.ts, values.ys)
     return np.flatnonzero(np.any(bad, axis=0))
 

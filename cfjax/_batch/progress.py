@@ -14,7 +14,7 @@ if TYPE_CHECKING:
 def progress_bar(
     progress: "bool | rich.progress.Progress", description: str, total: int | float
 ) -> Iterator[Callable[..., None]]:
-    """A bar of its own, or one more of the caller's `rich.progress.Progress`.
+    """A new progress bar, or one more in the caller's `rich.progress.Progress`.
 
     Yields the function that changes it: `advance=`, `completed=` or `description=`. There is
     nothing to see if `progress` is false or rich is missing.

@@ -1,4 +1,4 @@
-"""What a step of a solver costs: evaluations of the field, flows, brackets and flops."""
+"""The cost of a step of a solver: evaluations of the field, flows, brackets and flops."""
 
 import functools
 from collections import Counter
@@ -115,7 +115,7 @@ def calls_of_steps(problem: Problem) -> tuple[Calls, Calls]:
 
 
 def _counted_steps(problem: Problem, counts_flows: bool) -> tuple[Calls, Calls]:
-    """Counted while the steps run: what a loop repeats cannot be seen in its trace."""
+    """Calls are counted while the steps run, as the trace of a loop does not show repetitions."""
     term, solver, t0, _, dt0, y0, args = problem
     tally = _Tally()
 

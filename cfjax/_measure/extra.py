@@ -1,4 +1,4 @@
-"""What only the extra `cfjax[paper]` brings."""
+"""Packages of the extra `cfjax[paper]`."""
 
 import contextlib
 from collections.abc import Iterator
@@ -6,7 +6,7 @@ from collections.abc import Iterator
 
 @contextlib.contextmanager
 def paper_extra() -> Iterator[None]:
-    """Within, a missing package of the extra is an error that says how to get it."""
+    """Within it, a missing package of the extra is an error that says how to install it."""
     try:
         yield
     except ModuleNotFoundError as error:

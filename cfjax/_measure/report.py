@@ -1,4 +1,4 @@
-"""What the commands print and write: tables, figures and data."""
+"""The output of the commands: tables, figures and data."""
 
 import inspect
 import os
@@ -29,7 +29,7 @@ from .work_precision import WorkPrecision, compiled, take_turns
 
 
 class Report(NamedTuple):
-    """What one experiment prints, in this order, and its figures and data by file name."""
+    """The printed output of an experiment, in order, and its figures and data by file name."""
 
     printed: Sequence[RenderableType]
     figures: Mapping[str, Figure]
@@ -103,7 +103,7 @@ def scene(
     num_saves: int = 100,
     budget: float = 2.0,
 ) -> Report:
-    """One solve of a scene by its solver: its invariants, what it takes, and its picture.
+    """One solve of a scene by its solver: its invariants, its time, and its picture.
 
     The scene has a `solver`, and functions `problem`, `invariants` and `picture`. Invariants are
     evaluated in `num_saves` states, and times measured for `budget` seconds. The picture may be of

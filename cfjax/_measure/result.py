@@ -1,4 +1,4 @@
-"""What `work_precision` returns: the table and the chart."""
+"""The result of `work_precision`, with its table and chart."""
 
 import csv
 import os

@@ -22,7 +22,7 @@ STYLES: dict[str, dict[str, Any]] = {
     "RKMK4, full series": dict(color="#E69F00", linestyle=":", marker="D", linewidth=1.9),
     "RKR-C4": dict(color="#56B4E9", linestyle="-.", marker="v"),
 }
-# For all other methods, in turn.
+# Of all other methods, in turn.
 _OTHER_STYLES = [
     dict(color="#56B4E9", linestyle="-", marker="D"),
     dict(color="#E69F00", linestyle="--", marker="P"),
@@ -35,7 +35,7 @@ _OTHER_STYLES = [
 
 
 def styles(methods: Iterable[str]) -> dict[str, dict[str, Any]]:
-    """A style for each method: always the same for those of the paper."""
+    """A style for each method. The methods of the paper always have the same."""
     other_styles = itertools.cycle(_OTHER_STYLES)
     return {name: STYLES.get(name) or next(other_styles) for name in methods}
 
@@ -59,7 +59,7 @@ def new_figure(size: tuple[float, float], caption: str = "") -> Figure:
 
 
 def logarithmic(axes: Axes, label: str, unit: str = "") -> None:
-    """A logarithmic axis for what is drawn already, with ticks such as 20 µs."""
+    """Makes the x axis of a finished plot logarithmic, with ticks such as 20 µs."""
     axes.set(xscale="log", xlabel=label)
     low, high = axes.get_xlim()
     axes.xaxis.set_major_locator(LogLocator(subs=(1, 2, 5) if high < 50 * low else (1,)))
@@ -84,7 +84,7 @@ def about_times(seconds: np.ndarray) -> str:
 
 
 def finish(figure: Figure, columns: int) -> None:
-    """A grid in every panel, and one legend of so many columns above them all."""
+    """Adds a grid to every panel, and one legend of so many columns above them all."""
     for axes in figure.axes:
         axes.grid(color="0.9", linewidth=0.6)
         axes.set_axisbelow(True)

@@ -43,7 +43,7 @@ Method = diffrax.AbstractSolver | tuple[PyTree, diffrax.AbstractSolver]
 
 
 def absolute_tolerance(tolerance: Float[Array, ""]) -> diffrax.AbstractStepSizeController:
-    """Control of the absolute error alone: that of a relative one depends on the frame."""
+    """Control of the absolute error alone, as a relative error depends on the frame."""
     return diffrax.PIDController(rtol=0.0, atol=tolerance)
 
 

@@ -38,7 +38,7 @@ REPEATS = 100
 
 
 class Trajectory(NamedTuple):
-    """Errors at the end of each step: the energy's, and that of y in the 2-norm."""
+    """Errors at the end of each step: of the energy, and of y in the 2-norm."""
 
     t: Float[np.ndarray, " steps"]
     energy_error: Float[np.ndarray, " steps"]
