@@ -201,9 +201,9 @@ def of_spacecraft() -> Scene:
     programs |= with_jaxlie(
         lambda t, r, m: (m / inertia, jnp.cross(m, m / inertia)),
         t1,
-        start=lambda SO3, y: (SO3(y["q"]), y["m"]),
-        end=lambda r, m: {"q": r.wxyz, "m": m},
-        first=100,
+        to_state=lambda SO3, y: (SO3(y["q"]), y["m"]),
+        from_state=lambda r, m: {"q": r.wxyz, "m": m},
+        smallest=100,
     )
     return Scene(
         jax.tree.map(jnp.asarray, spacecraft.y0()),
@@ -282,9 +282,9 @@ def of_prescribed_velocity() -> Scene:
         lambda t, r, m: (omega(t), m),
         t1,
         # No momentum.
-        start=lambda SO3, r: (SO3.from_matrix(r), jnp.zeros(0)),
-        end=lambda r, m: r.as_matrix(),
-        first=25,
+        to_state=lambda SO3, r: (SO3.from_matrix(r), jnp.zeros(0)),
+        from_state=lambda r, m: r.as_matrix(),
+        smallest=25,
     )
     return Scene(
         jnp.eye(3),
