@@ -18,13 +18,10 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
-from scipy.integrate import solve_ivp
 
 import cfjax
+import on_host
 from cfjax.scenes import spacecraft
-
-# The least that SciPy takes.
-LEAST = 2.3e-14
 
 
 class Program(NamedTuple):
@@ -89,17 +86,8 @@ class Projected(diffrax.Tsit5):
         return self.project(y1), *remainder
 
 
-def on_host(velocity: Callable, method: Any, t1: float) -> Callable:
-    """The solve by SciPy, from a NumPy array."""
-
-    def solve(y0: np.ndarray, rtol: float) -> np.ndarray:
-        def ode(t: float, y: np.ndarray) -> np.ndarray:
-            return velocity(t, y.reshape(y0.shape)).ravel()
-
-        solution = solve_ivp(ode, (0.0, t1), y0.ravel(), method=method, rtol=rtol, atol=rtol)
-        return solution.y[:, -1].reshape(y0.shape)
-
-    return solve
+def by_scipy(velocity: Callable, t1: float, method: str = "DOP853") -> Callable:
+    return lambda y0, rtol: on_host.solve(velocity, t1, y0, method=method, rtol=rtol)
 
 
 def with_jaxlie(
@@ -178,7 +166,7 @@ def of_spacecraft() -> Scene:
     def with_scipy(y0: Any, rtol: float) -> Any:
         # A batch is one system.
         columns = np.concatenate([y0["q"].T, y0["m"].T])
-        y = on_host(velocity_of_columns, "DOP853", t1)(columns, rtol).T
+        y = on_host.solve(velocity_of_columns, t1, columns, rtol=rtol).T
         return {"q": y[..., :4], "m": y[..., 4:]}
 
     programs = {
@@ -251,7 +239,7 @@ def of_prescribed_velocity() -> Scene:
         x, y, z = omega(t, np)
         return r @ np.array([[0, -z, y], [z, 0, -x], [-y, x, 0]])
 
-    exact = on_host(with_numpy, "DOP853", t1)(np.eye(3), LEAST)
+    exact = on_host.solve(with_numpy, t1, np.eye(3))
     programs = {
         "CF4": Program("cfjax", equal_steps(field, cfjax.CF4(), t1), steps(25)),
         "Magnus6": Program("cfjax", equal_steps(field, cfjax.Magnus6(), t1), steps(12)),
@@ -276,7 +264,7 @@ def of_prescribed_velocity() -> Scene:
             as_quaternion(in_plain_space(quaternion_velocity, diffrax.Dopri8(), t1)),
             steps(4),
         ),
-        "SciPy, DOP853": Program("scipy", on_host(with_numpy, "DOP853", t1), TOLERANCES),
+        "SciPy, DOP853": Program("scipy", by_scipy(with_numpy, t1), TOLERANCES),
     }
     programs |= with_jaxlie(
         lambda t, r, m: (omega(t), m),
@@ -327,14 +315,14 @@ def of_kuramoto() -> Scene:
     def on_grid(t: float, u: np.ndarray) -> np.ndarray:
         return velocity(u, np)
 
-    exact = on_host(on_grid, "DOP853", t1)(y0, LEAST)
+    exact = on_host.solve(on_grid, t1, y0)
     programs = {
         "CF4": Program("cfjax", coefficients(cfjax.CF4()), steps(150)),
         "ETD54": Program("cfjax", coefficients(cfjax.ETD54()), steps(30)),
         # With 2000 it overflows.
         "diffrax, Tsit5": Program("diffrax", in_plain_space(in_space, diffrax.Tsit5(), t1), [2400]),
-        "SciPy, DOP853": Program("scipy", on_host(on_grid, "DOP853", t1), TOLERANCES[::2]),
-        "SciPy, LSODA": Program("scipy", on_host(on_grid, "LSODA", t1), TOLERANCES),
+        "SciPy, DOP853": Program("scipy", by_scipy(on_grid, t1), TOLERANCES[::2]),
+        "SciPy, LSODA": Program("scipy", by_scipy(on_grid, t1, "LSODA"), TOLERANCES),
     }
     if importlib.util.find_spec("exponax"):
         exponax = importlib.import_module("exponax")

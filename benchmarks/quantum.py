@@ -34,9 +34,9 @@ import jax.numpy as jnp
 import numpy as np
 import scipy.sparse as sparse
 from jaxtyping import Array, Complex, Float
-from scipy.integrate import solve_ivp
 
 import cfjax
+import on_host
 import results
 from cfjax.scenes import annealing, transmon
 
@@ -356,13 +356,10 @@ def by_scipy(problem: Problem, args: Any) -> Any:
     operators = problem.operators()
 
     def rate(t, y):
-        y = y.reshape(problem.y0.shape)
         pairs = zip(problem.coefficients(t, args, np), operators, strict=True)
-        return np.ravel(-1j * sum(c * (h @ y) for c, h in pairs))
+        return -1j * sum(c * (h @ y) for c, h in pairs)
 
-    psi0 = problem.y0.ravel()
-    sol = solve_ivp(rate, (0.0, problem.t1), psi0, "DOP853", rtol=1e-13, atol=1e-15)
-    return sol.y[:, -1].reshape(problem.y0.shape)
+    return on_host.solve(rate, problem.t1, problem.y0, rtol=1e-13, atol=1e-15)
 
 
 def measure(quick: bool) -> Iterator[results.Row]:

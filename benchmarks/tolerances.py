@@ -15,9 +15,9 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array
 from matplotlib.figure import Figure
-from scipy.integrate import solve_ivp
 
 import cfjax
+import on_host
 import results
 from cfjax._measure import style as _style
 from cfjax._measure.cost import Problem, calls_of_steps
@@ -150,12 +150,7 @@ def _batch() -> np.ndarray:
 
 
 def _reference(y0: np.ndarray) -> np.ndarray:
-    def ode(t: float, y: np.ndarray) -> np.ndarray:
-        y = y.reshape(y0.shape)
-        return np.cross(y, y / rigid_body.inertia).ravel()
-
-    solution = solve_ivp(ode, (0, END), y0.ravel(), method="DOP853", rtol=2.3e-14, atol=1e-15)
-    return solution.y[:, -1].reshape(y0.shape)
+    return on_host.solve(lambda t, y: np.cross(y, y / rigid_body.inertia), END, y0, atol=1e-15)
 
 
 def draw() -> dict[str, Figure]:
