@@ -372,7 +372,7 @@ def measure(quick: bool) -> Iterator[results.Row]:
     yield {"others": ", ".join(f"{name} {versions[name]}" for name in modules if name in versions)}
     for label, problem in PROBLEMS.items():
         reference = by_cfjax(problem, "Magnus10")
-        best = jax.jit(batched(functools.partial(reference, num_steps=problem.best)))
+        best = jax.jit(batched(lambda args, solve=reference, n=problem.best: solve(args, n)))
         single_system = problem.systems(1)
         apart = error(best(single_system), by_scipy(problem, single_system[0])[None])
         yield {"problem": label, "DOP853 less Magnus10": results.digits(apart)}

@@ -71,5 +71,5 @@ class _Translation(AbstractAlgebraElement):
     def tangent(self, point: Float[Array, "3"]) -> Float[Array, "3"]:
         return self.v
 
-    def bracket(self, other: Any) -> "_Anything":
+    def bracket(self, other: Any) -> "_Translation":
         return self
