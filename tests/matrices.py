@@ -5,6 +5,7 @@ from fractions import Fraction
 
 import mpmath
 import numpy as np
+import scipy.linalg
 
 DTYPES = [np.float32, np.float64, np.complex64, np.complex128]
 # The largest norms of which `expm` has a polynomial: beyond the last one it squares.
@@ -125,3 +126,10 @@ def backward_error(polynomial, degree, length=60):
         c[k] = q[k] - sum((i * c[i] * q[k - i] for i in range(degree, k)), Fraction(0)) / k
     assert not any(c[: degree + 1])
     return [abs(float(x)) for x in c]
+
+
+def inverse_derivative_of_exp(a, basis, b):
+    """The coordinates of x with `d/dt exp(a + t x) = b exp(a)` at t = 0, by SciPy's derivatives."""
+    columns = [scipy.linalg.expm_frechet(a, e, compute_expm=False) for e in basis]
+    right = b @ scipy.linalg.expm(a)
+    return np.linalg.lstsq(np.stack(columns, -1).reshape(-1, len(basis)), right.ravel())[0]

@@ -11,24 +11,10 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from solver_table import SOLVERS
 
 import cfjax
 
-SOLVERS = {
-    name: value
-    for name, value in inspect.getmembers(cfjax)
-    if inspect.isclass(value)
-    and issubclass(value, diffrax.AbstractSolver)
-    and name
-    not in ("AbstractSolver", "CommutatorFree", "ExponentialRungeKutta", "RKMK", "Richardson")
-} | {
-    "CommutatorFree": lambda: cfjax.CommutatorFree(cfjax.third_order_b(2)),
-    "ExponentialRungeKutta": lambda: cfjax.ExponentialRungeKutta(cfjax.ETD43.tableau),
-    "RKMK": lambda: cfjax.RKMK(diffrax.Bosh3.tableau),
-    "Richardson": lambda: cfjax.Richardson(cfjax.CF2()),
-    "Splitting": lambda: cfjax.Splitting((0.5, 0.5)),
-    "Composition": lambda: cfjax.Composition(cfjax.Strang(), 4),
-}
 ON_SPHERE = np.array([0.6, 0.0, 0.8])
 SQUARE = np.array([[0.4, -0.2], [0.1, 0.3]])
 FRAME = np.linalg.qr(np.array([[1.0, 0.2], [0.5, 1.0], [0.3, -0.4]]))[0]
@@ -67,18 +53,16 @@ def noise(t, y, args, increment):
     return cfjax.Rotation(1e-3 * args * increment)
 
 
-def term_for(solver):
+def term_for(takes):
     """The rotation `unit`, or what a solver takes in its place."""
-    if isinstance(solver, cfjax.WeakOrder2 | cfjax.ShiftedNoise):
+    if takes == "noise":
         path = diffrax.VirtualBrownianTree(
             0.0, 1.0, 0.05, (3,), jax.random.key(0), levy_area=diffrax.SpaceTimeLevyArea
         )
         return diffrax.MultiTerm(cfjax.LieTerm(unit), cfjax.LieControlTerm(noise, path))
-    if solver.term_structure is diffrax.MultiTerm:
+    if takes == "terms":
         return diffrax.MultiTerm(*(cfjax.LieTerm(about(axis)) for axis in range(3)))
-    if type(solver).__name__.startswith(("ETD", "Exponential")):
-        return cfjax.LieTerm(linear)
-    return cfjax.LieTerm(of_time if type(solver).__name__.startswith("Magnus") else unit)
+    return cfjax.LieTerm({"linear part": linear, "time only": of_time}.get(takes, unit))
 
 
 FIELDS = {
@@ -163,8 +147,9 @@ def check(solver, term, y0, has_gradient):
 @pytest.mark.slow
 @pytest.mark.parametrize("name", SOLVERS)
 def test_every_solver(name):
-    solver, y0 = SOLVERS[name](), FRAME if name == "CayleyRK4" else ON_SPHERE
-    check(solver, term_for(solver), y0, has_gradient=False)
+    row = SOLVERS[name]
+    y0 = FRAME if row.takes == "columns" else ON_SPHERE
+    check(row.make(), term_for(row.takes), y0, has_gradient=False)
 
 
 @pytest.mark.slow
@@ -174,7 +159,7 @@ def test_every_field(name):
     check(cfjax.CF3(), cfjax.LieTerm(field), y0, has_gradient=True)
 
 
-def test_none_is_left_out():
+def test_no_field_is_left_out():
     fields = {
         name
         for name, value in inspect.getmembers(cfjax)

@@ -6,6 +6,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from solver_table import SOLVERS
 
 import cfjax
 
@@ -42,21 +43,19 @@ def loss(args, y0, term, solver, num_steps=20, **options):
     return jnp.sum(ys["q"] @ WEIGHTS) + jnp.sum(jnp.sin(ys["p"]))
 
 
+TERMS = {"terms": SPLIT, "any": cfjax.LieTerm(whole), "time only": cfjax.LieTerm(of_time)}
+QUICK = [("Strang", 5), ("ImplicitMidpoint", None), ("Magnus2", None)]
+SAVE_EVERY = {"BlanesMoan4": 5, "Composition": 1, "ImplicitMidpoint": 1, "Magnus4Lobatto": 5}
+SLOW = [(name, SAVE_EVERY.get(name)) for name, row in SOLVERS.items() if row.is_symmetric]
+
+
 @pytest.mark.parametrize(
-    "term, solver, save_every",
-    [
-        (SPLIT, cfjax.Strang(), 5),
-        pytest.param(SPLIT, cfjax.BlanesMoan4(), 5, marks=pytest.mark.slow),
-        pytest.param(SPLIT, cfjax.Composition(cfjax.Strang(), 4), 1, marks=pytest.mark.slow),
-        pytest.param(cfjax.LieTerm(whole), cfjax.ImplicitMidpoint(), 1, marks=pytest.mark.slow),
-        (cfjax.LieTerm(whole), cfjax.ImplicitMidpoint(), None),
-        (cfjax.LieTerm(of_time), cfjax.Magnus2(), None),
-        pytest.param(cfjax.LieTerm(of_time), cfjax.Magnus4(), None, marks=pytest.mark.slow),
-        pytest.param(cfjax.LieTerm(of_time), cfjax.Magnus4Lobatto(), 5, marks=pytest.mark.slow),
-    ],
-    ids=lambda x: type(x).__name__ if isinstance(x, diffrax.AbstractSolver) else "",
+    "name, save_every",
+    [*QUICK, *(pytest.param(*case, marks=pytest.mark.slow) for case in SLOW if case not in QUICK)],
 )
-def test_the_gradient_is_the_one_that_keeps_all_states(term, solver, save_every):
+def test_the_gradient_of_step_back_is_that_of_all_states_kept(name, save_every):
+    solver, term = SOLVERS[name].make(), TERMS[SOLVERS[name].takes]
+
     def gradient(step_back):
         options = dict(save_every=save_every, save_initial=True, step_back=step_back)
         return jax.value_and_grad(loss, (0, 1))(jnp.asarray(0.7), START, term, solver, **options)
@@ -147,7 +146,7 @@ FADING = diffrax.MultiTerm(cfjax.LieTerm(source), cfjax.LieTerm(decay))
 
 
 @pytest.mark.parametrize("throw", [True, False])
-def test_a_way_back_that_misses_the_start(throw):
+def test_step_back_that_misses_the_start(throw):
     """Of what has decayed by exp(-40) no digits are left beside the source."""
 
     def end(y0):
@@ -221,7 +220,7 @@ def test_the_error_where_the_start_has_no_derivative(transform, is_captured):
 
 
 @pytest.mark.slow
-def test_a_batch():
+def test_step_back_in_a_batch():
     def gradients(step_back):
         one = jax.grad(lambda args: swing(args, 20, step_back=step_back))
         return jax.jit(jax.vmap(one))(jnp.asarray([0.2, 0.7]))
@@ -230,7 +229,7 @@ def test_a_batch():
     np.testing.assert_allclose(gradients(True), gradients(False), rtol=1e-12, atol=1e-13)
 
 
-def test_what_is_refused():
+def test_step_back_refuses_other_solvers_and_options():
     term = cfjax.LieTerm(whole)
     with pytest.raises(ValueError, match=r"step_back takes a symmetric solver, .* got CF4"):
         loss(jnp.asarray(0.7), START, term, cfjax.CF4(), step_back=True)

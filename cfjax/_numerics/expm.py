@@ -34,7 +34,7 @@ class Scheme(NamedTuple):
 # method from random starts, refined in 60 digits and rounded to double so that 1/2! to 1/6! come
 # out within 1e-17: an error of 1/2! is one of exp(a)ᵀ exp(a), the same in every step. theta is
 # where the backward error of the rest of the series reaches half a unit in the last place.
-# tests/numerics/test_exponentials.py derives both again.
+# tests/numerics/test_expm.py derives both again.
 _DEGREE_15 = Scheme(
     powers=2,
     theta=2.346,

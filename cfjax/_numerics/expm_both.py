@@ -28,7 +28,7 @@ _ODD = (
     (1 / 6, 5275939 / 945945000, 509 / 363242880),
 )
 # Where the backward error reaches half a unit in the last place.
-# tests/numerics/test_exponentials.py derives the weights and these.
+# tests/numerics/test_expm_both.py derives the weights and these.
 _THETA = {"float32": 2.645, "float64": 0.862}
 
 

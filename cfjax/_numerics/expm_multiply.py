@@ -17,7 +17,7 @@ from .squaring import max_over_batch
 
 # Of Taylor polynomials of growing degree, beginning with these, the largest norm for which they
 # have a backward error below half a unit in the last place; up to where the terms grow and cancel.
-# As in Table 3.1 of Al-Mohy & Higham; tests/numerics/test_kernels.py derives them.
+# As in Table 3.1 of Al-Mohy & Higham; tests/numerics/test_expm_multiply.py derives them.
 FIRST_DEGREE = {"float32": 3, "float64": 5}
 LONGEST = {
     "float32": [

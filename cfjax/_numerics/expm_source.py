@@ -6,7 +6,7 @@ from .expm import TAYLOR_SCHEMES, by_norm, in_full_register, taylor_from_second
 from .matmul import plus_identity, small_product
 
 # The backward error in the source has a factor k in its k-th term, so norms must be smaller.
-# tests/numerics/test_exponentials.py derives it.
+# tests/numerics/test_expm_source.py derives it.
 _SMALLER = 0.83
 
 # Block matrices `[[a, q], [0, b^H]]`.

@@ -1,18 +1,13 @@
 """Coefficients of commutator-free Magnus methods: every word, the nodes, symmetry."""
 
-import inspect
 from math import factorial, prod
 
 import numpy as np
 import pytest
+from solver_table import solvers
 
-import cfjax
-
-TABLEAUS = {
-    name: value.tableau
-    for name, value in inspect.getmembers(cfjax)
-    if hasattr(getattr(value, "tableau", None), "nodes")
-}
+METHODS = solvers("Magnus")
+TABLEAUS = {name: row.make().tableau for name, row in METHODS.items()}
 # Rounded coefficients in products of floats: sums of some hundred terms, less than one in all.
 ROUNDING = 1e-15
 
@@ -67,32 +62,22 @@ def rows_at(tableau, theta):
     return [powers @ np.array(flow) for flow in tableau.continuous_extension]
 
 
-def test_every_method_is_here():
-    assert sorted(TABLEAUS) == [
-        "Magnus10",
-        "Magnus2",
-        "Magnus4",
-        "Magnus4Lobatto",
-        "Magnus6",
-        "Magnus8",
-    ]
-
-
 @pytest.mark.parametrize("name", TABLEAUS)
 def test_the_order_by_every_word(name):
-    tableau = TABLEAUS[name]
-    found = defects(tableau.nodes, tableau.rows, tableau.order + 1)
-    assert found[: tableau.order + 1].max() < ROUNDING
-    assert found[tableau.order + 1] > 1e-8
+    tableau, order = TABLEAUS[name], METHODS[name].order
+    found = defects(tableau.nodes, tableau.rows, order + 1)
+    assert found[: order + 1].max() < ROUNDING
+    assert found[order + 1] > 1e-8
+    assert tableau.order == order
 
 
-@pytest.mark.parametrize("name", [name for name in TABLEAUS if TABLEAUS[name].embedded])
+@pytest.mark.parametrize("name", [name for name, row in METHODS.items() if row.embedded])
 def test_the_order_of_the_embedded_method_by_every_word(name):
-    tableau = TABLEAUS[name]
-    order = tableau.embedded_order
+    tableau, order = TABLEAUS[name], METHODS[name].embedded
     found = defects(tableau.nodes, tableau.embedded, order + 1)
     assert found[: order + 1].max() < ROUNDING
     assert found[order + 1] > 1e-4
+    assert tableau.embedded_order == order
     # It sees what quadrature on all nodes does not: a single letter of that degree, or the nodes'
     # own weights would be those of every method.
     single = weights(tableau.nodes, tableau.embedded, order + 1)[order + 1,]
@@ -107,8 +92,7 @@ def test_the_order_of_the_embedded_method_by_every_word(name):
 @pytest.mark.parametrize("theta", [0.25, 0.9])
 @pytest.mark.parametrize("name", TABLEAUS)
 def test_the_order_within_a_step_by_every_word(name, theta):
-    tableau = TABLEAUS[name]
-    order = max(1, tableau.order - 1)
+    tableau, order = TABLEAUS[name], METHODS[name].output
     found = defects(tableau.nodes, rows_at(tableau, theta), order + 1, theta)
     # The coefficients are up to 3000, of both signs.
     assert found[: order + 1].max() < 1e-12

@@ -10,7 +10,8 @@ import hypothesis
 import hypothesis.strategies as st
 import numpy as np
 import pytest
-from extended import FLOWS, SERIES
+from solver_table import COMMUTATOR_FREE, MUNTHE_KAAS
+from solver_table import named as named_solvers
 
 import cfjax
 from cfjax import Tableau, error_constant, order, third_order_a, third_order_b
@@ -32,13 +33,7 @@ LIE_EULER, CF2, CF3, CF4, CG3, CG4, CG5 = (
 )
 
 ORDERS = {
-    "LIE_EULER": (LIE_EULER, 1),
-    "CF2": (CF2, 2),
-    "CF3": (CF3, 3),
-    "CF4": (CF4, 4),
-    "CG3": (CG3, 3),
-    "CG4": (CG4, 4),
-    "CG5": (CG5, 5),
+    name: (row.make().tableau, row.order) for name, row in named_solvers("commutator-free").items()
 }
 named = pytest.mark.parametrize(("tableau", "q"), ORDERS.values(), ids=ORDERS.keys())
 
@@ -426,11 +421,14 @@ def weights_at(continuous_extension, theta):
     ]
 
 
+FLOWS = named_solvers("commutator-free", "low-storage") | COMMUTATOR_FREE
+
+
 @pytest.mark.representatives(8)
-@pytest.mark.parametrize("solver, order", FLOWS.values(), ids=FLOWS)
-def test_the_order_conditions_of_the_continuous_extension(solver, order):
+@pytest.mark.parametrize("name", FLOWS)
+def test_the_order_conditions_of_the_continuous_extension(name):
     """Its weights must be `theta^n` times those of the exact solution, for words of order n."""
-    tableau = solver.tableau
+    tableau, order = FLOWS[name].make().tableau, FLOWS[name].output
     within = continuous_extension(tableau)
     # Exact where the tableau is; Fraction(2) / 3 and 2.0 / 3 are both right below.
     is_exact = tableau.is_exact and tableau.continuous_extension is not None
@@ -466,7 +464,7 @@ def test_the_order_conditions_of_the_continuous_extension(solver, order):
 
     # Coefficients up to 10 that are rounded, in products of up to four that are rarely all large;
     # or exact. In YRK135, up to 12, they grow and cancel: 12^4 units of rounding are 2e-12.
-    tolerance = 0 if is_exact else 2e-14 if solver != cfjax.YRK135() else 1e-12
+    tolerance = 0 if is_exact else 2e-14 if name != "YRK135" else 1e-12
     for theta in (number(1) / 7, number(1) / 2, number(1)):
         for n in range(1, order + 1):
             assert defect(n, theta) <= tolerance
@@ -478,9 +476,10 @@ def test_the_order_conditions_of_the_continuous_extension(solver, order):
         np.testing.assert_allclose(np.array(row, float), np.array(rest, float), rtol=0, atol=1e-14)
 
 
-@pytest.mark.parametrize("solver, order", SERIES.values(), ids=SERIES)
-def test_the_order_conditions_in_the_algebra(solver, order):
+@pytest.mark.parametrize("name", MUNTHE_KAAS)
+def test_the_order_conditions_in_the_algebra(name):
     """Those of continuous Runge-Kutta methods, tree by tree, at every stage by recursion."""
+    solver, order = MUNTHE_KAAS[name].make(), MUNTHE_KAAS[name].output
     a = solver.a[: len(solver.b)]
     (powers,), more, times = runge_kutta_extension(a, solver.b, solver.order(None))
     rows = (*a, *more)
@@ -511,8 +510,8 @@ def test_a_method_that_needs_the_field_at_the_end_of_the_step_evaluates_it():
     """The methods of order 5 whose stages reach order 3 only."""
     assert {
         name
-        for name, (solver, _) in FLOWS.items()
-        if any(map(solver.tableau.uses_last, continuous_extension(solver.tableau)))
+        for name, row in FLOWS.items()
+        if any(map((tableau := row.make().tableau).uses_last, continuous_extension(tableau)))
     } == {"CF54", "CG5"}
 
 

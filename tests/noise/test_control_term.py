@@ -15,6 +15,7 @@ import problems
 import pytest
 from brownian_paths import GivenStep
 from brownian_paths import noise_of as omega_of
+from solver_table import solvers
 
 import cfjax
 
@@ -22,7 +23,7 @@ Y0 = jnp.asarray(problems.MOMENTUM)
 W = jnp.asarray([0.4, -0.3])
 H = jnp.asarray([0.05, 0.12])
 GIVEN = GivenStep(W, H)
-PIECES: Any = [cfjax.WeakOrder2(), cfjax.ShiftedNoise()]
+PIECES: Any = [row.make() for row in solvers("noise").values()]
 SOLVERS: Any = [cfjax.CF4(), *PIECES, cfjax.RKMK4()]
 by_name = pytest.mark.parametrize("solver", SOLVERS, ids=lambda x: type(x).__name__)
 
@@ -223,7 +224,7 @@ def test_noise_of_plain_numbers(solver):
 
 
 @pytest.mark.parametrize("way", ["diffeqsolve", pytest.param("integrate", marks=pytest.mark.slow)])
-def test_there_and_back(way):
+def test_noise_there_and_back(way):
     """With fields that do not depend on the state, the way back undoes every piece."""
     solver = cfjax.WeakOrder2()
 
@@ -527,12 +528,12 @@ def test_step_doubling_controls_the_error():
 # Marks and orders
 
 
-def test_marks_and_orders():
+def test_ito_and_stratonovich_marks_and_strong_orders():
     term, ode = term_of(GIVEN), cfjax.LieTerm(drift)
-    solvers: Any = [cfjax.CF2(), cfjax.CF4(), cfjax.CF43(), cfjax.CG4(), cfjax.RKMK4()]
-    solvers += [cfjax.Luscher3(), cfjax.CFEES25(), cfjax.CayleyRK4(), cfjax.RKMK8(), cfjax.CF54()]
-    solvers += [*PIECES, cfjax.Strang(), cfjax.BlanesMoan4()]
-    for solver in solvers:
+    kinds = "commutator-free", "low-storage", "Munthe-Kaas", "retraction", "splitting", "noise"
+    of_stratonovich = [row.make() for row in solvers(*kinds).values()]
+    of_stratonovich.remove(cfjax.LieEuler())
+    for solver in of_stratonovich:
         assert isinstance(solver, diffrax.AbstractStratonovichSolver)
         assert not isinstance(solver, diffrax.AbstractItoSolver)
         assert solver.strong_order(term) == 0.5
@@ -561,159 +562,10 @@ def test_diffrax_does_not_warn():
     )
 
 
-# Linear in the increment
-
-A = np.array([[2.0, 0.1, 0.0], [0.3, 1.0, 0.2], [0.0, -0.4, 3.0]])
-DECAY = -np.arange(3.0)
-
-
-@jax.custom_jvp
-def with_a_rule(x):
-    return 2 * x
-
-
-with_a_rule.defjvp(lambda x, dx: (with_a_rule(*x), 2 * dx[0]))
-
-
-class Kept(eqx.Module):
-    """A field with an array that a compiled program does not know."""
-
-    rest: Any
-
-    def __call__(self, t, y, args, dw):
-        return cfjax.LinearAffine(self.rest, dw)
-
-
-def on_host(dw):
-    shape = jax.ShapeDtypeStruct(dw.shape, dw.dtype)
-    return jax.pure_callback(lambda x: 2 * np.asarray(x), shape, dw, vmap_method="sequential")
-
-
-LINEAR: dict[str, Any] = {
-    "product": lambda y, a, dw: y * dw * a,
-    "Rotation": lambda y, a, dw: cfjax.Rotation(jnp.cross(y, dw) + A @ dw),
-    "stack": lambda y, a, dw: cfjax.Rotation(jnp.stack([dw[0], 0.0, dw[2] * y[1]])),
-    "entry": lambda y, a, dw: jnp.zeros(3).at[1].set(dw[0]),
-    "all entries": lambda y, a, dw: y.at[:].set(dw),
-    "gather": lambda y, a, dw: dw[jnp.argsort(y)],
-    "where": lambda y, a, dw: jnp.where(y > 0.5, dw, 0.0),
-    "cond": lambda y, a, dw: jax.lax.cond(y[0] > 0, lambda x: x, lambda x: 2 * x, dw),
-    "loop": lambda y, a, dw: jax.lax.fori_loop(0, 3, lambda k, c: c + y[k] * dw, jnp.zeros(3)),
-    "jit": lambda y, a, dw: jax.jit(lambda x: x * y)(dw),
-    "custom_jvp": lambda y, a, dw: with_a_rule(dw),
-    "jvp": lambda y, a, dw: jax.jvp(lambda y: jnp.sin(y) * y, (y,), (dw,))[1],
-    "solve": lambda y, a, dw: jnp.linalg.solve(A + jnp.diag(y), dw),
-    "fft": lambda y, a, dw: jnp.fft.irfft(jnp.fft.rfft(dw) * jnp.fft.rfft(y), 3),
-    "lineax": lambda y, a, dw: lx.linear_solve(lx.MatrixLinearOperator(A * a), dw).value,
-    "host": lambda y, a, dw: on_host(dw),
-    # Linear, but not as far as the program shows.
-    "unit vector": lambda y, a, dw: dw / jnp.linalg.norm(dw) * jnp.linalg.norm(dw),
-    "matrix": lambda y, a, dw: cfjax.LeftMatrix(dw[0] * a * A),
-    "Affine": lambda y, a, dw: cfjax.Affine(dw[0], dw, DECAY),
-    "Affine, zero": lambda y, a, dw: cfjax.Affine(0.0, dw, DECAY, cfjax.SineTransform()),
-    "LinearAffine, zero": lambda y, a, dw: cfjax.LinearAffine(np.zeros((3, 3)), dw),
-    "kept zeros": lambda y, a, dw: Kept(jnp.zeros((3, 3)))(0, y, a, dw),
-    "operators": lambda y, a, dw: cfjax.OperatorSum(dw * a, [A, A - 1, A.T]),
-    "times zero": lambda y, a, dw: 0.0 * y + dw,
-}
-DRIFTS: dict[str, Any] = {
-    "of the state": lambda y, a, dw: y * dw - y,
-    "of a parameter": lambda y, a, dw: dw - a * y,
-    "Rotation": lambda y, a, dw: cfjax.Rotation(y * dw - y),
-    "Rotation, of a parameter": lambda y, a, dw: cfjax.Rotation(dw - a * y),
-    "alone": lambda y, a, dw: cfjax.Rotation(-y),
-    "Affine": lambda y, a, dw: cfjax.Affine(1.0, dw, DECAY),
-    "LinearAffine": lambda y, a, dw: cfjax.LinearAffine(-a * A, dw),
-}
-NOT_LINEAR: dict[str, Any] = {
-    "square": lambda y, a, dw: y * dw**2,
-    "product": lambda y, a, dw: cfjax.Rotation(dw * dw[0]),
-    "sine": lambda y, a, dw: y * jnp.sin(dw),
-    "sign": lambda y, a, dw: y * jnp.sign(dw),
-    "rectified": lambda y, a, dw: y * jnp.maximum(dw, 0.0),
-    "apply": lambda y, a, dw: dw.at[0].apply(jnp.sin),
-    "integers": lambda y, a, dw: dw.astype(int).astype(float),
-}
-THREE = diffrax.UnsafeBrownianPath((3,), jax.random.key(0))
-
-
-def of_three(field):
-    return cfjax.LieControlTerm(lambda t, y, args, dw: field(y, args, dw), THREE)
-
-
-def checks(field, y=Y0):
-    cfjax.check_terms(of_three(field), jnp.asarray(0.0), y, jnp.asarray(0.5))
-
-
-@pytest.mark.parametrize("name", LINEAR)
-def test_fields_that_are_linear(name):
-    checks(LINEAR[name])
-
-
-@pytest.mark.parametrize("name", DRIFTS)
-def test_a_drift_in_the_field_of_the_noise(name):
-    with pytest.raises(ValueError, match=r"zero where the increment is zero.*LieTerm\(drift"):
-        checks(DRIFTS[name])
-
-
-@pytest.mark.parametrize("name", NOT_LINEAR)
-def test_fields_that_are_not_linear(name):
-    with pytest.raises(ValueError, match="that of a sum of two increments is not the sum of their"):
-        checks(NOT_LINEAR[name])
-
-
-def test_a_drift_is_seen_where_the_start_is_special():
-    """At zero that of an Ornstein-Uhlenbeck process is zero."""
-    with pytest.raises(ValueError, match="not zero where the increment is zero"):
-        checks(DRIFTS["of a parameter"], jnp.zeros(3))
-
-
-def test_increments_of_several_parts_and_complex_ones():
-    def field(t, y, args, dw):
-        return {"a": y["a"] * dw["x"], "b": 1j * y["b"] * dw["z"].astype(complex), "c": None}
-
-    shapes = {"x": jax.ShapeDtypeStruct((), float), "z": jax.ShapeDtypeStruct((2,), float)}
-    path = diffrax.UnsafeBrownianPath(shapes, jax.random.key(0))
-    y = {"a": jnp.ones(3), "b": jnp.ones(2, complex), "c": jnp.ones(1)}
-    cfjax.check_terms(cfjax.LieControlTerm(field, path), jnp.asarray(0.0), y)
-
-    def with_drift(t, y, args, dw):
-        return {**field(t, y, args, dw), "c": y["c"]}
-
-    at_rest = cfjax.LieTerm(lambda t, y, args: dict.fromkeys("abc"))
-    both = diffrax.MultiTerm(at_rest, cfjax.LieControlTerm(with_drift, path))
-    with pytest.raises(ValueError, match=r"terms\[1\]: The field of a cfjax.LieControlTerm must"):
-        cfjax.check_terms(both, jnp.asarray(0.0), y)
-
-
-def test_check_field_names_the_check_of_terms(no_shape_hook):
-    terms: Any = [of_three(LINEAR["product"])] * 2
-    with pytest.raises(TypeError, match=r"For terms there is cfjax\.check_terms"):
-        cfjax.check_field(terms, Y0)
-
-
-@pytest.mark.parametrize("solver", [cfjax.CF2(), diffrax.Euler()], ids=["CF2", "Euler"])
-def test_a_solve_refuses_a_drift_in_the_noise(solver):
-    """When it is traced, whichever the solver."""
-    solve = partial(cfjax.integrate, of_three(DRIFTS["of the state"]), solver, 0.0, 1.0, Y0)
-    with pytest.raises(ValueError, match="not zero where the increment is zero"):
-        solve(num_steps=2)
-
-
-def test_what_a_program_does_not_show_is_an_error_of_the_start():
-    term = of_three(DRIFTS["of a parameter"])
-    solve = partial(cfjax.integrate, term, cfjax.CF2(), 0.0, 1.0, Y0, num_steps=2)
-    with pytest.raises(RuntimeError, match="not zero where the increment is zero"):
-        solve(jnp.asarray(0.5))
-    # For the parameter zero there is no drift.
-    ends = jax.vmap(lambda a: solve(a, throw=False).ys[-1])(jnp.asarray([0.0, 0.5]))
-    np.testing.assert_array_equal(np.isfinite(ends), [[True] * 3, [False] * 3])
-
-
 # Errors
 
 
-def test_arguments_of_the_term(no_shape_hook):
+def test_wrong_arguments_of_the_control_term(no_shape_hook):
     with pytest.raises(TypeError, match="field must be a function of t, y, args and increment"):
         cfjax.LieControlTerm(1.0, GIVEN)
     with pytest.raises(TypeError, match=r"control must be a diffrax.AbstractPath, such as"):
@@ -751,42 +603,3 @@ def test_methods_that_refuse_noise():
         cfjax.integrate(term, cfjax.Magnus4(), 0.0, 1.0, Y0, num_steps=2)
     with pytest.raises(TypeError, match=re.escape("use diffrax.HalfSolver(solver)")):
         cfjax.integrate(term, cfjax.Richardson(cfjax.CF4()), 0.0, 1.0, Y0, num_steps=2)
-
-
-@pytest.mark.parametrize("solver", PIECES, ids=lambda x: type(x).__name__)
-def test_what_methods_of_pieces_refuse(solver, no_shape_hook):
-    name = type(solver).__name__
-
-    def solve(term, solver=solver):
-        return cfjax.integrate(term, solver, 0.0, 1.0, Y0, num_steps=2)
-
-    with pytest.raises(TypeError, match=f"{name} is for equations with noise, and no term has a"):
-        solve(cfjax.LieTerm(drift))
-    plain = diffrax.UnsafeBrownianPath((2,), jax.random.key(0))
-    with pytest.raises(TypeError, match="got levy_area=BrownianIncrement: write"):
-        solve(term_of(plain))
-    smooth = diffrax.LinearInterpolation(jnp.arange(2.0), jnp.ones((2, 2)))
-    with pytest.raises(TypeError, match="got LinearInterpolation"):
-        solve(term_of(smooth))
-    with pytest.raises(ValueError, match="solver must have order 3 or more, got CF2"):
-        type(solver)(cfjax.CF2())
-    with pytest.raises(TypeError, match=f"{name} needs a solver of order 4 where the noise's"):
-        solve(term_of(GIVEN), type(solver)(cfjax.CF3()))
-    for wrong in (diffrax.Heun(), cfjax.Magnus4(), cfjax.Richardson(cfjax.CF4()), solver, None):
-        with pytest.raises(TypeError, match="solver must be a commutator-free or Munthe-Kaas"):
-            type(solver)(wrong)
-
-
-def test_the_noise_solver_of_shifted_noise(no_shape_hook):
-    with pytest.raises(TypeError, match="noise_solver must be a commutator-free or Munthe-Kaas"):
-        cfjax.ShiftedNoise(noise_solver=diffrax.Heun())
-    low = cfjax.ShiftedNoise(noise_solver=cfjax.LieEuler())
-    with pytest.raises(TypeError, match="ShiftedNoise needs a noise_solver of order 4 where"):
-        step(low, term_of(GIVEN))
-
-    def constant(t, y, args, dw):
-        return cfjax.Rotation(jnp.concatenate([dw, dw[:1]]))
-
-    # Of fields that do not depend on the state one flow is exact.
-    term = terms(cfjax.LieControlTerm(constant, GIVEN))
-    close(step(low, term), step(cfjax.ShiftedNoise(noise_solver=cfjax.CF4()), term))

@@ -6,9 +6,10 @@ import mpmath
 import numpy as np
 import pytest
 import scipy.linalg
-from matrices import DTYPES, POSE, exact_expm, random, small, to_numpy
+from matrices import DTYPES, POSE, backward_error, exact_expm, random, small, to_numpy
 
 from cfjax import Conjugation, LeftMatrix, expm
+from cfjax._numerics import cayley_hamilton
 
 mapped = jax.jit(jax.vmap(expm))
 
@@ -151,3 +152,11 @@ def test_a_conjugation_keeps_eigenvalues():
     # Units of rounding, as large as the factors are.
     atol = 40 * 2.0**-52 * np.linalg.cond(e) * np.linalg.norm(x)
     np.testing.assert_allclose(y, e @ x @ np.linalg.inv(e), rtol=0, atol=atol)
+
+
+@pytest.mark.parametrize(("precision", "norm"), [("float32", 1.7), ("float64", 1.8)])
+def test_degrees_of_sizes_2_and_3_are_enough(precision, norm):
+    degree = cayley_hamilton._DEGREE[precision]
+    log = backward_error([0] * (degree + 1), degree)
+    unit = 2.0**-24 if precision == "float32" else 2.0**-53
+    assert sum(c * norm ** (k - 1) for k, c in enumerate(log)) <= unit

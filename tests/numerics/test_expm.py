@@ -2,6 +2,7 @@
 
 import inspect
 import math
+from fractions import Fraction
 
 import jax
 import jax.numpy as jnp
@@ -9,9 +10,16 @@ import mpmath
 import numpy as np
 import pytest
 import scipy.linalg
-from matrices import THETA
+from matrices import POSE, THETA, backward_error, coefficients, exact_expm, small, to_numpy
 
 from cfjax import expm
+from cfjax._numerics.expm import (
+    _DEGREE_15,
+    _DEGREE_15_DOUBLE,
+    _DEGREE_21,
+    TAYLOR_SCHEMES,
+    expm_parts,
+)
 
 # One compilation for each size and dtype keeps this file fast.
 compiled = jax.jit(expm)
@@ -357,3 +365,88 @@ def test_second_derivative_of_a_size_with_two_schemes(norm):
     exact = np.sum(a @ a @ scipy.linalg.expm(norm * a))
     # 36 entries, each of at most three factors that lose as in test_accuracy.
     assert abs(float(entry(norm)) - exact) <= 36 * 3 * 4 * 6 * 2.3e-16
+
+
+def test_expm_of_an_array_of_numpy(no_shape_hook):
+    a = np.array([[0.0, -0.5], [0.5, 0.0]])
+    expected = [[np.cos(0.5), -np.sin(0.5)], [np.sin(0.5), np.cos(0.5)]]
+    np.testing.assert_allclose(expm(a), expected, rtol=0, atol=1e-15)
+    slope = jax.jvp(lambda t: expm(t * a), (0.0,), (1.0,))[1]
+    np.testing.assert_allclose(slope, a, rtol=0, atol=1e-15)
+    with pytest.raises(ValueError, match=r"`a` must be a square matrix, shape \(n, n\), got"):
+        expm(np.ones((2, 3)))
+
+
+# Polynomials
+
+SCHEMES = pytest.mark.parametrize(
+    ("scheme", "degree", "unit"),
+    [
+        (_DEGREE_15, 15, 2.0**-24),
+        (_DEGREE_15_DOUBLE, 15, 2.0**-53),
+        (_DEGREE_21, 21, 2.0**-53),
+    ],
+)
+
+
+@SCHEMES
+def test_polynomial_is_the_taylor_polynomial(scheme, degree, unit):
+    del unit
+    got = coefficients(scheme)
+    assert got[0] == got[1] == 1
+    for k in range(2, degree + 1):
+        # Rounding the weights to double moves a coefficient by at most 2.8e-16 (computed here).
+        assert abs(float(got[k] * math.factorial(k) - 1)) < 4e-16
+    # The degrees above are not Taylor's, or the name of the scheme would be wrong.
+    assert all(
+        abs(float(got[k] * math.factorial(k) - 1)) > 0.1 for k in range(degree + 1, len(got))
+    )
+
+
+@pytest.mark.parametrize("scheme", [_DEGREE_15, _DEGREE_21])
+def test_the_first_coefficients_have_no_bias(scheme):
+    """What they are off by is the same in every step, and drift grows with the number of steps."""
+    got = coefficients(scheme)
+    for k in range(2, 7):
+        assert abs(float(got[k] - Fraction(1, math.factorial(k)))) < 1e-17
+
+
+@SCHEMES
+def test_theta_is_where_the_backward_error_reaches_the_unit_roundoff(scheme, degree, unit):
+    log = backward_error(coefficients(scheme), degree)
+
+    def backward(x):
+        return sum(c * x ** (k - 1) for k, c in enumerate(log) if k > degree)
+
+    assert backward(scheme.theta) <= unit < backward(scheme.theta * 1.001)
+
+
+def test_theta_of_each_scheme():
+    for precision, thetas in THETA.items():
+        assert tuple(scheme.theta for scheme in TAYLOR_SCHEMES[precision]) == thetas
+
+
+# The rest of exp(a)
+
+
+@pytest.mark.parametrize("dtype", [np.float32, np.complex128])
+@pytest.mark.parametrize("n", [2, 3])
+def test_the_rounding_of_the_rest_is_as_small_as_it_is(n, dtype):
+    cases = [(kind, norm) for kind in ("skew", "meet", "general") for norm in (1e-6, 1e-3, 0.5)]
+    a = np.stack([small(kind, n, norm, 0, dtype) for kind, norm in cases])
+    weights, found = jax.jit(jax.vmap(expm_parts))(a)
+    assert (np.asarray(weights) == 1).all()
+    for x, rest in zip(a, np.asarray(found), strict=True):
+        with mpmath.workdps(60):
+            m = mpmath.matrix(x.tolist())
+            exact = to_numpy(exact_expm(x) - mpmath.eye(n) - m)
+        # Those of c, and of one product, relative to the square of a, which for real skew matrices
+        # of size 2 is no smaller than the norm squared.
+        atol = 8 * np.finfo(dtype).eps * np.linalg.norm(x) ** 2
+        np.testing.assert_allclose(rest, exact, rtol=0, atol=atol)
+
+
+def test_the_rest_of_a_pose_far_away():
+    weight, rest = expm_parts(jnp.asarray(POSE))
+    assert weight == 1
+    assert np.array_equal(rest[2], np.zeros(3))

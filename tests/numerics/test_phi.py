@@ -95,7 +95,7 @@ def test_derivatives_at_zero_in_reverse(dtype):
         f = jax.grad(f)
 
 
-def test_modes_agree():
+def test_forward_and_reverse_mode_agree():
     z = jnp.asarray(np.concatenate([[0.0], -MAGNITUDES, MAGNITUDES[:-1]]))
     forward = jax.vmap(jax.jvp, in_axes=(None, 0, 0))(phi_1, (z,), (jnp.ones_like(z),))[1]
     reverse = jax.vmap(jax.grad(phi_1))(z)
@@ -122,7 +122,7 @@ def test_second_reverse_pass_through_a_checkpointed_loop():
 
 
 @pytest.mark.parametrize("dtype", [np.float32, np.float64])
-def test_what_is_not_finite(dtype):
+def test_phi_1_of_nan_infinity_and_what_overflows(dtype):
     z = jnp.asarray([np.nan, -np.inf, np.inf, 1e4], dtype)
     found = np.asarray(phi_1(z))
     assert np.isnan(found[0])

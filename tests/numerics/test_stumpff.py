@@ -4,12 +4,13 @@ import math
 
 import jax
 import jax.numpy as jnp
-import mpmath
+import mpmath as mp
 import numpy as np
 import pytest
 from problems import SQUARES_OF_ANGLES
 
 from cfjax import Rotation, stumpff
+from cfjax._numerics.stumpff import cotangent_excess, stumpff_1_to_3_apart
 
 ORDERS = 3
 DTYPES = pytest.mark.parametrize("dtype", [np.float32, np.float64])
@@ -20,13 +21,13 @@ def reference(n, s):
 
     The largest term is below exp(x), which costs x / log(10) digits of those carried.
     """
-    with mpmath.workdps(40 + int(math.sqrt(s) / 2)):
-        s = mpmath.mpf(float(s))
-        sums = [mpmath.mpf(0)] * (ORDERS + 1)
-        term = 1 / mpmath.factorial(n)  # s^j / (n + 2j)! with its sign
-        inverse = 1 / s if s else mpmath.mpf(0)
+    with mp.workdps(40 + int(math.sqrt(s) / 2)):
+        s = mp.mpf(float(s))
+        sums = [mp.mpf(0)] * (ORDERS + 1)
+        term = 1 / mp.factorial(n)  # s^j / (n + 2j)! with its sign
+        inverse = 1 / s if s else mp.mpf(0)
         j = 0
-        small = mpmath.mpf(10) ** (-mpmath.mp.dps)
+        small = mp.mpf(10) ** (-mp.mp.dps)
         while j <= ORDERS + 1 or abs(term) > small:
             # The factor j (j-1) .. of d^k and its power of s, from the term or, at zero, directly.
             power = term
@@ -35,7 +36,7 @@ def reference(n, s):
                     if s:
                         sums[k] += power
                     elif k == j:
-                        sums[k] += (-1) ** j * mpmath.factorial(j) / mpmath.factorial(n + 2 * j)
+                        sums[k] += (-1) ** j * mp.factorial(j) / mp.factorial(n + 2 * j)
                 power *= (j - k) * inverse
             j += 1
             term *= -s / ((n + 2 * j) * (n + 2 * j - 1))
@@ -109,12 +110,12 @@ def test_values_and_three_derivatives(n, dtype, exact):
 def test_many_turns(dtype):
     # x = 1e4 and its neighbourhood: a unit of rounding of x is all that can be asked of a sine.
     s = np.array(1e8, dtype)
-    with mpmath.workdps(40):
-        exact = mpmath.mpf(float(s))
-        x = mpmath.sqrt(exact)
-        value = [mpmath.cos(x), mpmath.sin(x) / x, (1 - mpmath.cos(x)) / exact]
+    with mp.workdps(40):
+        exact = mp.mpf(float(s))
+        x = mp.sqrt(exact)
+        value = [mp.cos(x), mp.sin(x) / x, (1 - mp.cos(x)) / exact]
         for n in range(3, 6):
-            value.append((1 / mpmath.factorial(n - 2) - value[n - 2]) / exact)
+            value.append((1 / mp.factorial(n - 2) - value[n - 2]) / exact)
     for n in range(6):
         allowed = bound(n, float(s), [abs(float(v)) for v in value], 4 * np.finfo(dtype).eps)
         assert abs(float(stumpff(n, jnp.asarray(s))) - float(value[n])) <= allowed, n
@@ -137,7 +138,7 @@ def test_taylor_coefficients_at_zero(n):
 @pytest.mark.representatives(1)
 @DTYPES
 @pytest.mark.parametrize("bad", [np.inf, np.nan])
-def test_what_is_not_finite_gives_nan(bad, dtype):
+def test_infinity_and_nan_give_nan(bad, dtype):
     for n in range(6):
         got = jax.vmap(lambda s, n=n: stumpff(n, s))(jnp.asarray([bad, 1.0], dtype))
         assert np.isnan(got[0]), n
@@ -186,3 +187,118 @@ def test_a_derivative_computes_each_function_once():
     for derivative in (turned, tangent, cotangents):
         # The length of an angle goes to its bits and back.
         assert str(jax.make_jaxpr(derivative)(x, x)).count("bitcast_convert_type") == 2
+
+
+# As it is exported
+
+
+@pytest.mark.representatives(1)
+@pytest.mark.parametrize("n", [0, 1, 3])
+def test_stumpff_takes_arrays_of_numpy_and_a_batch(n):
+    s = np.array([[0.0, 0.25], [1.0, 4.0]], np.float32)
+    x = np.sqrt(s.astype(float))
+    expected = {0: np.cos(x), 1: np.sinc(x / np.pi), 3: None}[n]
+    if expected is None:
+        expected = np.where(x > 0, (x - np.sin(x)) / np.where(x > 0, x, 1) ** 3, 1 / 6)
+    found = stumpff(n, s)
+    assert found.dtype == s.dtype
+    # Some units of rounding of numbers of order one.
+    np.testing.assert_allclose(found, expected, rtol=0, atol=8 * 2.0**-24)
+    batch = jax.vmap(lambda s: stumpff(n, s))(jnp.asarray(s))
+    np.testing.assert_allclose(batch, found, rtol=0, atol=8 * 2.0**-24)
+
+
+def test_stumpff_of_a_negative_number_is_nan():
+    s = jnp.array([-1.0, -1e-300, 0.0])
+    np.testing.assert_array_equal(np.isnan(stumpff(1, s)), [True, True, False])
+    # And it does not spread: the derivatives at zero are those of the series.
+    slope = jax.grad(lambda s: jnp.nansum(stumpff(1, s)))(s)
+    np.testing.assert_allclose(slope[2], -1 / 6, rtol=2.0**-50)
+
+
+@pytest.mark.parametrize(
+    "n, s, error, message",
+    [
+        (1.0, np.ones(2), TypeError, "n must be an int, got 1.0 of type float"),
+        (True, np.ones(2), TypeError, "n must be an int, got True of type bool"),
+        (-1, np.ones(2), ValueError, "n must be at least 0, got -1"),
+        (1, np.ones(2, int), TypeError, "s must be float32 or float64, got int64"),
+        (1, np.ones(2, complex), TypeError, "s must be float32 or float64, got complex128"),
+    ],
+)
+def test_stumpff_refuses(no_shape_hook, n, s, error, message):
+    with pytest.raises(error, match=message):
+        stumpff(n, s)
+
+
+# Stumpff functions together, and the cotangent of the inverse derivative of exp
+
+
+def three(s):
+    near, d1, d2, c3 = stumpff_1_to_3_apart(s)
+    return near + d1, near / 2 + d2, c3
+
+
+@pytest.mark.representatives(1)
+@DTYPES
+def test_stumpff_functions_1_to_3_together(dtype):
+    s = jnp.asarray(SQUARES_OF_ANGLES, dtype)
+    ones = jnp.ones_like(s)
+    for n, (got, slope) in enumerate(
+        zip(*jax.jit(lambda s: jax.jvp(three, (s,), (ones,)))(s), strict=True), start=1
+    ):
+        want, want_slope = jax.jvp(lambda s, n=n: stumpff(n, s), (s,), (ones,))
+        # The same formulas, but XLA may round them in another order: the bound of either, twice.
+        eps = 8 * np.finfo(dtype).eps
+        np.testing.assert_allclose(got, want, rtol=eps, atol=eps)
+        np.testing.assert_allclose(slope, want_slope, rtol=eps, atol=eps)
+
+
+@DTYPES
+def test_cotangent_excess(dtype):
+    """Against `(1 - x/2 cot(x/2)) / x^2` itself, with 60 digits for what cancels, and its slopes.
+
+    By differences of 60 digits, which leave 20.
+    """
+    x = np.array([0.0, 1e-20, 1e-4, 0.1, 1.0, np.pi, 4.5, 6.0, 6.2])
+    s = jnp.asarray(x * x, dtype)
+    first = jax.grad(cotangent_excess)
+    functions = cotangent_excess, first, jax.grad(first)
+    found = [jax.jit(jax.vmap(f))(s) for f in functions]
+
+    def at_angle(s):
+        x = mp.sqrt(s)
+        return (1 - x / 2 * mp.cot(x / 2)) / s
+
+    with mp.workdps(60):
+        for k, at in enumerate(s):
+            at = mp.mpf(float(at))
+            h = mp.mpf(10) ** -12
+            # The series about zero, of which the first term that is left out is below 1e-40.
+            f = at_angle if at > 1e-10 else lambda s: 1 / mp.mpf(12) + s / 720 + s**2 / 30240
+            values = [f(at + j * h) for j in (-1, 0, 1)]
+            wants = (
+                values[1],
+                (values[2] - values[0]) / (2 * h),
+                (values[2] - 2 * values[1] + values[0]) / h**2,
+            )
+            # One unit of s moves the pole by that much, each derivative once more; and a
+            # derivative of the polynomial is ten times as far off as that is.
+            near = float(4 * mp.pi**2 / (4 * mp.pi**2 - at))
+            for n, (got, want) in enumerate(zip(found, wants, strict=True)):
+                rtol = 8 * 10**n * (n + 1) * near * np.finfo(dtype).eps
+                # Markov's inequality: what a rounding of the polynomial, of degree 13 on an
+                # interval of length 4 pi^2, can be in its derivatives at an end.
+                atol = np.finfo(dtype).eps / 12 * (2 * 13**2 / (4 * np.pi**2)) ** n
+                np.testing.assert_allclose(
+                    float(got[k]), float(want), rtol, atol, err_msg=f"{n} at {at}"
+                )
+
+
+@pytest.mark.representatives(1)
+@DTYPES
+def test_cotangent_excess_is_finite_beyond_a_full_turn(dtype):
+    s = jnp.asarray([4 * math.pi**2 * 1.0001, 100.0, np.finfo(dtype).max, np.inf], dtype)
+    got, slope = jax.vmap(jax.value_and_grad(cotangent_excess))(s)
+    np.testing.assert_allclose(got, 1 / 12, rtol=4 * np.finfo(dtype).eps)
+    np.testing.assert_array_equal(slope, 0)

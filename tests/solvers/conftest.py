@@ -51,3 +51,10 @@ def body_problem():
         lambda t, y: problems.driven_body_ode(t, y, problems.INERTIA), 0.0, 1.0, problems.MOMENTUM
     )
     return problems.driven_body, problems.MOMENTUM, problems.INERTIA, answer
+
+
+@pytest.fixture(scope="session")
+def driven_top_answer():
+    """Angular momentum and attitude of the driven top at t = 1."""
+    start = np.concatenate([problems.DRIVEN_TOP_START["m"], np.eye(3).ravel()])
+    return problems.reference(problems.driven_top_ode, 0.0, 1.0, start)

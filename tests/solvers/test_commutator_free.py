@@ -14,24 +14,12 @@ import numpy as np
 import problems
 import pytest
 import scipy.linalg
+from solver_table import COMMUTATOR_FREE, named
 
 import cfjax
 
-METHODS: dict[str, cfjax.CommutatorFree] = {
-    "LieEuler": cfjax.LieEuler(),
-    "CF2": cfjax.CF2(),
-    "CF3": cfjax.CF3(),
-    "CF4": cfjax.CF4(),
-    "CF43": cfjax.CF43(),
-    "CF54": cfjax.CF54(),
-    "CG3": cfjax.CG3(),
-    "CG4": cfjax.CG4(),
-    "CG5": cfjax.CG5(),
-    "family A, 1/2": cfjax.CommutatorFree(cfjax.third_order_a(Fraction(1, 2))),
-    "family A, 1": cfjax.CommutatorFree(cfjax.third_order_a(1)),
-    "family B, 2/3": cfjax.CommutatorFree(cfjax.third_order_b(Fraction(2, 3))),
-    "family B, 0.1": cfjax.CommutatorFree(cfjax.third_order_b(0.1)),
-}  # pyright: ignore[reportAssignmentType]
+ROWS = named("commutator-free") | COMMUTATOR_FREE
+METHODS: dict[str, Any] = {name: row.make() for name, row in ROWS.items()}
 methods = pytest.mark.parametrize("solver", METHODS.values(), ids=METHODS.keys())
 
 # The step is small enough that the next order adds at most 0.1 to the slope, and the errors,

@@ -687,38 +687,6 @@ def test_solvers_of_linear_spaces_refuse_frozen_fields(solver):
             cfjax.integrate(TERM, solver, 0.0, 1.0, Y0, ARGS, num_steps=2)
 
 
-def test_a_class_in_place_of_a_solver_is_refused():
-    for solver in (cfjax.CF4, cfjax.RKMK4, cfjax.CayleyRK4):
-        message = rf"must be an instance, {solver.__name__}\(\), got the class"
-        with pytest.raises(AttributeError, match=message):
-            solve(solver)
-
-
-def still(t, y, args):
-    return cfjax.LowRankSkew(jnp.zeros_like(y))
-
-
-@pytest.mark.representatives(1)
-@pytest.mark.parametrize("bad", ["t0", "t1"])
-@pytest.mark.parametrize(
-    ("term", "solver", "y0"),
-    [
-        (TERM, cfjax.CF4(), Y0),
-        (TERM, cfjax.CF4(estimate=None), Y0),
-        (TERM, cfjax.Richardson(cfjax.RKMK4()), Y0),
-        (cfjax.LieTerm(lambda t, y, args: -y), cfjax.CF4(), Y0),
-        (cfjax.LieTerm(lambda t, y, args: -y), cfjax.RKMK3(), Y0),
-        (cfjax.LieTerm(still), cfjax.CF43(), jnp.eye(3)[:, :2]),
-    ],
-    ids=["CF4", "no estimate", "Richardson", "same as last", "plain", "Stiefel"],
-)
-def test_a_time_that_is_nan_is_an_error(bad, term, solver, y0):
-    """diffrax makes no step to it, and returns the start as a success."""
-    t0, t1 = (jnp.nan if name == bad else t for name, t in (("t0", 0.0), ("t1", 1.0)))
-    with pytest.raises(eqx.EquinoxRuntimeError, match="t0, t1 and dt0 must be numbers, got NaN"):
-        diffrax.diffeqsolve(term, solver, t0, t1, 0.5, y0, ARGS)
-
-
 @pytest.mark.slow
 @pytest.mark.parametrize("solver", [diffrax.Tsit5(), diffrax.Heun()])
 def test_solvers_of_linear_spaces_take_translations(solver):

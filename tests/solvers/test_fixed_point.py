@@ -11,7 +11,7 @@ MIDPOINT = cfjax.ImplicitMidpoint()
 BODY = np.asarray([0.48, 0.6, 0.64], np.float32)
 
 
-def test_a_part_at_rest_changes_nothing():
+def test_fixed_point_beside_a_part_at_rest():
     """Its size has no part in whether the others have converged."""
 
     def body(t, y, args):
@@ -33,7 +33,7 @@ def test_a_part_at_rest_changes_nothing():
         assert expected == (diffrax.RESULTS.successful if h < 2 else failed)
 
 
-def test_small_numbers_that_large_ones_move():
+def test_fixed_point_of_small_numbers_beside_large_ones():
     """The forces cancel to a few digits, so the momenta cannot settle to more than these."""
 
     def chain(t, y, args):
@@ -54,7 +54,7 @@ def cascade(rate, coupling):
     return -rate * np.eye(4) + coupling * np.eye(4, k=-1)
 
 
-def test_a_cascade():
+def test_fixed_point_of_a_cascade_that_is_not_normal():
     """Changes grow a thousandfold before they fall, or for ever."""
     # In steps of length 1, so the spectral radii are half of the rates.
     matrices = np.stack([cascade(0.9, 1.0), cascade(0.9, 20.0), cascade(0.9, 1e3), 4 * np.eye(4)])
@@ -83,7 +83,7 @@ def test_a_cascade():
         assert np.all(np.isnan(jacobian[3][np.eye(4, dtype=bool)]))
 
 
-def test_parts_of_several_dtypes_and_second_derivatives():
+def test_fixed_point_of_several_dtypes_and_its_second_derivatives():
     def field(t, y, args):
         return {"z": 1j * y["z"], "x": -(y["x"] ** 2), "low": -y["low"]}
 

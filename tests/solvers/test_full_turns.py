@@ -25,7 +25,7 @@ def reference(t1, args):
 
 
 @pytest.mark.parametrize("estimate", ["algebra", pytest.param("group", marks=pytest.mark.slow)])
-def test_a_controlled_step_is_taken_again(estimate):
+def test_a_controlled_step_of_a_full_turn_is_taken_again(estimate):
     def solve(args):
         return diffrax.diffeqsolve(
             cfjax.LieTerm(tumbling),
@@ -78,7 +78,7 @@ FIELDS = {
 
 @pytest.mark.representatives(3)
 @pytest.mark.parametrize("name", FIELDS)
-def test_the_bound_of_each_closed_form(name):
+def test_the_bound_of_dexpinv_in_closed_form(name):
     """Equal steps of a constant field: right below 2 pi, an error from there on."""
     make, y0 = FIELDS[name]
     term = cfjax.LieTerm(lambda t, y, angle: make(angle * jnp.asarray([0.0, 0.0, 1.0])))
@@ -101,7 +101,7 @@ def test_the_bound_of_each_closed_form(name):
         cfjax.integrate(term, cfjax.RKMK5(), 0.0, 1.0, y0, above, num_steps=1)
 
 
-def test_rolled_stages():
+def test_a_full_turn_in_rolled_stages():
     """A stage beyond the bound is found where the stages are one loop, too."""
     term = cfjax.LieTerm(tumbling)
     for unroll in (False, True):

@@ -1,41 +1,28 @@
 """Low-storage methods: the same step as their tableau's, in two copies of the state."""
 
-from typing import Any
-
 import diffrax
 import jax
 import jax.numpy as jnp
 import numpy as np
 import problems
 import pytest
+from solver_table import solvers
 
 import cfjax
 
-# Orders, and those of the embedded methods.
-METHODS: dict[str, Any] = {
-    "Williamson3": (3, None),
-    "BWRRK33": (3, None),
-    "BWRRK53": (3, 2),
-    "CK34": (3, 2),
-    "CK54": (4, None),
-    "Luscher3": (3, 2),
-    "CFEES25": (2, 1),
-    "CFEES27": (2, None),
-    "YRK135": (5, None),
-}
+METHODS = solvers("low-storage")
 names = pytest.mark.parametrize("name", METHODS)
 
 
 @names
 def test_the_orders_by_their_conditions(name):
-    order, below = METHODS[name]
-    tableau = getattr(cfjax, name).tableau
-    assert cfjax.order(tableau) == order
-    assert tableau.num_flows == tableau.num_evaluations
-    if below is None:
+    row, tableau = METHODS[name], getattr(cfjax, name).tableau
+    assert cfjax.order(tableau) == row.order
+    assert tableau.num_flows == tableau.num_evaluations == row.evaluations
+    if row.embedded is None:
         assert tableau.embedded is None
     else:
-        assert cfjax.order(tableau.embedded_method) == below
+        assert cfjax.order(tableau.embedded_method) == row.embedded
         assert tableau.num_embedded_flows == {"Luscher3": 1, "CFEES25": 1}.get(name, 0)
 
 
@@ -71,7 +58,7 @@ def test_the_observed_order(body_problem, name):
     steps = [6, 8, 12, 16] if name == "YRK135" else [16, 32, 64, 128]
     found = problems.errors(field, getattr(cfjax, name)(), 1.0, y0, args, answer, steps)
     assert found.min() > 10 * problems.REFERENCE_ERROR
-    assert abs(problems.slope(steps, found) - METHODS[name][0]) < 0.15
+    assert abs(problems.slope(steps, found) - METHODS[name].order) < 0.15
 
 
 @pytest.mark.slow
@@ -91,7 +78,7 @@ def test_a_frame_in_coordinates_of_its_own_takes_every_stage(no_shape_hook):
 
 @pytest.mark.representatives(2)
 @names
-def test_memory_of_two_states(name):
+def test_memory_is_that_of_two_states(name):
     """As the compiler plans it: the point and the sum, and what one evaluation needs."""
     n = 1_000_000
 
@@ -111,7 +98,7 @@ def test_memory_of_two_states(name):
 
 
 @pytest.mark.representatives(1)
-@pytest.mark.parametrize("name", [name for name, (_, below) in METHODS.items() if below])
+@pytest.mark.parametrize("name", [name for name, row in METHODS.items() if row.embedded])
 def test_error_control(name):
     y0, inertia = jnp.asarray(problems.MOMENTUM), jnp.asarray(problems.INERTIA)
     answer = problems.reference(

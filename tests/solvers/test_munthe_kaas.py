@@ -13,20 +13,16 @@ import problems
 import pytest
 import scipy.integrate
 import scipy.linalg
+from solver_table import MUNTHE_KAAS, SOLVERS, Row
 
 import cfjax
 from cfjax.scenes import heavy_top, spacecraft
 
-METHODS: dict[str, Any] = {
-    "RKMK3": cfjax.RKMK3(),
-    "RKMK4": cfjax.RKMK4(),
-    "Heun": cfjax.RKMK(diffrax.Heun.tableau),
-    "Bosh3": cfjax.RKMK(diffrax.Bosh3.tableau),
-    "Dopri5": cfjax.RKMK(diffrax.Dopri5.tableau),
-    "Tsit5": cfjax.RKMK(diffrax.Tsit5.tableau),
-}
-ORDERS = {"RKMK3": 3, "RKMK4": 4, "Heun": 2, "Bosh3": 3, "Dopri5": 5, "Tsit5": 5}
-names = pytest.mark.parametrize("name", METHODS)
+ROWS: dict[str, Row] = {name: SOLVERS[name] for name in ("RKMK3", "RKMK4")} | MUNTHE_KAAS
+METHODS: dict[str, Any] = {name: row.make() for name, row in ROWS.items()}
+# A program of 13 stages is for few tests.
+SHORT = [name for name in ROWS if name != "Dopri8"]
+names = pytest.mark.parametrize("name", SHORT)
 
 # As in test_commutator_free.py. Steps down to 1/128 leave 2e-12 for order 5, 20 times the error
 # of the reference.
@@ -50,13 +46,13 @@ def observed_order(problem, solver, **kwargs) -> float:
     [
         pytest.param(side, name, marks=[pytest.mark.slow] * ((side, name) != ("left", "RKMK4")))
         for side in ("left", "right")
-        for name in METHODS
+        for name in SHORT
     ],
 )
 def test_order_on_matrices(matrix_problems, side, name):
-    solver = METHODS[name]
-    assert solver.order(None) == ORDERS[name]
-    assert abs(observed_order(matrix_problems[side], solver) - ORDERS[name]) < TOLERANCE
+    solver, order = METHODS[name], ROWS[name].order
+    assert solver.order(None) == order
+    assert abs(observed_order(matrix_problems[side], solver) - order) < TOLERANCE
 
 
 # Dopri5 and Tsit5 meet the error of the reference here before their order shows: their test is in
@@ -64,13 +60,13 @@ def test_order_on_matrices(matrix_problems, side, name):
 @pytest.mark.slow
 @pytest.mark.parametrize("name", ["RKMK3", "RKMK4", "Heun", "Bosh3"])
 def test_order_on_the_sphere(body_problem, name):
-    assert abs(observed_order(body_problem, METHODS[name]) - ORDERS[name]) < TOLERANCE
+    assert abs(observed_order(body_problem, METHODS[name]) - ROWS[name].order) < TOLERANCE
 
 
 @pytest.mark.slow
 @pytest.mark.parametrize("name", ["RKMK3", "RKMK4", "Bosh3"])
 def test_order_on_a_product_of_manifolds(flight_problem, name):
-    assert abs(observed_order(flight_problem, METHODS[name]) - ORDERS[name]) < TOLERANCE
+    assert abs(observed_order(flight_problem, METHODS[name]) - ROWS[name].order) < TOLERANCE
 
 
 class WrongSide(cfjax.LeftMatrix):
@@ -150,7 +146,7 @@ def by_hand(name, f, t, y, h, weights=None):
         return linear - commutator(q1, q2) / 6 - commutator(q1, q4) / 12
 
     tableau = getattr(diffrax, name).tableau
-    order = ORDERS[name]
+    order = ROWS[name].order
     bernoulli = [1, -1 / 2, 1 / 6, 0]
     stages = []
     rows = [[], *tableau.a_lower]
@@ -212,7 +208,7 @@ def test_the_estimate_is_what_the_embedded_method_says(name, estimate):
 )
 def test_the_estimate_falls_with_the_order_of_the_embedded_method(name):
     """Like h^p: on a group that does not commute, in state and time."""
-    solver = METHODS[name] if name in METHODS else cfjax.RKMK(getattr(diffrax, name).tableau)
+    solver = METHODS[name]
     order = solver.order(None)
     assert solver.error_order(None) == order
     # Longer steps at high order, whose estimate would else meet rounding.
@@ -404,7 +400,7 @@ def test_the_last_stage_is_at_the_end_exactly(name, stages):
 
     The rows of a tableau in floating point sum to their stage time up to rounding only.
     """
-    solver = METHODS[name] if name in METHODS else cfjax.RKMK(getattr(diffrax, name).tableau)
+    solver = METHODS[name]
     solver = solver.without_estimate()
     t0, t1 = inexact_end()
     times = []
@@ -487,24 +483,21 @@ def test_a_method_of_order_five_keeps_within_its_brackets(name):
     assert counts == {"evaluations": 6, "flows": 6, "brackets": 6 * 2}
 
 
-# Order, evaluations, those that only output within the step takes, and brackets of a stage.
-NAMED = {
-    "RKMK5": (cfjax.RKMK5, diffrax.Tsit5, 5, 6, 0, 2),
-    "RKMK8": (cfjax.RKMK8, diffrax.Dopri8, 8, 13, 4, 6),
-}
+# Of which tableau, evaluations that only output within the step takes, and brackets of a stage.
+NAMED = {"RKMK5": (diffrax.Tsit5, 0, 2), "RKMK8": (diffrax.Dopri8, 4, 6)}
 
 
 @pytest.mark.parametrize("name", NAMED)
 def test_a_named_method_is_that_of_its_tableau(name):
-    cls, plain, order, evaluations, within, brackets = NAMED[name]
+    cls, (plain, within, brackets) = getattr(cfjax, name), NAMED[name]
     solver, same = cls(), cfjax.RKMK(plain.tableau)
     for row in "a", "b", "b_error", "c":
         assert getattr(solver, row) == getattr(same, row)
-    assert solver.order(None) == order
+    assert solver.order(None) == SOLVERS[name].order
     assert solver == cls() != cls(estimate="group")
     assert cls(estimate=None).estimate is None
     # As its docstring says.
-    stages = evaluations + within
+    stages = SOLVERS[name].evaluations + within
     cost = {"evaluations": stages, "flows": stages, "brackets": (stages - 1) * brackets}
     assert count_step(solver.without_estimate(), jnp.ones((4, 4))) == cost
 
@@ -516,7 +509,7 @@ def test_a_named_method_turns_a_symmetric_body_with_its_order(name):
 
     Its attitude is exp(t m(0) / I1) exp(t r e3).
     """
-    cls, _, order, *_ = NAMED[name]
+    cls, order = getattr(cfjax, name), SOLVERS[name].order
     inertia, m0, t1 = np.array([1.0, 1.0, 0.4]), np.array([0.8, 0.3, 0.5]), 4.0
 
     def field(t, y, args):
@@ -594,7 +587,7 @@ def test_only_a_diffrax_tableau_makes_a_method(tableau):
         cfjax.RKMK(tableau)
 
 
-def test_the_refusals_in_the_words_of_the_package():
+def test_messages_of_wrong_arguments_without_the_import_hook():
     """In a Python without the import hook, which otherwise answers before the package does."""
     script = r"""
 import cfjax, diffrax, pytest

@@ -173,7 +173,7 @@ def test_the_estimate_keeps_the_units_of_each_part():
 
 
 @pytest.mark.parametrize("name", ["zero", "large", "not finite"])
-def test_an_estimate_without_a_size(name):
+def test_an_estimate_that_is_zero_large_or_not_finite(name):
     """Exact steps have no error; one larger than the state is itself; NaN says so.
 
     For y' = -4 y from 1: y1 = 1 - 4 and y2 = (1 - 2)^2.
@@ -357,7 +357,7 @@ def test_single_precision_and_batch():
     close(jnp.linalg.norm(found, axis=1), scales * jnp.linalg.norm(problem[1]), 1e-5)
 
 
-def test_a_value_that_compiles_once():
+def test_equal_richardson_solvers_compile_once():
     assert Richardson(cfjax.CF4()) == Richardson(cfjax.CF4())
     assert hash(Richardson(cfjax.CF4())) == hash(Richardson(cfjax.CF4()))
     traces = []

@@ -1,7 +1,5 @@
 """Stages rolled into a loop: the numbers and derivatives of stages that are not."""
 
-import re
-
 import diffrax
 import equinox as eqx
 import jax
@@ -65,7 +63,7 @@ def assert_same(found, expected, units):
 @pytest.mark.representatives(1)
 @pytest.mark.parametrize("problem", FIELDS)
 @pytest.mark.parametrize("name", SOLVERS)
-def test_a_step(name, problem):
+def test_a_step_with_rolled_stages(name, problem):
     field, y0, args = FIELDS[problem]
     y0, args = problems.arrays((y0, args))
     fun = lambda solver, y0, args: moved(solver, field, y0, args)  # noqa: E731
@@ -87,7 +85,7 @@ COLUMNS = problems.arrays(
 
 @pytest.mark.representatives(2)
 @pytest.mark.parametrize("name", SOLVERS)
-def test_a_step_in_coordinates_that_grow(name):
+def test_rolled_stages_in_coordinates_that_grow(name):
     """In a loop there is room for all of them from the start."""
     fun = lambda solver, y0, args: moved(solver, columns, y0, args)  # noqa: E731
     # Ten flows, each a sum of ten products of vectors of up to 18 entries of size 1.
@@ -126,7 +124,7 @@ def test_coordinates_that_grow_have_one_program_for_all_stages():
 
 @pytest.mark.representatives(1)
 @pytest.mark.parametrize("name", ["CF3", "RKMK(Bosh3)"])
-def test_a_gradient_in_a_batch(name):
+def test_a_gradient_with_rolled_stages_in_a_batch(name):
     field = lambda t, y, args: cfjax.Rotation(args * y[:, 0] + t * y[:, 1])  # noqa: E731
     y0, args = jnp.eye(3), jnp.array([0.5, -0.4, 0.9])
 
@@ -149,16 +147,6 @@ class Weighted(cfjax.AbstractFrozenField):
 
     def tangent(self, point):
         return self.a * point
-
-
-def test_fields_of_different_kinds_are_an_error_in_words():
-    def field(t, y, args):
-        kinds.append(1)
-        return cfjax.LeftMatrix(A) if len(kinds) < 3 else cfjax.RightMatrix(A)
-
-    kinds = []
-    with pytest.raises(TypeError, match="Only fields of one kind can be added"):
-        moved(cfjax.CF4(), field, jnp.eye(4), None)
 
 
 def test_a_field_that_varies_is_unrolled():
@@ -202,35 +190,6 @@ def test_a_small_step_is_rolled_if_asked_for(solver):
     assert "scan[" not in str(jax.make_jaxpr(lambda y0: end(solver.unrolled(), y0))(y0))
     # Entries of size 1, some ten flows with a few roundings each.
     assert_same(end(solver, y0), end(solver.unrolled(), y0), 100)
-
-
-@pytest.mark.parametrize("dtype", [jnp.float64, jnp.complex128])
-def test_large_fields_are_combined_by_a_product(dtype):
-    """Of 2500 numbers; smaller ones are added up."""
-    n = 50
-    a = jnp.asarray(np.random.default_rng(0).normal(size=(n, n)) / n, dtype)
-    a = a + 1j * a.T if dtype == jnp.complex128 else a
-
-    def field(t, y, args):
-        m = a @ y + jnp.cos(t).astype(dtype) * a
-        return cfjax.LeftMatrix(m - m.conj().T)
-
-    def end(solver):
-        times = jnp.asarray(0.1), jnp.asarray(0.4)
-        step = lambda y0: problems.first_step(solver, cfjax.LieTerm(field), *times, y0, None)[0]  # noqa: E731
-        y0 = jnp.eye(n, dtype=dtype)
-        assert ("dot_general" in _combinations(step, y0)) == (solver.unroll is False)
-        return step(y0)
-
-    # Entries of at most 1; products of 50 terms, a few for each flow.
-    assert_same(end(cfjax.CF4(unroll=False)), end(cfjax.CF4(unroll=True)), 1000)
-
-
-def _combinations(step, y0):
-    """The operations of a program that make a vector of 2500 numbers."""
-    text = str(jax.make_jaxpr(step)(y0))
-    lines = [line for line in text.splitlines() if re.search(r":(f64|c128)\[2500\] = ", line)]
-    return " ".join(lines)
 
 
 @pytest.mark.parametrize("make", [cfjax.CF4, cfjax.RKMK5, cfjax.RKMK4, cfjax.Magnus4])

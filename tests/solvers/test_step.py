@@ -13,21 +13,15 @@ import numpy as np
 import problems
 import pytest
 import scipy.linalg
+from solver_table import COMMUTATOR_FREE, named
 
 import cfjax
 from cfjax._methods.continuous_extension import continuous_extension
 
-SOLVERS: dict[str, Any] = {
-    name: getattr(cfjax, name)()
-    for name in (
-        *("LieEuler", "CF2", "CF3", "CF4", "CF43", "CF54", "CG3", "CG4", "CG5"),
-        *("Williamson3", "BWRRK33", "BWRRK53", "CK34", "CK54", "Luscher3", "CFEES25", "CFEES27"),
-        "YRK135",
-    )
-} | {
-    "family A, 1": cfjax.CommutatorFree(cfjax.third_order_a(1)),
-    "family B, 0.1": cfjax.CommutatorFree(cfjax.third_order_b(0.1)),
+METHODS = named("commutator-free", "low-storage") | {
+    name: COMMUTATOR_FREE[name] for name in ("family A, 1", "family B, 0.1")
 }
+SOLVERS: dict[str, Any] = {name: row.make() for name, row in METHODS.items()}
 # Times, and the place within the step.
 T0, H, THETA = 0.3, 0.25, 0.4
 

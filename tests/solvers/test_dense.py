@@ -13,12 +13,14 @@ import numpy as np
 import optimistix as optx
 import problems
 import pytest
-from extended import FLOWS, SERIES
 from scipy.integrate import solve_ivp
+from solver_table import COMMUTATOR_FREE, MUNTHE_KAAS, SOLVERS, named
 
 import cfjax
 
-EXTENDED = FLOWS | SERIES | {"RKMK3": (cfjax.RKMK3(), 2), "RKMK4": (cfjax.RKMK4(), 3)}
+# `RKMK5` and `RKMK8` are Tsit5 and Dopri8.
+METHODS = named("commutator-free", "low-storage") | COMMUTATOR_FREE | MUNTHE_KAAS
+METHODS |= {name: SOLVERS[name] for name in ("RKMK3", "RKMK4")}
 BODY = problems.driven_body, jnp.asarray(problems.MOMENTUM), jnp.asarray(problems.INERTIA)
 
 
@@ -54,14 +56,15 @@ def dense(solver, n, field, y0, args, t1=1.0, **kwargs):
 
 # Those of Dopri8 are at rounding after two of these steps, so its own are longer.
 @pytest.mark.parametrize(
-    "solver, order",
+    "name",
     [
-        pytest.param(*case, id=name, marks=[pytest.mark.slow] * (name not in ("CF4", "RKMK4")))
-        for name, case in EXTENDED.items()
+        pytest.param(name, marks=[pytest.mark.slow] * (name not in ("CF4", "RKMK4")))
+        for name in METHODS
     ],
 )
-def test_the_error_between_the_steps_falls_with_the_order_of_the_solution(solver, order):
+def test_the_error_between_the_steps_falls_with_the_order_of_the_solution(name):
     """Within one step like h^(order + 1), so it keeps the order of the solution."""
+    solver, order = METHODS[name].make(), METHODS[name].output
     steps = np.array([4, 8, 16, 32]) if order < 7 else np.array([0.5, 0.7, 1.0, 1.4])
     thetas = np.array([0.21, 0.5, 0.83])
     field, y0, args = BODY
@@ -102,7 +105,7 @@ def test_the_error_between_the_steps_falls_with_the_order_of_the_solution(solver
     "name", ["CF4", "CK54", "RKMK4", pytest.param("CF54", marks=pytest.mark.slow)]
 )
 def test_random_times_are_on_the_manifold_and_nodes_are_the_steps(name):
-    solver, _ = EXTENDED[name]
+    solver = METHODS[name].make()
     field, y0, args = BODY
     n = 8
     sol = dense(solver, n, field, y0, args)
@@ -144,7 +147,7 @@ def test_random_times_are_on_the_manifold_and_nodes_are_the_steps(name):
     "name, direction", [pytest.param("CF3", 1, marks=pytest.mark.slow), ("CF4", -1)]
 )
 def test_derivatives_in_time(name, direction):
-    solver, order = EXTENDED[name]
+    solver, order = METHODS[name].make(), METHODS[name].output
     field, y0, args = BODY
     n = 16
     sol = dense(solver, n, field, y0, args, t1=float(direction))
@@ -290,7 +293,7 @@ def test_a_pendulum_passes_a_plane_on_the_sphere_at_the_right_time(name):
     event = diffrax.Event(height, optx.Newton(rtol=1e-12, atol=1e-12))
     sol = diffrax.diffeqsolve(
         cfjax.LieTerm(pendulum),
-        EXTENDED[name][0],
+        METHODS[name].make(),
         0.0,
         20.0,
         0.01,

@@ -1,0 +1,198 @@
+"""exp(a) and exp(-a) together: their polynomials, accuracy, derivatives, batches."""
+
+import math
+from fractions import Fraction
+from functools import cache
+
+import jax
+import jax.numpy as jnp
+import mpmath
+import numpy as np
+import pytest
+import scipy.linalg
+from matrices import DTYPES, backward_error, exact_expm, of_norm, random, small, to_numpy
+
+from cfjax._numerics import expm_both
+from cfjax._numerics.expm_both import expm_both_parts
+
+
+def both(a):
+    weight, plus, minus = expm_both_parts(a)
+    one = jnp.eye(a.shape[0], dtype=a.dtype)
+    return weight * (one + a) + plus, weight * (one - a) + minus
+
+
+mapped = jax.jit(jax.vmap(both))
+
+
+def of_rows(rows):
+    """In powers of Z, without rounding."""
+
+    def combine(weights):
+        z, z2, shared = weights
+        c3, c4 = expm_both._SHARED
+        return [0, z, z2, Fraction(shared) * Fraction(c3), Fraction(shared) * Fraction(c4)]
+
+    left, right, rest = ([Fraction(x) for x in combine(row)] for row in rows)
+    out = [*rest, *[Fraction(0)] * 4]
+    for i, x in enumerate(left):
+        for j, y in enumerate(right):
+            out[i + j] += x * y
+    return out
+
+
+def test_polynomials_are_those_of_cosh_and_sinh():
+    for odd, rows in [(0, expm_both._EVEN), (1, expm_both._ODD)]:
+        got = of_rows(rows)
+        for k in range(1, 8):
+            # Rounding the weights to double moves a coefficient by 1.5e-16 at most (found here).
+            assert abs(float(got[k] * math.factorial(2 * k + odd) - 1)) < 3e-16
+            if k < 4:  # An error of these would be the same in every step.
+                assert abs(float(got[k] - Fraction(1, math.factorial(2 * k + odd)))) < 1e-17
+        last = 1 if odd == 0 else 17 / 15
+        assert float(got[8] * math.factorial(16 + odd)) == pytest.approx(last, rel=1e-15)
+
+
+def test_coefficients_are_positive_so_nothing_cancels():
+    assert min(w for rows in (expm_both._EVEN, expm_both._ODD) for row in rows for w in row) >= 0
+
+
+@pytest.mark.parametrize(("precision", "unit"), [("float32", 2.0**-24), ("float64", 2.0**-53)])
+def test_theta_of_both_is_where_the_backward_error_reaches_the_unit_roundoff(precision, unit):
+    even, odd = of_rows(expm_both._EVEN), of_rows(expm_both._ODD)
+    polynomial = [x for pair in zip(even, odd, strict=True) for x in pair]
+    # Those that are rounded count as exact: they are tested above.
+    c = backward_error(polynomial, 15)
+    # Of 1/16! as well.
+    assert c[16] < 1e-28
+
+    def size(x):
+        return sum(y * x ** (k - 1) for k, y in enumerate(c) if k > 16)
+
+    theta = expm_both._THETA[precision]
+    assert size(theta) <= unit < size(theta * 1.001)
+
+
+OF_BOTH = [
+    *(("skew", norm) for norm in (0.0, 1e-12, 0.86, 1.0, 10.0, 100.0, 1e4)),
+    *(("general", norm) for norm in (0.1, 0.87, 2.7)),
+    *((kind, norm) for kind in ("negative", "nilpotent", "double") for norm in (0.5, 10.0)),
+]
+
+
+@pytest.mark.representatives(1)
+@pytest.mark.parametrize("dtype", DTYPES)
+@pytest.mark.parametrize("n", [5, 3, 1, 8])
+def test_accuracy_of_both(n, dtype):
+    batch = np.stack([of_norm(kind, n, norm, k, dtype) for k, (kind, norm) in enumerate(OF_BOTH)])
+    found = mapped(batch)
+    for case, a, *got in zip(OF_BOTH, batch, *map(np.asarray, found), strict=True):
+        wide = a.astype(np.promote_types(dtype, np.float64))
+        # For one number cosh - sinh cancels, up to theta; in a matrix, the largest entries count.
+        condition = np.exp(2 * expm_both._THETA[np.finfo(dtype).dtype.name]) if n == 1 else 1.0
+        if case[0] not in ("skew", "negative") and n > 1:
+            condition = max(scipy.linalg.expm_cond(sign * wide) for sign in (1, -1))
+        # Squarings double the relative error of normal matrices, and add n units: 2 n norm in all,
+        # as the scaled norm is at least a half of theta. One for the polynomials. Others can lose
+        # their condition number.
+        bound = (1 + 3 * n) * np.finfo(dtype).eps * max(1.0, case[1], condition)
+        for sign, x in zip((1, -1), got, strict=True):
+            assert x.dtype == dtype
+            # SciPy's double precision is exact enough for single.
+            is_double = np.finfo(dtype).bits == 64
+            exact = to_numpy(exact_expm(sign * a)) if is_double else scipy.linalg.expm(sign * wide)
+            assert np.linalg.norm(x - exact, 2) <= bound * np.linalg.norm(exact, 2), (case, sign)
+
+
+@pytest.mark.representatives(1)
+@pytest.mark.parametrize("n", [2, 3])
+def test_both_of_sizes_2_and_3(n):
+    norms = [0.0, 1e-3, 0.7, 1.3, 20.0]
+    a = np.stack([small("skew", n, norm, k) for k, norm in enumerate(norms)])
+    weights, plus, minus = map(np.asarray, jax.jit(jax.vmap(expm_both_parts))(a))
+    eye = np.eye(n)
+    for norm, x, w, p, m in zip(norms, a, weights, plus, minus, strict=True):
+        for sign, rest in ((1, p), (-1, m)):
+            # As in test_accuracy_of_both.
+            atol = 4 * n * 2.0**-52 * max(1.0, norm)
+            exact = to_numpy(exact_expm(sign * x))
+            np.testing.assert_allclose(w * (eye + sign * x) + rest, exact, rtol=0, atol=atol)
+
+
+def test_both_are_exact_at_zero():
+    a, direction = np.zeros((3, 3)), random((3, 3))
+    (weight, *rest), tangents = jax.jvp(jax.jit(expm_both_parts), (a,), (direction,))
+    assert weight == 1
+    # The tangents are those of I + a and I - a.
+    np.testing.assert_array_equal(rest, np.zeros((2, 3, 3)))
+    np.testing.assert_array_equal(tangents[1:], np.zeros((2, 3, 3)))
+
+
+def test_the_rest_of_both_is_as_small_as_the_square():
+    a = of_norm("general", 3, 1e-6)
+    _, *rest = jax.jit(expm_both_parts)(a)
+    for sign, x in zip((1, -1), rest, strict=True):
+        with mpmath.workdps(60):
+            exact = exact_expm(sign * a) - mpmath.matrix(a.tolist()) * sign - mpmath.eye(3)
+        # Relative to a^2: a product and a sum.
+        atol = 4 * 2.0**-52 * np.linalg.norm(a) ** 2
+        np.testing.assert_allclose(x, to_numpy(exact), rtol=0, atol=atol)
+
+
+@cache
+def derivatives_of_both():
+    """Of both along a direction: forward, and by reverse mode of a product."""
+
+    @jax.jit
+    @jax.vmap
+    def of(a, d, weight):
+        pushed = jax.jvp(both, (a,), (d,))[1]
+        pulled = jax.vjp(both, a)[1]((weight, weight))[0]
+        # Of sum(weight * both(t a)) twice by t, reverse over reverse.
+        value = lambda t: jnp.sum(weight * (sum(both(t * a))))  # noqa: E731
+        return pushed, pulled, jax.grad(jax.grad(value))(1.0)
+
+    return of
+
+
+@pytest.mark.slow
+def test_derivatives_of_both():
+    cases = [("skew", x) for x in (0.0, 1e-12, 0.5, 3.0, 100.0)] + [("general", 1.0)]
+    a = np.stack([of_norm(kind, 3, norm) for kind, norm in cases])
+    d, w = random((2, len(cases), 3, 3), 1)
+    pushed, pulled, second = derivatives_of_both()(a, d, w)
+    for k, (kind, norm) in enumerate(cases):
+        # The derivatives are products of two factors exp, each with the error in the test of
+        # accuracy, and of norm e^2 at most for the general one.
+        growth = 1 if kind == "skew" else np.exp(2)
+        bound = 2 * 10 * 2.0**-52 * max(1, norm) * growth * 3
+        exact = [scipy.linalg.expm_frechet(s * a[k], s * d[k], compute_expm=False) for s in (1, -1)]
+        for got, x in zip((pushed[0][k], pushed[1][k]), exact, strict=True):
+            np.testing.assert_allclose(got, x, rtol=0, atol=bound)
+        # The transpose of L(a, .) is L(a^T, .).
+        exact = [
+            s * scipy.linalg.expm_frechet(s * a[k].T, w[k], compute_expm=False) for s in (1, -1)
+        ]
+        np.testing.assert_allclose(pulled[k], sum(exact), rtol=0, atol=2 * bound)
+        twice = a[k] @ a[k] @ (scipy.linalg.expm(a[k]) + scipy.linalg.expm(-a[k]))
+        # Of size norm^2, nine entries.
+        atol = 9 * bound * max(1, norm) ** 2
+        np.testing.assert_allclose(second[k], np.sum(w[k] * twice), rtol=0, atol=atol)
+
+
+@pytest.mark.parametrize("dtype", [float, complex])
+def test_not_finite_both_stay_with_their_member(dtype):
+    batch = np.stack([of_norm("general", 3, 1.0, k, dtype) for k in range(4)])
+    batch[0, 0, 1], batch[1, 2, 2] = np.nan, np.inf
+    batch[2] *= 1e300
+    for x in map(np.asarray, jax.jit(jax.vmap(expm_both_parts))(batch)[1:]):
+        assert np.isnan(x[:3]).all()
+        assert np.isfinite(x[3]).all()
+
+
+def test_branches_stay_branches_in_a_batch():
+    def conditions(f, *args):
+        return str(jax.make_jaxpr(f)(*args)).count(" cond[")
+
+    a = np.stack([of_norm("skew", 6, norm) for norm in (0.1, 50.0)])
+    assert conditions(jax.vmap(both), a) == conditions(both, a[0]) > 0

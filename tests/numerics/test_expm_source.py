@@ -1,0 +1,137 @@
+"""What a constant source adds to a congruence, beside exp(a): accuracy, derivatives, batches."""
+
+import jax
+import jax.numpy as jnp
+import mpmath
+import numpy as np
+import pytest
+import scipy.linalg
+from matrices import DTYPES, backward_error, coefficients, exact_expm, of_norm, random
+
+from cfjax._numerics.expm import TAYLOR_SCHEMES
+from cfjax._numerics.expm_source import _SMALLER, expm_parts_with_source
+
+
+def with_source(a, q):
+    weight, rest, g = expm_parts_with_source(a, q)
+    return weight * (jnp.eye(a.shape[0], dtype=a.dtype) + a) + rest, g
+
+
+mapped_with_source = jax.jit(jax.vmap(with_source))
+
+
+def block(a, q):
+    """Van Loan's."""
+    b = np.block([[a, q], [np.zeros(a.shape), -a.conj().T]])
+    return mpmath.matrix(b.tolist())
+
+
+def exact_source(m, n):
+    """Its entries. The block loses exp(2 |a|): 60 digits are enough up to a norm of 50."""
+    with mpmath.workdps(60):
+        e = exact_expm(m)
+        return list(e[:n, n:] * e[:n, :n].H)
+
+
+def test_norms_are_where_the_error_in_the_source_reaches_the_unit_roundoff():
+    for precision, unit in [("float32", 2.0**-24), ("float64", 2.0**-53)]:
+        for scheme in TAYLOR_SCHEMES[precision]:
+            degree = 15 if scheme.powers == 2 else 21
+            c = backward_error(coefficients(scheme), degree)
+            theta = _SMALLER * scheme.theta
+            # The derivative of a^k has k terms. A tenth: the factor suits the worst scheme.
+            assert 0.1 * unit < sum(k * y * theta ** (k - 1) for k, y in enumerate(c) if y) <= unit
+
+
+WITH_SOURCE = [
+    *(("skew", norm) for norm in (0.0, 1e-12, 0.1, 0.55, 0.57, 1.3, 1.5, 10.0, 40.0)),
+    *((kind, 2.0) for kind in ("general", "nilpotent", "double")),
+    *(("negative", norm) for norm in (0.5, 30.0)),
+]
+
+
+@pytest.mark.representatives(1)
+@pytest.mark.parametrize("dtype", DTYPES)
+@pytest.mark.parametrize("n", [3, 6, 1])
+def test_accuracy_with_a_source(n, dtype):
+    a = np.stack([of_norm(kind, n, norm, k, dtype) for k, (kind, norm) in enumerate(WITH_SOURCE)])
+    q = random((len(WITH_SOURCE), n, n), 7, dtype)
+    found = map(np.asarray, mapped_with_source(a, q))
+    wide = np.promote_types(dtype, np.float64)
+    for case, a1, q1, e, g in zip(WITH_SOURCE, a, q, *found, strict=True):
+        kind, norm = case
+        growth = 1.0 if kind in ("skew", "negative") else np.exp(2 * norm)
+        # As for expm: n units of rounding, doubled by each squaring, and what is not normal may
+        # lose its growth. Of one number exp(-theta) cancels.
+        bound = 2 * (n + 3) * np.finfo(dtype).eps * max(1.0, norm) * growth
+        a1, q1 = a1.astype(wide), q1.astype(wide)
+        assert g.dtype == dtype
+        np.testing.assert_allclose(e, scipy.linalg.expm(a1), rtol=0, atol=bound, err_msg=str(case))
+        exact = np.array(exact_source(block(a1, q1), n), complex).reshape(n, n)
+        atol = bound * np.linalg.norm(q1)
+        np.testing.assert_allclose(g, exact, rtol=0, atol=atol, err_msg=str(case))
+
+
+def test_exact_at_zero_with_a_source():
+    a, d = np.zeros((3, 3), complex), random((3, 3), 1, complex)
+    q = random((3, 3), 2, complex)
+    (weight, rest, g), tangents = jax.jvp(jax.jit(expm_parts_with_source), (a, q), (d, q))
+    assert weight == 1
+    np.testing.assert_array_equal(rest, np.zeros((3, 3)))
+    np.testing.assert_array_equal(g, q)
+    # d/da of the integral at zero, a unit of rounding of each of four terms.
+    want = (d @ q + q @ d.conj().T) / 2 + q
+    np.testing.assert_allclose(tangents[2], want, rtol=0, atol=4 * 2.0**-52 * 10)
+
+
+def test_semidefinite_stays_semidefinite():
+    """A source of rank one, so that three eigenvalues of the integral are small or zero."""
+    norms = [0.0, 1e-6, 0.1, 1.0, 5.0, 30.0]
+    a = np.stack([of_norm("general" if norm < 3 else "negative", 4, norm) for norm in norms])
+    v = random((4, 1), 3)
+    q = np.broadcast_to(v @ v.T, a.shape)
+    for g in np.asarray(mapped_with_source(a, q)[1]):
+        least = np.linalg.eigvalsh((g + g.T) / 2).min()
+        # 20 units of rounding of the whole.
+        assert least >= -20 * 2.0**-52 * max(np.linalg.norm(g), np.linalg.norm(q[0]))
+
+
+@pytest.mark.slow
+def test_derivatives_with_a_source():
+    w, d, r = random((3, 3, 3), 4)
+
+    @jax.jit
+    @jax.vmap
+    def found(a, q):
+        def value(t):
+            return jnp.sum(w * expm_parts_with_source(a + t * d, q + t * r)[2])
+
+        slope = lambda t: jax.jvp(value, (t,), (1.0,))[1]  # noqa: E731
+        return jax.grad(value)(0.0), *jax.jvp(slope, (0.0,), (1.0,))
+
+    norms = [0.0, 1e-12, 0.5, 3.0]
+    a = np.stack([of_norm("general", 3, norm) for norm in norms])
+    q = random((4, 3, 3), 5)
+    h = mpmath.mpf(10) ** -15
+    for norm, a1, q1, *got in zip(norms, a, q, *found(a, q), strict=True):
+
+        def value(t, a1=a1, q1=q1):
+            m = block(a1, q1) + t * block(d, r)
+            return sum(x * y for x, y in zip(exact_source(m, 3), np.ravel(w), strict=True))
+
+        # Differences in 60 digits: an error of 1e-30.
+        with mpmath.workdps(60):
+            ends = value(h), value(0), value(-h)
+            first, second = (ends[0] - ends[2]) / (2 * h), (ends[0] - 2 * ends[1] + ends[2]) / h**2
+        # Some ten units for each of three factors exp, of norm exp(norm) at most.
+        atol = 30 * 2.0**-52 * np.exp(3 * norm) * 30
+        assert abs(got[0] - float(first)) <= atol
+        assert abs(got[1] - float(first)) <= atol
+        assert abs(got[2] - float(second)) <= 10 * atol
+
+
+def test_a_source_that_is_not_finite_stays_with_its_member():
+    a, q = random((2, 3, 3, 3), 6)
+    a[0, 0, 1], q[1, 1, 1] = np.nan, np.inf
+    g = np.asarray(mapped_with_source(a, q)[1])
+    assert np.isnan(g[0]).all() and not np.isfinite(g[1]).all() and np.isfinite(g[2]).all()

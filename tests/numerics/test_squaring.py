@@ -1,0 +1,91 @@
+"""Squarings of what was scaled down by a power of two: exponents, batches, derivatives."""
+
+import math
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from matrices import random
+
+from cfjax._numerics.squaring import exponent, magnitude, max_over_batch, squared, squarings
+
+SIZES = [1e-300, 0.3, np.nextafter(0.5, 0), 0.5, 0.75, 1.0, np.nextafter(1.0, 2), 3.0, 4.0, 1e300]
+
+
+@pytest.mark.parametrize("size", SIZES)
+def test_the_exponent_is_that_of_frexp(size):
+    assert exponent(jnp.asarray(size)) == math.frexp(size)[1]
+
+
+@pytest.mark.parametrize("dtype", [np.float32, np.float64])
+def test_exponents_at_the_ends_of_a_precision(dtype):
+    info = jnp.finfo(dtype)
+    assert exponent(jnp.asarray(info.max, dtype)) == info.maxexp
+    assert exponent(jnp.zeros((), dtype)) < -100
+    for bad in (np.inf, np.nan):
+        assert exponent(jnp.asarray(bad, dtype)) > info.maxexp
+
+
+@pytest.mark.parametrize("dtype", [np.float32, np.float64])
+def test_the_power_of_some_squarings(dtype):
+    digits = jnp.finfo(dtype).nmant
+    for s in (0, 1, 7, digits):
+        number, power = squarings(jnp.asarray(s), jnp.dtype(dtype))
+        assert (number, power) == (s, 2.0**-s)
+        assert power.dtype == dtype
+    # No digit would be left.
+    number, power = squarings(jnp.asarray(digits + 1), jnp.dtype(dtype))
+    assert number == 0 and np.isnan(power)
+
+
+def test_the_magnitude_of_a_complex_number():
+    np.testing.assert_array_equal(magnitude(jnp.asarray([3 - 4j, -1j])), [7, 1])
+    np.testing.assert_array_equal(magnitude(jnp.asarray([-2.0, 1.0])), [2, 1])
+
+
+def test_the_maximum_over_a_batch_without_what_is_not_a_number():
+    found = jax.vmap(max_over_batch)(jnp.asarray([1.0, np.nan, 3.0]))
+    np.testing.assert_array_equal(found, [3, 3, 3])
+    assert max_over_batch(jnp.asarray(2.0)) == 2
+
+
+def powers(a, s):
+    return squared(a, lambda x: x, s)
+
+
+# Of products that fuse, and of a loop.
+@pytest.mark.parametrize("n", [3, 6])
+def test_each_member_of_a_batch_is_squared_as_often_as_it_needs(n):
+    a, s = random((5, n, n)), np.array([0, 1, 2, 5, 7])
+    a = a / np.linalg.norm(a, 2, axis=(1, 2))[:, None, None]
+    found = jax.jit(jax.vmap(powers))(a, jnp.asarray(s, jnp.int32))
+    for x, b, k in zip(found, a, s, strict=True):
+        # A few roundings of entries below 1 in each product, doubled by every other.
+        expected = np.linalg.matrix_power(b, 2**k)
+        np.testing.assert_allclose(x, expected, rtol=0, atol=2**k * n * 2.0**-52)
+
+
+def test_none_are_started_where_there_is_no_squaring():
+    a = jnp.asarray(random((3, 3)))
+    found = [squared(a, lambda x: x + jnp.eye(3), jnp.asarray(s, jnp.int32)) for s in (0, 1)]
+    np.testing.assert_array_equal(found[0], a)
+    with_start = np.linalg.matrix_power(np.asarray(a) + np.eye(3), 2)
+    np.testing.assert_allclose(found[1], with_start, rtol=0, atol=1e-14)
+
+
+@pytest.mark.parametrize("n", [3, 6])
+@pytest.mark.parametrize("s", [0, 3, 6])
+def test_derivatives_of_powers(n, s):
+    """Of the trace of (t a)^m at t = 1, m = 2^s: m times itself, in both modes."""
+    a = random((n, n))
+    a = jnp.asarray(a / np.linalg.norm(a, 2))
+
+    def trace(t):
+        return jnp.trace(powers(t * a, jnp.asarray(s, jnp.int32)))
+
+    m = 2**s
+    expected = m * np.trace(np.linalg.matrix_power(np.asarray(a), m))
+    atol = m * m * n * 2.0**-52
+    np.testing.assert_allclose(jax.grad(trace)(1.0), expected, rtol=0, atol=atol)
+    np.testing.assert_allclose(jax.jvp(trace, (1.0,), (1.0,))[1], expected, rtol=0, atol=atol)
