@@ -24,7 +24,7 @@ def test_the_number_of_a_fault_is_that_of_its_worst_case(x, number):
 @pytest.mark.parametrize("x, message", [(1.5, "above one"), (2.5, "above two")])
 def test_a_fault_is_an_error_with_its_message(x, message):
     with pytest.raises(eqx.EquinoxRuntimeError, match=message):
-        jax.jit(lambda x: fault_of(x).error(ZERO))(x)
+        eqx.filter_jit(lambda x: fault_of(x).error(ZERO))(jnp.asarray(x))
 
 
 def test_no_fault_is_no_error():
@@ -45,9 +45,9 @@ def checked(x):
 
 
 def test_a_check_gives_back_the_same_arrays_or_an_error():
-    np.testing.assert_array_equal(jax.jit(checked)(X), X)
+    np.testing.assert_array_equal(eqx.filter_jit(checked)(X), X)
     with pytest.raises(eqx.EquinoxRuntimeError, match="above three"):
-        jax.jit(checked)(2 * X)
+        eqx.filter_jit(checked)(2 * X)
 
 
 def test_a_check_in_a_batch():

@@ -52,7 +52,7 @@ def test_shape_dtype_and_entries_of_an_operator(name):
 
 
 def test_a_sum_of_real_and_complex_arrays():
-    found = added([jnp.ones(2), 1j * jnp.ones(2), jnp.asarray([1.0, -1.0])])
+    found = added([jnp.ones(2), jnp.asarray([1j, 1j]), jnp.asarray([1.0, -1.0])])
     np.testing.assert_array_equal(found, [2 + 1j, 1j])
 
 
