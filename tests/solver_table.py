@@ -32,8 +32,6 @@ Takes = Literal["any", "brackets", "time only", "linear part", "columns", "terms
 class Row(NamedTuple):
     """A solver.
 
-    Integers, or None.
-
     - `make`: makes it, with its estimate if it has one. Its class where that takes no arguments.
     - `order`: of an ordinary equation. `embedded`: that of its embedded method, or None.
     - `evaluations`: of the field in a step, with the estimate and without output within the step.
@@ -47,6 +45,7 @@ class Row(NamedTuple):
     make: Callable[[], Any]
     kind: Kind
     order: int
+    # Those that may be None are integers else.
     embedded: Any
     evaluations: Any
     first: int

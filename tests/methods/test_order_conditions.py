@@ -421,7 +421,9 @@ def weights_at(continuous_extension, theta):
     ]
 
 
-FLOWS = named_solvers("commutator-free", "low-storage") | COMMUTATOR_FREE
+FLOWS = named_solvers("commutator-free", "low-storage") | {
+    name: COMMUTATOR_FREE[name] for name in ("family A, 1/2", "family B, 2/3")
+}
 
 
 @pytest.mark.representatives(8)

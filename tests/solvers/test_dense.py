@@ -19,7 +19,8 @@ from solver_table import COMMUTATOR_FREE, MUNTHE_KAAS, SOLVERS, named
 import cfjax
 
 # `RKMK5` and `RKMK8` are Tsit5 and Dopri8.
-METHODS = named("commutator-free", "low-storage") | COMMUTATOR_FREE | MUNTHE_KAAS
+METHODS = named("commutator-free", "low-storage") | MUNTHE_KAAS
+METHODS |= {name: COMMUTATOR_FREE[name] for name in ("family A, 1/2", "family B, 2/3")}
 METHODS |= {name: SOLVERS[name] for name in ("RKMK3", "RKMK4")}
 BODY = problems.driven_body, jnp.asarray(problems.MOMENTUM), jnp.asarray(problems.INERTIA)
 
