@@ -1,4 +1,4 @@
-"""What every solve checks of its arguments before it traces anything."""
+"""Checks of the arguments of a solve, before anything is traced."""
 
 import typing
 from typing import Any
@@ -15,7 +15,7 @@ from jaxtyping import Array, PyTree, Real
 
 
 def time_dtype(y0: PyTree) -> Any:
-    """The state's precision: times of another would promote it."""
+    """The floating dtype of the state. Times of another dtype would promote it."""
     leaves = jtu.tree_leaves(y0)
     with jax.numpy_dtype_promotion("standard"):
         return jnp.finfo(jnp.result_type(*leaves) if leaves else float).dtype
@@ -32,15 +32,15 @@ def time_scalar(name: str, t: Any, dtype: Any) -> Real[Array, ""]:
 
 def check_term_and_solver(term: Any, solver: Any) -> None:
     is_term = lambda x: isinstance(x, diffrax.AbstractTerm)  # noqa: E731
-    terms, structure = jtu.tree_flatten(term, is_leaf=is_term)
+    terms, treedef = jtu.tree_flatten(term, is_leaf=is_term)
     if not terms or not all(map(is_term, terms)):
         raise TypeError(f"term must be a diffrax term, such as cfjax.LieTerm(field), got {term!r}.")
     if not isinstance(solver, diffrax.AbstractSolver):
         raise TypeError(f"solver must be a diffrax solver, such as cfjax.CF4(), got {solver!r}.")
     # As `diffrax.diffeqsolve`, but for the types within a generic one.
-    expected, expected_structure = jtu.tree_flatten(solver.term_structure)
+    expected, expected_treedef = jtu.tree_flatten(solver.term_structure)
     classes = [typing.get_origin(c) or c for c in expected]
-    if structure != expected_structure or not all(map(isinstance, terms, classes)):
+    if treedef != expected_treedef or not all(map(isinstance, terms, classes)):
         raise TypeError(
             f"{type(solver).__name__} takes a term of the form {solver.term_structure}, got "
             f"{eqx.tree_pformat(term)}."
@@ -48,19 +48,19 @@ def check_term_and_solver(term: Any, solver: Any) -> None:
 
 
 def check_own_tolerances(solver: Any) -> None:
-    """An implicit solver cannot have those of a step size controller where there is none."""
+    """Refuses an implicit solver without tolerances: equal steps have no controller with any."""
     while isinstance(solver, diffrax.AbstractWrappedSolver):
         solver = solver.solver
     if isinstance(solver, diffrax.AbstractImplicitSolver):
-        finder = solver.root_finder
-        # By default a marker: they are to be those of the step size controller.
-        own = [getattr(finder, name, None) for name in ("rtol", "atol")]
-        if not all(map(eqx.is_inexact_array_like, own)):
+        root_finder = solver.root_finder
+        # The default is a marker: take those of the step size controller.
+        tolerances = [getattr(root_finder, name, None) for name in ("rtol", "atol")]
+        if not all(map(eqx.is_inexact_array_like, tolerances)):
             name = type(solver).__name__
-            place = "diffrax." if getattr(diffrax, name, None) is type(solver) else ""
+            module = "diffrax." if getattr(diffrax, name, None) is type(solver) else ""
             raise ValueError(
                 "solver must have tolerances of its own, as equal steps do not provide any, got "
-                f"{name} without. Write {place}{name}(root_finder=diffrax.VeryChord(rtol=1e-8, "
+                f"{name} without. Write {module}{name}(root_finder=diffrax.VeryChord(rtol=1e-8, "
                 "atol=1e-8, norm=optimistix.rms_norm))."
             )
 
@@ -73,7 +73,7 @@ def as_state(y0: PyTree) -> PyTree:
 
     def as_array(path: Any, leaf: Any) -> Array:
         is_number = isinstance(leaf, jax.Array | np.ndarray | np.generic | int | float | complex)
-        if not is_number or not _has_numbers(getattr(leaf, "dtype", None) or np.result_type(leaf)):
+        if not is_number or not _is_numeric(getattr(leaf, "dtype", None) or np.result_type(leaf)):
             raise TypeError(
                 f"y0{jtu.keystr(path)} must be an array of numbers, got {eqx.tree_pformat(leaf)}."
             )
@@ -85,7 +85,7 @@ def as_state(y0: PyTree) -> PyTree:
     return jtu.tree_map_with_path(as_array, y0)
 
 
-def _has_numbers(dtype: Any) -> bool:
+def _is_numeric(dtype: Any) -> bool:
     return jnp.issubdtype(dtype, jnp.number) or jnp.issubdtype(dtype, jnp.bool_)
 
 

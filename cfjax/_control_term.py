@@ -10,7 +10,7 @@ import jax.tree_util as jtu
 import numpy as np
 from jaxtyping import Array, PyTree
 
-from ._field import AbstractFrozenField, flow, is_field, tangent
+from ._field import flow, has_default_combine, is_field, tangent
 from ._numerics.checks import Fault
 from ._numerics.linearity import Linearity, linearity
 from ._term import checked
@@ -75,8 +75,8 @@ class LieControlTerm(diffrax.AbstractTerm):
                 f"{self.control!r}."
             )
 
-    def vf(self, t: Any, y: PyTree, args: PyTree) -> "_Place":
-        return _Place.of(t, y, args)
+    def vf(self, t: Any, y: PyTree, args: PyTree) -> "_Unevaluated":
+        return _Unevaluated.of(t, y, args)
 
     def contr(self, t0: Any, t1: Any, **kwargs: Any) -> PyTree:
         if isinstance(self.control, _INTERPOLATIONS):
@@ -91,8 +91,8 @@ class LieControlTerm(diffrax.AbstractTerm):
         value = self.control.evaluate(start, end, **kwargs)
         return jtu.tree_map(lambda x: jnp.where(is_back, -x, x), value)
 
-    def prod(self, vf: "_Place", control: PyTree) -> PyTree:
-        t, y, args = vf.all()
+    def prod(self, vf: "_Unevaluated", control: PyTree) -> PyTree:
+        t, y, args = vf.values()
         field = checked(self.field(t, y, args, control), y)
         self._linearity(vf, control)
         return field
@@ -101,89 +101,86 @@ class LieControlTerm(diffrax.AbstractTerm):
         return tangent(self.prod(self.vf(t, y, args), control), y)
 
     def fault(self, fault: Fault, t: Any, y: PyTree, args: PyTree, control: PyTree) -> Fault:
-        """This, or that the field is not linear by its values, if its program does not show it.
+        """`fault`, with a case for values that are not linear, if the program does not show it.
 
         The values are at a state to which the field leads, as a start is often special. `control`
         is an increment, or its shapes and dtypes.
 
         **Raises** `ValueError` if the program says that it is not linear.
         """
-        kinds = self._linearity(_Place.of(t, y, args), control)
-        if all(kind.power <= 1 and kind.constant == "zero" for kind in kinds):
+        dependences = self._linearity(_Unevaluated.of(t, y, args), control)
+        if all(d.power <= 1 and d.constant == "zero" for d in dependences):
             return fault
         rng = np.random.default_rng(0)
-        drawn = lambda x: jnp.asarray(rng.normal(size=x.shape), x.dtype)  # noqa: E731
+        normal_like = lambda x: jnp.asarray(rng.normal(size=x.shape), x.dtype)  # noqa: E731
 
         def increment(sign: float) -> PyTree:
             # The two on either side of zero, and far from it: neither rectified nor rounded alike.
-            of = lambda x: jnp.asarray(sign * rng.uniform(1, 2, x.shape), x.dtype)  # noqa: E731
-            return jtu.tree_map(of, control)
+            scaled = lambda x: jnp.asarray(sign * rng.uniform(1, 2, x.shape), x.dtype)  # noqa: E731
+            return jtu.tree_map(scaled, control)
 
         a, b = increment(1.0), increment(-1.0)
 
-        def at(y: PyTree, increment: PyTree) -> PyTree:
+        def field_at(y: PyTree, increment: PyTree) -> PyTree:
             return checked(self.field(t, y, args, increment), y)
 
-        def moved(y: PyTree, increment: PyTree) -> PyTree:
-            # Any point will do for a translation.
-            field = at(y, increment)
-            there = flow(field, y)
+        def state_after(y: PyTree, increment: PyTree) -> PyTree:
+            # For a translation, which is the same everywhere, any point will do.
+            field = field_at(y, increment)
+            end = flow(field, y)
             return jtu.tree_map(
-                lambda f, y: y if is_field(f) else y + drawn(y), field, there, is_leaf=is_field
+                lambda f, y: y if is_field(f) else y + normal_like(y), field, end, is_leaf=is_field
             )
 
-        # Away from the start, and what is frozen at one of them as it is at the other.
-        first = moved(y, a)
-        second = moved(first, b)
+        # Both away from the start: the field is frozen at y1, and its velocity taken at y2.
+        y1 = state_after(y, a)
+        y2 = state_after(y1, b)
 
         def arrays(k: float, n: float) -> list[Array]:
-            both = jtu.tree_map(lambda a, b: k * a + n * b, a, b)
-            return _linear_in_field(at(first, both), second)
+            combination = jtu.tree_map(lambda a, b: k * a + n * b, a, b)
+            return _linear_arrays(field_at(y1, combination), y2)
 
-        is_off, has_drift = jnp.zeros((), bool), jnp.zeros((), bool)
+        is_nonlinear, has_drift = jnp.zeros((), bool), jnp.zeros((), bool)
         for x0, xa, xb, x in zip(
             *map(arrays, (0.0, 1.0, 0.0, 1.0), (0.0, 0.0, 1.0, 0.3)), strict=True
         ):
-            largest = lambda x: jnp.max(jnp.abs(x), initial=0)  # noqa: E731
-            eps, size = float(jnp.finfo(x.dtype).eps), largest(xa) + largest(xb)
-            # Half of the digits. What is zero is so but for terms that cancel.
-            is_off |= largest(x - (xa + 0.3 * xb)) > np.sqrt(eps) * size
-            has_drift |= largest(x0) > 100 * eps * size
-        return fault.with_case(is_off, _IS_NOT_LINEAR).with_case(has_drift, _HAS_DRIFT)
+            max_abs = lambda x: jnp.max(jnp.abs(x), initial=0)  # noqa: E731
+            eps, size = float(jnp.finfo(x.dtype).eps), max_abs(xa) + max_abs(xb)
+            # Half of the digits. A zero may be the rounding of terms that cancel.
+            is_nonlinear |= max_abs(x - (xa + 0.3 * xb)) > np.sqrt(eps) * size
+            has_drift |= max_abs(x0) > 100 * eps * size
+        return fault.with_case(is_nonlinear, _IS_NOT_LINEAR).with_case(has_drift, _HAS_DRIFT)
 
-    def _linearity(self, place: "_Place", control: PyTree) -> list[Linearity]:
-        """How what the field returns depends on the increment, as far as its program shows."""
+    def _linearity(self, vf: "_Unevaluated", control: PyTree) -> list[Linearity]:
+        """How the arrays of the field depend on the increment, as far as its program shows."""
 
         def arrays(control: PyTree, state: PyTree, args: PyTree) -> list[Array]:
             t, y, point = state
-            t, y, args = eqx.tree_at(lambda place: place.arrays, place, (t, y, args)).all()
-            return _linear_in_field(self.field(t, y, args, control), point)
+            t, y, args = eqx.tree_at(lambda vf: vf.arrays, vf, (t, y, args)).values()
+            return _linear_arrays(self.field(t, y, args, control), point)
 
-        t, y, args = place.arrays
-        found = linearity(arrays, control, (t, y, y), args)
-        for kind in found:
-            if kind.constant == "some":
+        t, y, args = vf.arrays
+        dependences = linearity(arrays, control, (t, y, y), args)
+        for dependence in dependences:
+            if dependence.constant == "some":
                 raise ValueError(_HAS_DRIFT)
-            if kind.power == 2:
+            if dependence.power == 2:
                 raise ValueError(_IS_NOT_LINEAR)
-        return found
+        return dependences
 
 
-def _linear_in_field(field: PyTree, point: PyTree) -> list[Array]:
-    """What is linear in a field: its coordinates, or its velocity at any point.
+def _linear_arrays(field: PyTree, point: PyTree) -> list[Array]:
+    """Arrays that are linear in a field: its leaves, or its velocity at a point.
 
-    A class that adds its arrays one by one has coordinates alone.
+    The leaves are linear if the class has the default `combine`.
     """
     parts, treedef = jtu.tree_flatten(field, is_leaf=lambda x: x is None or is_field(x))
-    found = []
+    arrays = []
     for part, y in zip(parts, treedef.flatten_up_to(point), strict=True):
-        linear = tangent(part, y) if is_field(part) and not _adds_arrays(type(part)) else part
-        found += [x for x in map(jnp.asarray, jtu.tree_leaves(linear)) if eqx.is_inexact_array(x)]
-    return found
-
-
-def _adds_arrays(kind: Any) -> bool:
-    return kind.combine.__func__ is vars(AbstractFrozenField)["combine"].__func__
+        has_velocity = is_field(part) and not has_default_combine(type(part))
+        linear = tangent(part, y) if has_velocity else part
+        arrays += [x for x in map(jnp.asarray, jtu.tree_leaves(linear)) if eqx.is_inexact_array(x)]
+    return arrays
 
 
 def fault_of_increments(
@@ -194,29 +191,32 @@ def fault_of_increments(
     y0: PyTree,
     args: PyTree,
 ) -> Fault:
-    """This, or that a term which a path drives is not linear in the increment."""
-    is_ours = lambda x: isinstance(x, LieControlTerm)  # noqa: E731
-    for term in filter(is_ours, jtu.tree_leaves(terms, is_leaf=is_ours)):
+    """`fault`, with a case for each term driven by a path that is not linear in the increment."""
+    is_control_term = lambda x: isinstance(x, LieControlTerm)  # noqa: E731
+    for term in filter(is_control_term, jtu.tree_leaves(terms, is_leaf=is_control_term)):
         control = eqx.filter_eval_shape(term.contr, t0, t1)
         fault = term.fault(fault, t0, y0, args, control)
     return fault
 
 
-class _Place(eqx.Module):
-    """Where the field is to be evaluated once the increment is known. Its leaves are arrays."""
+class _Unevaluated(eqx.Module):
+    """The arguments of a field that is evaluated once the increment is known.
+
+    diffrax takes it for the value of the vector field, so its leaves are arrays.
+    """
 
     arrays: PyTree
-    others: tuple[Any, ...] = eqx.field(static=True)
-    structure: Any = eqx.field(static=True)
+    static: tuple[Any, ...] = eqx.field(static=True)
+    treedef: Any = eqx.field(static=True)
 
     @classmethod
-    def of(cls, *values: Any) -> "_Place":
-        arrays, others = eqx.partition(values, eqx.is_array)
-        leaves, structure = jtu.tree_flatten(others)
-        return cls(arrays, tuple(leaves), structure)
+    def of(cls, *values: Any) -> "_Unevaluated":
+        arrays, static = eqx.partition(values, eqx.is_array)
+        leaves, treedef = jtu.tree_flatten(static)
+        return cls(arrays, tuple(leaves), treedef)
 
-    def all(self) -> Any:
-        return eqx.combine(self.arrays, jtu.tree_unflatten(self.structure, self.others))
+    def values(self) -> Any:
+        return eqx.combine(self.arrays, jtu.tree_unflatten(self.treedef, self.static))
 
 
 def paths(terms: PyTree[diffrax.AbstractTerm]) -> list[diffrax.AbstractPath]:

@@ -73,15 +73,15 @@ class AbstractFrozenField(eqx.Module):
     def tangent(self, point: Any) -> Any:
         """The ambient velocity at `point`, the derivative of the flow at time zero."""
 
-    # What diffrax's explicit methods try, and what its implicit ones do (`field**ω`), both in an
-    # error that says nothing to their user.
+    # diffrax's explicit methods try the first, its implicit ones the second (`field**ω`), and their
+    # own errors say nothing of the cause.
     def __array__(self, *args: Any, **kwargs: Any) -> Any:
-        raise TypeError(self._is_no_array())
+        raise TypeError(self._not_an_array_message())
 
     def __pow__(self, other: Any) -> Any:
-        raise TypeError(self._is_no_array())
+        raise TypeError(self._not_an_array_message())
 
-    def _is_no_array(self) -> str:
+    def _not_an_array_message(self) -> str:
         return (
             f"{type(self).__name__} is a frozen vector field and not an array. A solver of linear "
             "spaces cannot take it: use a method of cfjax, for example cfjax.CF4(), or give the "
@@ -115,10 +115,10 @@ class AbstractFrozenField(eqx.Module):
         """
         for path, leaf in jtu.tree_leaves_with_path(fields[0]):
             check_coordinates(f"{cls.__name__}{jtu.keystr(path)}", leaf)
-        structure = jtu.tree_structure(fields[0])
-        if any(jtu.tree_structure(field) != structure for field in fields[1:]):
-            kinds = " and ".join(dict.fromkeys(map(describe, fields)))
-            raise TypeError(f"Fields that are added must agree in all but arrays, got {kinds}.")
+        treedef = jtu.tree_structure(fields[0])
+        if any(jtu.tree_structure(field) != treedef for field in fields[1:]):
+            texts = " and ".join(dict.fromkeys(map(describe, fields)))
+            raise TypeError(f"Fields that are added must agree in all but arrays, got {texts}.")
         return jtu.tree_map(lambda *leaves: linear_combination(weights, leaves), *fields)
 
     def defect(self, point: Any) -> tuple[Real[Array, ""], str] | None:
@@ -243,15 +243,15 @@ def flow(field: PyTree, point: PyTree) -> PyTree:
             return p
         if not is_field(f):
             return p + f
-        moved = f.flow(p)
+        end = f.flow(p)
         # A point in the chart of a step may come back with more coordinates.
         is_state = f.acts_on_subtree or jtu.all_leaves([p])
-        if is_state and struct(moved) != struct(p):
+        if is_state and struct(end) != struct(p):
             raise ValueError(
                 f"{type(f).__name__}.flow must return what is shaped like its point, "
-                f"{describe(p)}, got {describe(moved)}. Shape and dtype must agree."
+                f"{describe(p)}, got {describe(end)}. Shape and dtype must agree."
             )
-        return moved
+        return end
 
     return jtu.tree_map(flow_leaf, field, point, is_leaf=_is_field_or_none)
 
@@ -281,7 +281,7 @@ def combine(weights: Sequence[Weight], fields: Sequence[PyTree]) -> PyTree:
     """
     parts, treedef = jtu.tree_flatten_with_path(fields[0], is_leaf=is_field)
     try:
-        others = [treedef.flatten_up_to(field) for field in fields[1:]]
+        later_parts = [treedef.flatten_up_to(field) for field in fields[1:]]
     except ValueError as error:
         structures = [describe(jtu.tree_map(_name, f, is_leaf=is_field)) for f in fields]
         raise TypeError(
@@ -292,8 +292,8 @@ def combine(weights: Sequence[Weight], fields: Sequence[PyTree]) -> PyTree:
         pairs = [(w, x) for w, x in zip(weights, leaves, strict=True) if not isinstance(x, Rest)]
         if not pairs:
             return leaves[0]
-        moving, leaves = zip(*pairs, strict=True)
-        if len({_kind(leaf) for leaf in leaves}) > 1:
+        part_weights, leaves = zip(*pairs, strict=True)
+        if len({_combining_class(leaf) for leaf in leaves}) > 1:
             names = " and ".join(dict.fromkeys(map(_name, leaves)))
             place = jtu.keystr(path) and f" at {jtu.keystr(path)}"
             raise TypeError(
@@ -301,24 +301,28 @@ def combine(weights: Sequence[Weight], fields: Sequence[PyTree]) -> PyTree:
                 "of a diffrax.MultiTerm, give each its own part of the state."
             )
         if is_field(leaves[0]):
-            return type(leaves[0]).combine(moving, leaves)
+            return type(leaves[0]).combine(part_weights, leaves)
         check_coordinates("A translation", leaves[0])
-        return linear_combination(moving, leaves)
+        return linear_combination(part_weights, leaves)
 
-    columns = zip(parts, *others, strict=True)
-    return treedef.unflatten(combine_part(path, part, *rest) for (path, part), *rest in columns)
+    columns = zip(parts, *later_parts, strict=True)
+    return treedef.unflatten(combine_part(path, part, *later) for (path, part), *later in columns)
 
 
 def _name(x: Any) -> str:
     return type(x).__name__ if is_field(x) else "a translation"
 
 
-def _kind(x: Any) -> Any:
-    """Of a field its class, or the one whose own `combine` it has inherited."""
+def _combining_class(x: Any) -> Any:
+    """The class of a field, or that from which it has inherited its own `combine`."""
     if not is_field(x):
         return None
     owner = next(c for c in type(x).__mro__ if "combine" in vars(c))
     return type(x) if owner is AbstractFrozenField else owner
+
+
+def has_default_combine(cls: Any) -> bool:
+    return cls.combine.__func__ is vars(AbstractFrozenField)["combine"].__func__
 
 
 def bracket(a: PyTree, b: PyTree) -> PyTree:
@@ -337,7 +341,7 @@ def bracket(a: PyTree, b: PyTree) -> PyTree:
         if isinstance(x, AbstractAlgebraElement):
             return x.bracket(y)
         if is_field(x):
-            raise TypeError(without_bracket(x))
+            raise TypeError(no_bracket_message(x))
         return jnp.zeros_like(x)
 
     return jtu.tree_map(bracket_leaf, a, b, is_leaf=is_field)
@@ -355,9 +359,9 @@ def dexpinv(a: PyTree, b: PyTree, degree: int) -> PyTree:
 
 def has_dexpinv(a: PyTree) -> Bool[Array, ""] | None:
     """Whether `dexpinv` at a has a value in all parts; None if nothing is known of any part."""
-    parts = [x.has_dexpinv() for x in jtu.tree_leaves(a, is_leaf=is_field) if is_field(x)]
-    known = [x for x in parts if x is not None]
-    return functools.reduce(jnp.logical_and, known) if known else None
+    flags = [x.has_dexpinv() for x in jtu.tree_leaves(a, is_leaf=is_field) if is_field(x)]
+    defined = [x for x in flags if x is not None]
+    return functools.reduce(jnp.logical_and, defined) if defined else None
 
 
 @functools.cache
@@ -374,8 +378,8 @@ def to_chart(field: PyTree, point: PyTree, earlier: Sequence[PyTree]) -> tuple[P
     parts, treedef = jtu.tree_flatten(field, is_leaf=is_field)
     columns = [treedef.flatten_up_to(tree) for tree in (point, *earlier)]
     charted = [
-        f.to_chart(p, before) if is_field(f) else (f, p)
-        for f, p, *before in zip(parts, *columns, strict=True)
+        f.to_chart(p, part_earlier) if is_field(f) else (f, p)
+        for f, p, *part_earlier in zip(parts, *columns, strict=True)
     ]
     # A state may have no parts.
     return tuple(treedef.unflatten([pair[k] for pair in charted]) for k in range(2))
@@ -388,7 +392,7 @@ def from_chart(field: PyTree, point: PyTree) -> PyTree:
     )
 
 
-def without_bracket(field: AbstractFrozenField) -> str:
+def no_bracket_message(field: AbstractFrozenField) -> str:
     return (
         f"A Munthe-Kaas method needs brackets, and {type(field).__name__} has none: it is an "
         "AbstractFrozenField but not an AbstractAlgebraElement. Use a commutator-free method, "

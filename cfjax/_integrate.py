@@ -99,7 +99,7 @@ def integrate(
     check_term_and_solver(term, solver)
     check_own_tolerances(solver)
     y0 = as_state(y0)
-    own = as_own(solver).without_estimate()
+    solver_to_run = as_own(solver).without_estimate()
     num_steps = count("num_steps", num_steps)
     save_every = None if save_every is None else count("save_every", save_every)
     if save_every is not None and num_steps % save_every:
@@ -114,7 +114,7 @@ def integrate(
         raise ValueError(
             "step_back needs no checkpoints: give either step_back or checkpoint_every, got both."
         )
-    if step_back and not own.is_symmetric:
+    if step_back and not solver_to_run.is_symmetric:
         raise ValueError(
             "step_back takes a symmetric solver, such as cfjax.Strang(), cfjax.ImplicitMidpoint() "
             f"or cfjax.Magnus4(), got {type(solver).__name__}. With others use checkpoint_every."
@@ -124,19 +124,19 @@ def integrate(
             "step_back takes no noise, or what else a path drives: use checkpoint_every."
         )
     dtype = time_dtype(y0)
-    if num_steps > _most_steps(dtype):
+    if num_steps > _max_steps(dtype):
         raise ValueError(
-            f"num_steps must be at most {_most_steps(dtype)} for times in {dtype}, as the times of "
+            f"num_steps must be at most {_max_steps(dtype)} for times in {dtype}, as the times of "
             f"more steps would coincide, got {num_steps}. Make y0 float64."
         )
     t0, t1 = time_scalar("t0", t0, dtype), time_scalar("t1", t1, dtype)
     args = jtu.tree_map(lambda x: jnp.asarray(x) if isinstance(x, float | complex) else x, args)
-    # In a program that somebody else compiles, an error is part of that. What else is traced, be it
-    # an argument or what a field closes over, shows in the results.
+    # In a program that the caller compiles, the check of errors is part of it. Other traced values,
+    # be they in `args` or in what a field closes over, show in the results.
     is_compiled = any(isinstance(x, Tracer) for x in (jnp.zeros(()), *jtu.tree_leaves((t0, y0))))
     solution, fault = equal_steps(
         term,
-        own,
+        solver_to_run,
         t0,
         t1,
         y0,
@@ -150,7 +150,7 @@ def integrate(
         throw_in_reverse=throw and step_back,
     )
     if throw and not is_compiled:
-        solution = _raised(solution, fault)
+        solution = _checked_solution(solution, fault)
     return solution
 
 
@@ -193,17 +193,17 @@ def equal_steps(
         # From the step's number, so that rounding does not add up, and t1 is met exactly.
         return jnp.where(n == num_steps, t1, t0 + n.astype(t0.dtype) * ((t1 - t0) / intervals))
 
-    def step(carry, by=1):
+    def step(carry, direction=1):
         n, y, solver_state, result = carry
         y, _, _, solver_state, step_result = solver.step(
-            term, time(n), time(n + by), y, args, solver_state, made_jump=False
+            term, time(n), time(n + direction), y, args, solver_state, made_jump=False
         )
         # What the last state shows as well need not be in the loop: one of small steps feels every
         # operation.
         if not solver.shows_failure and step_result is not diffrax.RESULTS.successful:
             is_first = result == diffrax.RESULTS.successful
             result = diffrax.RESULTS.where(is_first, step_result, result)
-        return (n + by, y, solver_state, result)
+        return (n + direction, y, solver_state, result)
 
     solver_state, fault = solver.start(term, t0, time(n + 1), y0, args)
     fault = fault.with_case(
@@ -213,33 +213,33 @@ def equal_steps(
         "make y0 float64.",
     )
     is_static = isinstance(num_steps, int)
-    length = num_steps if is_static else jnp.where(fault.number == 0, num_steps, 0)
+    valid_num_steps = num_steps if is_static else jnp.where(fault.number == 0, num_steps, 0)
     zero = (fault.error if throw else fault.nan)(jnp.zeros((), t0.dtype))
     # Not the times: if these are constants, CF54 on a heavy top takes less than half the time.
     start = needing(zero, y0)
     carry = (n, start, solver_state, diffrax.RESULTS.successful)
     solver = solver.for_equal_steps(term, (t1 - t0) / intervals, t0, y0, args)
 
-    def advance(carry, number):
+    def advance(carry, length):
         if step_back:
-            back = lambda carry: step(carry, -1)  # noqa: E731
+            backward = lambda carry: step(carry, -1)  # noqa: E731
             # What a function closes over becomes an argument, which has a derivative.
-            there = eqx.filter_closure_convert(step, carry)
-            back = eqx.filter_closure_convert(back, carry)
-            several = lambda step, carry, number: repeat(step, carry, number)[0]  # noqa: E731
-            return repeat_and_undo(several, there, back, carry, number, throw_in_reverse)
+            forward = eqx.filter_closure_convert(step, carry)
+            backward = eqx.filter_closure_convert(backward, carry)
+            repeat_carry = lambda step, carry, length: repeat(step, carry, length)[0]  # noqa: E731
+            return repeat_and_undo(repeat_carry, forward, backward, carry, length, throw_in_reverse)
         # XLA would scalarise a loop of one turn, and compute the step anew for each of its uses.
-        if isinstance(number, int) and number == 1:
+        if isinstance(length, int) and length == 1:
             return step(carry)
         if checkpoint_every is None:
-            return repeat(step, carry, number)[0]
-        length, rest = checkpoint_every, number % checkpoint_every
-        block = jax.checkpoint(lambda carry: repeat(step, carry, length)[0])
-        carry, _ = lax.scan(lambda x, _: (block(x), None), carry, length=number // length)
-        return repeat(step, carry, rest)[0]
+            return repeat(step, carry, length)[0]
+        block_length, remainder = checkpoint_every, length % checkpoint_every
+        block = jax.checkpoint(lambda carry: repeat(step, carry, block_length)[0])
+        carry, _ = lax.scan(lambda x, _: (block(x), None), carry, length=length // block_length)
+        return repeat(step, carry, remainder)[0]
 
     def steps_and_save(carry, _):
-        carry = advance(carry, length if save_every is None else save_every)
+        carry = advance(carry, valid_num_steps if save_every is None else save_every)
         return carry, carry[1]
 
     num_saves: Any = 1 if save_every is None else num_steps // save_every
@@ -253,7 +253,7 @@ def equal_steps(
         else n + save_every * jnp.arange(1, num_saves + 1, dtype=n.dtype)
     )
     if save_initial:
-        prepend = lambda first, rest: jnp.concatenate([first[None], rest])  # noqa: E731
+        prepend = lambda initial, rest: jnp.concatenate([initial[None], rest])  # noqa: E731
         ts, ys = jtu.tree_map(prepend, (t0, start), (ts, ys))
     ts, end = needing(zero, (ts, t1))
     # Of the saved states alone, outside the loop: sums and products keep infinity and NaN, so a
@@ -262,9 +262,9 @@ def equal_steps(
     if solver.shows_failure:
         ys = error_if(ys, lambda ys: ~is_finite(ys), _BLOW_UP) if throw else ys
     else:
-        is_known = carry[3] != diffrax.RESULTS.successful
-        result = diffrax.RESULTS.where(is_known, carry[3], result)
-        ys = needing(_error_of(result), ys) if throw else ys
+        has_failed = carry[3] != diffrax.RESULTS.successful
+        result = diffrax.RESULTS.where(has_failed, carry[3], result)
+        ys = needing(_zero_or_error(result), ys) if throw else ys
     solution = diffrax.Solution(
         t0=t0,
         t1=end,
@@ -281,11 +281,11 @@ def equal_steps(
     return solution, fault.with_case(~is_finite(y0), _NOT_FINITE)
 
 
-def _raised(solution: diffrax.Solution, fault: Fault) -> diffrax.Solution:
-    """The solution, or the error that it is."""
+def _checked_solution(solution: diffrax.Solution, fault: Fault) -> diffrax.Solution:
+    """The solution; raises the error that `fault` or its result reports."""
     if any(isinstance(x, Tracer) for x in jtu.tree_leaves((fault, solution.result))):
         # `jax.vmap` or a derivative outside of a program.
-        zero = fault.error(jnp.zeros(())) + _error_of(solution.result)
+        zero = fault.error(jnp.zeros(())) + _zero_or_error(solution.result)
         return eqx.tree_at(lambda s: s.ys, solution, needing(zero, solution.ys))
     if jtu.tree_leaves(solution.ys):
         if number := int(fault.number):
@@ -298,7 +298,7 @@ def _raised(solution: diffrax.Solution, fault: Fault) -> diffrax.Solution:
     return solution
 
 
-def _most_steps(dtype: Any) -> int:
+def _max_steps(dtype: Any) -> int:
     """How many steps can be counted in the dtype of the times."""
     return 2 ** (jnp.finfo(dtype).nmant + 1)
 
@@ -312,13 +312,13 @@ def _is_short(
     """
     start, end = lax.stop_gradient((t0, t1))
     largest = jnp.maximum(jnp.abs(start), jnp.abs(end))
-    unit = largest - jnp.nextafter(largest, jnp.zeros_like(largest))
-    is_short = (start != end) & (jnp.abs(end - start) / num_steps < unit)
-    return is_short | (num_steps > _most_steps(t0.dtype))
+    spacing = largest - jnp.nextafter(largest, jnp.zeros_like(largest))
+    is_short = (start != end) & (jnp.abs(end - start) / num_steps < spacing)
+    return is_short | (num_steps > _max_steps(t0.dtype))
 
 
-def _error_of(result: diffrax.RESULTS) -> Real[Array, ""]:
-    """Zero, or the error that a result is."""
+def _zero_or_error(result: diffrax.RESULTS) -> Real[Array, ""]:
+    """Zero, or a runtime error if the result is a failure."""
     # equinox takes the largest number of a result, and an empty batch has none.
     worst = jtu.tree_map(max_over_batch, result)
     return worst.error_if(jnp.zeros(()), result != diffrax.RESULTS.successful)

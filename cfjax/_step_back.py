@@ -1,4 +1,4 @@
-"""Equal steps whose reverse mode undoes them, so that it keeps the end alone."""
+"""Equal steps whose reverse mode undoes them, so that its only residual is the end."""
 
 from collections.abc import Callable
 from typing import Any
@@ -35,63 +35,63 @@ def repeat_and_undo(
     Both are pytrees, whose arrays have derivatives too. The second entry of a carry is the state.
     Where the way back misses the start, the derivative is NaN, or an error if `throw`.
     """
-    moving, rest = _parts((carry, step))
-    rest, static = eqx.partition((rest, back), eqx.is_array)
+    diff, nondiff = _partition_inexact((carry, step))
+    nondiff, static = eqx.partition((nondiff, back), eqx.is_array)
 
     @jax.custom_vjp
-    def steps(moving: PyTree, rest: PyTree) -> PyTree:
-        rest, _ = eqx.combine(rest, static)
-        carry, step = eqx.combine(moving, rest)
+    def steps(diff: PyTree, nondiff: PyTree) -> PyTree:
+        nondiff, _ = eqx.combine(nondiff, static)
+        carry, step = eqx.combine(diff, nondiff)
         return repeat(lambda carry: step(carry), carry, num_steps)
 
-    def forward(moving: PyTree, rest: PyTree) -> tuple[PyTree, PyTree]:
-        end = steps(moving, rest)
-        return end, (moving, rest, end)
+    def forward(diff: PyTree, nondiff: PyTree) -> tuple[PyTree, PyTree]:
+        end = steps(diff, nondiff)
+        return end, (diff, nondiff, end)
 
-    def backward(kept: PyTree, derivative: PyTree) -> tuple[PyTree, None]:
-        moving, rest, end = kept
-        rest, back = eqx.combine(rest, static)
-        fixed = rest[1]
+    def backward(residuals: PyTree, ct: PyTree) -> tuple[PyTree, None]:
+        diff, nondiff, end = residuals
+        nondiff, back = eqx.combine(nondiff, static)
+        nondiff_step = nondiff[1]
 
         def undo(state: tuple[PyTree, ...], _: None) -> tuple[Any, None]:
-            carry, of_end, of_step, sizes = state
+            carry, end_ct, step_ct, sizes = state
             carry = back(carry)
-            varying, rest = _parts(carry)
+            diff_carry, nondiff = _partition_inexact(carry)
 
-            def stepped(varying: PyTree, moving: PyTree) -> PyTree:
-                step = eqx.combine(moving, fixed)
-                return _parts(step(eqx.combine(varying, rest)))[0]
+            def diff_step(diff_carry: PyTree, diff: PyTree) -> PyTree:
+                step = eqx.combine(diff, nondiff_step)
+                return _partition_inexact(step(eqx.combine(diff_carry, nondiff)))[0]
 
-            _, pullback = jax.vjp(stepped, varying, moving[1])
-            of_start, more = pullback(of_end)
-            of_step = jtu.tree_map(jnp.add, of_step, more)
-            sizes = jtu.tree_map(lambda most, y: jnp.maximum(most, size(y)), sizes, carry[1])
-            return (carry, of_start, of_step, sizes), None
+            _, pullback = jax.vjp(diff_step, diff_carry, diff[1])
+            start_ct, step_ct_part = pullback(end_ct)
+            step_ct = jtu.tree_map(jnp.add, step_ct, step_ct_part)
+            sizes = jtu.tree_map(lambda largest, y: jnp.maximum(largest, size(y)), sizes, carry[1])
+            return (carry, start_ct, step_ct, sizes), None
 
-        of_end = eqx.filter(derivative, jtu.tree_map(eqx.is_inexact_array, end))
-        state = end, of_end, jtu.tree_map(jnp.zeros_like, moving[1]), jtu.tree_map(size, end[1])
-        (found, *derivatives, sizes), _ = lax.scan(undo, state, length=num_steps)
-        start, step = eqx.combine(moving, rest)
+        end_ct = eqx.filter(ct, jtu.tree_map(eqx.is_inexact_array, end))
+        state = end, end_ct, jtu.tree_map(jnp.zeros_like, diff[1]), jtu.tree_map(size, end[1])
+        (undone, *cts, sizes), _ = lax.scan(undo, state, length=num_steps)
+        start, step = eqx.combine(diff, nondiff)
 
-        def moved(y: PyTree) -> PyTree:
+        def state_after_step(y: PyTree) -> PyTree:
             return step(eqx.tree_at(lambda carry: carry[1], start, y))[1]
 
-        misses = _misses(moved, start[1], found[1], sizes)
+        misses = _misses(state_after_step, start[1], undone[1], sizes)
         fault = Fault.none().with_case(misses, _MISSED)
         zero = (fault.error if throw else fault.nan)(jnp.zeros(()))
-        return jtu.tree_map(lambda x: x + zero.astype(x.dtype), tuple(derivatives)), None
+        return jtu.tree_map(lambda x: x + zero.astype(x.dtype), tuple(cts)), None
 
     steps.defvjp(forward, backward)
-    return steps(moving, rest)
+    return steps(diff, nondiff)
 
 
-def _parts(tree: PyTree) -> tuple[PyTree, PyTree]:
-    """What has a derivative, and the rest."""
+def _partition_inexact(tree: PyTree) -> tuple[PyTree, PyTree]:
+    """The leaves that have derivatives, and all others."""
     return eqx.partition(tree, eqx.is_inexact_array)
 
 
 def _misses(
-    step: Callable[[PyTree], PyTree], start: PyTree, found: PyTree, sizes: PyTree
+    step: Callable[[PyTree], PyTree], start: PyTree, undone: PyTree, sizes: PyTree
 ) -> Bool[Array, ""]:
     """Whether an array of the state is off by more than half of its digits.
 
@@ -100,21 +100,23 @@ def _misses(
     in half of their digits.
     """
 
-    def half(x: Array, own: Real[Array, ""]) -> Real[Array, ""]:
-        return float(jnp.finfo(x.dtype).eps) ** 0.5 * own
+    def tolerance(x: Array, scale: Real[Array, ""]) -> Real[Array, ""]:
+        return float(jnp.finfo(x.dtype).eps) ** 0.5 * scale
 
-    allowed = jtu.tree_map(half, start, sizes)
-    _, moves = jax.jvp(step, (start,), (jtu.tree_map(_change, start, allowed),))
+    tolerances = jtu.tree_map(tolerance, start, sizes)
+    _, changes = jax.jvp(step, (start,), (jtu.tree_map(_perturbation, start, tolerances),))
 
-    def part(start: Array, found: Array, own: Real[Array, ""], move: Array) -> Bool[Array, ""]:
+    def is_off(
+        start: Array, undone: Array, scale: Real[Array, ""], change: Array
+    ) -> Bool[Array, ""]:
         # True for NaN.
-        return ~(size(found - start) <= jnp.maximum(own, size(move)))
+        return ~(size(undone - start) <= jnp.maximum(scale, size(change)))
 
-    parts = jtu.tree_map(part, start, found, allowed, moves)
-    return jnp.any(jnp.asarray(jtu.tree_leaves(parts), bool))
+    are_off = jtu.tree_map(is_off, start, undone, tolerances, changes)
+    return jnp.any(jnp.asarray(jtu.tree_leaves(are_off), bool))
 
 
-def _change(x: Array, by: Real[Array, ""]) -> Inexact[Array, "..."]:
-    """A change of all entries by up to this, in which no symmetry hides what depends on them."""
-    change = by * jnp.cos(jnp.arange(x.size, dtype=by.dtype)).reshape(x.shape)
+def _perturbation(x: Array, amplitude: Real[Array, ""]) -> Inexact[Array, "..."]:
+    """A change of all entries by up to `amplitude`, with no symmetry that could hide its effect."""
+    change = amplitude * jnp.cos(jnp.arange(x.size, dtype=amplitude.dtype)).reshape(x.shape)
     return (1 + 1j) * change if jnp.iscomplexobj(x) else change

@@ -63,7 +63,7 @@ class LieTerm(diffrax.AbstractTerm):
 
 
 def product(terms: diffrax.AbstractTerm, value: PyTree, control: PyTree) -> PyTree:
-    """The product of what a term's vector field returned with its control: a frozen field.
+    """The product of the value of a term's vector field and the control: a frozen field.
 
     `diffrax.MultiTerm` would add the arrays within the fields of its terms, whatever they are, a
     spectrum too.
@@ -72,8 +72,8 @@ def product(terms: diffrax.AbstractTerm, value: PyTree, control: PyTree) -> PyTr
     fields are of different kinds.
     """
     if isinstance(terms, diffrax.MultiTerm):
-        parts = [product(*each) for each in zip(terms.terms, value, control, strict=True)]
-        return combine([1.0] * len(parts), parts)
+        products = [product(*each) for each in zip(terms.terms, value, control, strict=True)]
+        return combine([1.0] * len(products), products)
     if not any(map(is_field, jtu.tree_leaves(value, is_leaf=is_field))):
         return terms.prod(value, control)
     if isinstance(value, tuple) and isinstance(control, tuple):
@@ -92,15 +92,15 @@ def product(terms: diffrax.AbstractTerm, value: PyTree, control: PyTree) -> PyTr
 
 
 def velocity(terms: diffrax.AbstractTerm, value: PyTree, y: PyTree) -> PyTree:
-    """The velocity at `y` of what a term's vector field returned there, shaped like the state.
+    """The velocity at `y` of the value of a term's vector field there, shaped like the state.
 
     That of a `diffrax.MultiTerm` is the sum. Where a term has a control of another kind than time
     there is no velocity, and this is the value itself, as in diffrax's own solvers.
     """
     if isinstance(terms, diffrax.MultiTerm):
-        parts = [velocity(*each, y) for each in zip(terms.terms, value, strict=True)]
-        if all(struct(part) == struct(y) for part in parts):
-            return combine([1.0] * len(parts), parts)
+        velocities = [velocity(*each, y) for each in zip(terms.terms, value, strict=True)]
+        if all(struct(v) == struct(y) for v in velocities):
+            return combine([1.0] * len(velocities), velocities)
         return value
     if any(map(is_field, jtu.tree_leaves(value, is_leaf=is_field))):
         return tangent(value, y)
@@ -108,7 +108,7 @@ def velocity(terms: diffrax.AbstractTerm, value: PyTree, y: PyTree) -> PyTree:
 
 
 def checked(field: PyTree, y: PyTree) -> PyTree:
-    """What a term's function returned, once it is sure to act on `y`.
+    """The field that a term's function returned, checked to act on `y`.
 
     **Raises** `TypeError` or `ValueError` that names the part of the state.
     """
@@ -148,9 +148,9 @@ def checked_part(place: str, part: Any, point: PyTree) -> Any:
         try:
             velocity = eqx.filter_eval_shape(type(part).tangent, part, point)
         except (TypeError, ValueError) as error:
-            # Not the error's own class: some of JAX's are not made from a text.
-            kind = TypeError if isinstance(error, TypeError) else ValueError
-            raise kind(
+            # Not the error's own class: some of JAX's cannot be created from a text.
+            error_type = TypeError if isinstance(error, TypeError) else ValueError
+            raise error_type(
                 f"The field returned {name} for {place}, where the state is {describe(point)}. "
                 f"It does not act there: {error}"
             ) from error
@@ -158,7 +158,7 @@ def checked_part(place: str, part: Any, point: PyTree) -> Any:
             raise ValueError(
                 f"The field returned {name} for {place}. Its tangent is {describe(velocity)}, but "
                 f"the state is {describe(point)} there. Shape and dtype must agree."
-                f"{_make_complex(velocity, point)}"
+                f"{_complex_advice(velocity, point)}"
             )
         _check_precision(place, part, point)
         return part
@@ -174,12 +174,12 @@ def checked_part(place: str, part: Any, point: PyTree) -> Any:
         raise ValueError(
             f"The field returned a translation of type {describe(part)} for {place}, where the "
             f"state is {describe(point)}. Shape and dtype must agree, and be floating or complex."
-            f"{_make_complex(part, point)}"
+            f"{_complex_advice(part, point)}"
         )
     return jnp.asarray(part)
 
 
-def _make_complex(velocity: PyTree, point: PyTree) -> str:
+def _complex_advice(velocity: PyTree, point: PyTree) -> str:
     is_complex = [any(map(jnp.iscomplexobj, jtu.tree_leaves(x))) for x in (velocity, point)]
     advice = " The field is complex and the state is real: make y0 complex."
     return advice if is_complex == [True, False] else ""

@@ -1,4 +1,4 @@
-"""What all Lie group methods are to diffrax: one-step maps made of flows."""
+"""The interface of Lie group methods to diffrax, and the start of a solve."""
 
 import copy
 from collections.abc import Sequence
@@ -13,7 +13,7 @@ from jax import lax
 from jaxtyping import Array, Bool, PyTree, Real
 
 from .._control_term import fault_of_increments, is_driven
-from .._field import is_field
+from .._field import combine, is_field
 from .._methods.order_conditions import order
 from .._numerics.checks import Fault
 from .._term import product, velocity
@@ -21,11 +21,8 @@ from .solver import AbstractSolver
 from .sums import Sums
 
 
-class _OfInstances(property):
-    """A property that tells those who ask the class for it that they forgot the brackets.
-
-    An `AttributeError`, as for any other attribute that a class does not have.
-    """
+class _InstanceProperty(property):
+    """A property of instances. On the class it is an `AttributeError` that asks for an instance."""
 
     def __get__(self, instance: Any, owner: type | None = None) -> Any:
         if instance is None and owner is not None:
@@ -45,14 +42,14 @@ class AbstractLieSolver(AbstractSolver):
 
     term_structure: ClassVar = diffrax.AbstractTerm
     # What diffrax asks a solver for first.
-    term_compatible_contr_kwargs = _OfInstances(lambda self: {})
+    term_compatible_contr_kwargs = _InstanceProperty(lambda self: {})
 
     @property
     def shows_failure(self) -> bool:
         return True
 
     def strong_order(self, terms) -> float:
-        """That of any noise. It is 1 if the noise commutes."""
+        """The strong order for any noise. It is 1 if the noise commutes."""
         return 0.5
 
     @property
@@ -61,7 +58,7 @@ class AbstractLieSolver(AbstractSolver):
         return False
 
     def init(self, terms, t0, t1, y0, args) -> "State":
-        """Checks the times and the start, and makes the state of the solver.
+        """Checks the times and the start, and returns the state of the solver.
 
         **Raises** a runtime error for a time that is NaN, or a start off the manifold that a field
         acts on.
@@ -75,11 +72,11 @@ class AbstractLieSolver(AbstractSolver):
         # with no call of the host.
         self = self.for_terms(terms)
 
-        def at_start(y0):
+        def field_and_compensation(y0):
             field = product(terms, terms.vf(t0, y0, args), terms.contr(t0, t1))
             return field, Sums.of(field, y0).compensation
 
-        field, compensation = eqx.filter_eval_shape(at_start, y0)
+        field, compensation = eqx.filter_eval_shape(field_and_compensation, y0)
         compensation = Sums(y0, compensation).zeros()
         first = terms.vf(t0, y0, args) if self.first_same_as_last else None
         fault = fault_of_start(t0, t1, (field,), y0)
@@ -104,18 +101,18 @@ class AbstractLieSolver(AbstractSolver):
         return self._with(unroll=True) if hasattr(self, "unroll") else self
 
     def _with(self, **fields: Any) -> "AbstractLieSolver":
-        changed = copy.copy(self)
+        solver = copy.copy(self)
         for name, value in fields.items():
-            # As dataclasses do. Not every solver is made from its fields.
-            object.__setattr__(changed, name, value)
-        return changed
+            # As dataclasses do: not every solver has an `__init__` that takes its fields.
+            object.__setattr__(solver, name, value)
+        return solver
 
     def func(self, terms, t0, y0, args) -> Any:
-        """The velocity at `y0`, shaped like it. A control that is not time has diffrax's own."""
+        """The velocity at `y0`, shaped like it; for a control other than time see `velocity`."""
         return velocity(terms, terms.vf(t0, y0, args), y0)
 
 
-class AbstractOfTableau(AbstractLieSolver):
+class AbstractTableauSolver(AbstractLieSolver):
     """A method whose order is that of its tableau."""
 
     tableau: eqx.AbstractVar[Any]
@@ -140,6 +137,16 @@ def check_choice(name: str, value: Any, *choices: Any) -> None:
     if not any(value is x or (isinstance(x, str) and value == x) for x in choices):
         texts = list(map(repr, choices))
         raise ValueError(f"{name} must be {', '.join(texts[:-1])} or {texts[-1]}, got {value!r}.")
+
+
+def combine_nonzero(weights: Sequence[Any], fields: Sequence[PyTree]) -> PyTree:
+    """The combination without the fields of weight zero. Either may have fewer entries."""
+    terms = [(float(w), f) for w, f in zip(weights, fields, strict=False) if w != 0]
+    return combine(*zip(*terms, strict=True))
+
+
+def without_trailing_zeros(row: Sequence[Any]) -> tuple[Any, ...]:
+    return tuple(row[: max((k for k, x in enumerate(row, 1) if x != 0), default=0)])
 
 
 def is_finite(y: PyTree) -> Bool[Array, ""]:
@@ -168,12 +175,12 @@ def time_at(c: Any, t0: Any, t1: Any) -> Any:
 
 
 class State(eqx.Module):
-    """What a solver keeps from step to step.
+    """The solver's state from step to step.
 
     - `compensation`: what rounding has cut off the parts of the state that are compensated sums.
-    - `first`: the field at the start of the next step, where the last evaluation was there.
-    - `zero`: carries the checks of the start. Every step needs it, as diffrax drops what no step
-      uses.
+    - `first`: the value of the field at the start of the next step, if the last step ended with it.
+    - `zero`: carries the checks of the start. Every step uses it, as otherwise diffrax would drop
+      it.
     """
 
     compensation: PyTree
@@ -200,14 +207,14 @@ def _off_manifold(fault: Fault, part: Any, place: str, point: PyTree) -> Fault:
     defect = part.defect(point) if is_field(part) else None
     if defect is None:
         return fault
-    off, expected = lax.stop_gradient(defect[0]), defect[1]
+    distance, condition = lax.stop_gradient(defect[0]), defect[1]
     # Within it one step of Newton's method, which the fields take, leads to the manifold. NaN has
     # an error of its own.
-    least = float(np.sqrt(jnp.finfo(off.dtype).eps))
-    for x in (least, *(level for level in _LEVELS if level > least)):
+    threshold = float(np.sqrt(jnp.finfo(distance.dtype).eps))
+    for level in (threshold, *(x for x in _LEVELS if x > threshold)):
         fault = fault.with_case(
-            off > x,
+            distance > level,
             f"y{place} must start on the manifold that {type(part).__name__} acts on: y0{place} "
-            f"must have {expected}, and is off by more than {x:.1g}.",
+            f"must have {condition}, and is off by more than {level:.1g}.",
         )
     return fault

@@ -1,6 +1,5 @@
 """Commutator-free methods: one step for every tableau."""
 
-from collections.abc import Sequence
 from typing import ClassVar, Literal
 
 import diffrax
@@ -11,20 +10,20 @@ from jax import lax
 from jaxtyping import Array, Inexact, PyTree
 
 from .._control_term import is_driven
-from .._field import combine, tangent
+from .._field import tangent
 from .._methods import pairs as _pairs
 from .._methods import tableau as _tableau
 from .._methods.continuous_extension import continuous_extension
 from .._methods.tableau import Product, Row, Tableau
 from .._numerics.vectors import smooth
-from .base import AbstractOfTableau, check_choice
+from .base import AbstractTableauSolver, check_choice, combine_nonzero, without_trailing_zeros
 from .compiled import materialised_if_long, materialised_together
 from .dense import Path
 from .stages import Stages, rolled
 from .step import AbstractChartSolver, Chart, Step
 
 
-class AbstractCommutatorFree(AbstractOfTableau, AbstractChartSolver):
+class AbstractCommutatorFree(AbstractTableauSolver, AbstractChartSolver):
     """Flows of linear combinations of frozen fields, and no commutator.
 
     If the tableau has an embedded method, the error estimate is `y1 - embedded`, the difference of
@@ -70,32 +69,34 @@ class AbstractCommutatorFree(AbstractOfTableau, AbstractChartSolver):
         chart, fields, points = self.stages(chart)
         end = points[beta]
         if self.first_same_as_last:
-            # The end, the last field and the error are made of it.
+            # The state, the last field and the error use it.
             end = materialised_if_long(end)
         points = {**points, beta: end}
         # All that follows is for error control and output within the step. The compiler leaves it
         # out where the caller asks for neither.
-        within, last = continuous_extension(tableau), None
-        if any(map(tableau.uses_last, (embedded or (), *within))):
+        extension, last = continuous_extension(tableau), None
+        if any(map(tableau.uses_last, (embedded or (), *extension))):
             last = chart.value_at(1.0, end)
             fields = [*fields, chart.frozen(last, end, fields)]
-        path = Path.of(within, chart.origin, fields)
+        path = Path.of(extension, chart.origin, fields)
         if embedded is None:
             return Step(chart.end(end), path, last=last)
         if self.estimate == "algebra":
-            difference = _combined(_difference(embedded, tableau.beta), fields)
+            difference = combine_nonzero(_difference(embedded, tableau.beta), fields)
             error = tangent(difference, chart.state(end))
         else:
-            points = reached(trimmed(embedded), Stages(chart, fields, points))
+            points = with_product(trimmed(embedded), Stages(chart, fields, points))
             error = chart.difference(end, points[trimmed(embedded)])
         if not tableau.uses_last(embedded):
             return Step(chart.end(end), path, error, last)
-        before = trimmed(tableau.alpha[-1])
-        apart = chart.difference(end, reached(before, Stages(chart, fields, points))[before])
-        # All of them are needed before the ratio of their sizes.
-        end, error, apart = materialised_together((chart.end(end), error, apart))
-        error = jtu.tree_map(_seen, error, apart, chart.sums.way(end))
-        return Step(end, path, error, last, is_shared=True)
+        last_stage = trimmed(tableau.alpha[-1])
+        gap = chart.difference(
+            end, with_product(last_stage, Stages(chart, fields, points))[last_stage]
+        )
+        # The ratio of their sizes needs all of their entries.
+        end, error, gap = materialised_together((chart.end(end), error, gap))
+        error = jtu.tree_map(_larger_estimate, error, gap, chart.sums.displacement(end))
+        return Step(end, path, error, last, is_materialised=True)
 
     def stages(self, chart: Chart) -> Stages:
         """The fields of the stages, and the points at them and at the end."""
@@ -109,19 +110,19 @@ class AbstractCommutatorFree(AbstractOfTableau, AbstractChartSolver):
         prefixes = {rows[:n] for rows in (*alpha, beta) for n in range(1, len(rows))}
         fields, points = [chart.first], {(): chart.start}
         for c, rows in list(zip(tableau.c, alpha, strict=True))[1:]:
-            points = reached(rows, Stages(chart, fields, points))
+            points = with_product(rows, Stages(chart, fields, points))
             if rows in prefixes:
                 points = {**points, rows: chart.branching(points[rows])}
             fields = [*fields, chart.field(float(c), points[rows], fields)]
-        return Stages(chart, fields, reached(beta, Stages(chart, fields, points)))
+        return Stages(chart, fields, with_product(beta, Stages(chart, fields, points)))
 
     @property
     def _embedded(self) -> Product | None:
         return None if self.estimate is None else self.tableau.embedded
 
 
-def reached(rows: Product, stages: Stages) -> dict[Product, PyTree]:
-    """The points of the stages, and that where a product of flows leads.
+def with_product(rows: Product, stages: Stages) -> dict[Product, PyTree]:
+    """The points of the stages, and the point to which a product of flows leads.
 
     Rows that begin alike share their flows. (The paper's "reusing flow calculations".)
     """
@@ -130,45 +131,40 @@ def reached(rows: Product, stages: Stages) -> dict[Product, PyTree]:
         return points
     if not rows:
         return {**points, rows: chart.start}
-    points = reached(rows[:-1], stages)
-    return {**points, rows: chart.flow(_combined(rows[-1], fields), points[rows[:-1]])}
-
-
-def _combined(row: Row, fields: Sequence[PyTree]) -> PyTree:
-    used = [(float(a), f) for a, f in zip(row, fields, strict=False) if a != 0]
-    return combine(*zip(*used, strict=True))
+    points = with_product(rows[:-1], stages)
+    return {**points, rows: chart.flow(combine_nonzero(rows[-1], fields), points[rows[:-1]])}
 
 
 def trimmed(rows: Product) -> Product:
     """The rows without zeros at their ends, so that equal flows have equal rows."""
-    return tuple(row[: 1 + max(k for k, a in enumerate(row) if a != 0)] for row in rows)
+    return tuple(map(without_trailing_zeros, rows))
 
 
 def _difference(a: Product, b: Product) -> Row:
     """The sum of all rows of a less that of b, which may have fewer entries."""
-    rest = [[-entry for entry in row] + [0] * (len(a[0]) - len(row)) for row in b]
-    return tuple(sum(column) for column in zip(*a, *rest, strict=True))
+    negated = [[-entry for entry in row] + [0] * (len(a[0]) - len(row)) for row in b]
+    return tuple(sum(column) for column in zip(*a, *negated, strict=True))
 
 
-# It chooses by a comparison, of which no more than rounding decides either.
+# Where its comparison is decided by rounding, both branches are equally good.
 @smooth
-def _seen(
-    error: Inexact[Array, "..."], apart: Inexact[Array, "..."], way: Inexact[Array, "..."]
+def _larger_estimate(
+    error: Inexact[Array, "..."], gap: Inexact[Array, "..."], displacement: Inexact[Array, "..."]
 ) -> Inexact[Array, "..."]:
-    """The estimate, or `apart` times |apart| / (|way| + |apart|) where that is larger.
+    """The estimate, or `gap` times |gap| / (|displacement| + |gap|) where that is larger.
 
     An embedded method that compares the fields at the end and at the last stage sees only how the
-    field changes with the state. How far these points are `apart` shows how it changes with time
-    too. It is of order 3 in the step, so with this factor of order 5, and makes no estimate of
-    order 4 worse.
+    field changes with the state. The gap between these points shows how it changes with time too.
+    It is of order 3 in the step, so with this factor of order 5, and makes no estimate of order 4
+    worse.
     """
-    error_square, apart_square, way_square = (
-        lax.stop_gradient(jnp.sum(jnp.square(jnp.abs(x)))) for x in (error, apart, way)
+    error_square, gap_square, displacement_square = (
+        lax.stop_gradient(jnp.sum(jnp.square(jnp.abs(x)))) for x in (error, gap, displacement)
     )
-    total = jnp.sqrt(apart_square) + jnp.sqrt(way_square)
-    factor = jnp.sqrt(apart_square) / jnp.where(total > 0, total, 1)
-    other = apart * factor.astype(apart.dtype)
-    return jnp.where(factor * factor * apart_square > error_square, other, error)
+    total = jnp.sqrt(gap_square) + jnp.sqrt(displacement_square)
+    factor = jnp.sqrt(gap_square) / jnp.where(total > 0, total, 1)
+    gap_estimate = gap * factor.astype(gap.dtype)
+    return jnp.where(factor * factor * gap_square > error_square, gap_estimate, error)
 
 
 class CommutatorFree(

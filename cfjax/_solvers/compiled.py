@@ -1,7 +1,7 @@
-"""How a step is compiled. Of this folder only this file knows `_xla`.
+"""How a step is compiled. In this folder only this file imports `_xla`.
 
-A step says of its values that several results need them, and what of it may be one loop. What
-becomes of that in the program is decided in `_xla`.
+A step marks values that several results need, and what may be one loop. `_xla` decides what the
+program makes of these marks.
 """
 
 from collections.abc import Callable, Sequence
@@ -34,19 +34,19 @@ def control_of(terms: diffrax.AbstractTerm, t0: Any, t1: Any, **kwargs: Any) -> 
     return computed_once(control) if is_driven(terms) else control
 
 
-def by_turns(
-    body: Callable[[PyTree, Any], tuple[PyTree, PyTree]], carry: PyTree, turns: Sequence[Any]
+def scan_list(
+    body: Callable[[PyTree, Any], tuple[PyTree, PyTree]], carry: PyTree, xs: Sequence[Any]
 ) -> tuple[PyTree, list[PyTree]]:
-    """What `jax.lax.scan` makes of some turns, with the outputs of each."""
-    if len(turns) == 1:
-        carry, output = body(carry, turns[0])
+    """`jax.lax.scan` over a list of pytrees, which returns the outputs as a list."""
+    if len(xs) == 1:
+        carry, output = body(carry, xs[0])
         return carry, [output]
 
-    def once(carry: PyTree, turn: Any) -> Any:
-        return scalarised(lambda carry: body(carry, turn), carry)
+    def scalarised_body(carry: PyTree, x: Any) -> Any:
+        return scalarised(lambda carry: body(carry, x), carry)
 
-    # What is known stays known, so that the loop can be unrolled.
-    is_known = lambda xs: not any(isinstance(x, jax.Array) for x in xs)  # noqa: E731
-    many = jtu.tree_map(lambda *xs: (np if is_known(xs) else jnp).asarray(xs), *turns)
-    carry, stacked = over_stages(once, carry, many)
-    return carry, [jtu.tree_map(lambda x: x[k], stacked) for k in range(len(turns))]  # noqa: B023
+    # Values known while tracing stay so, so that the loop can be unrolled.
+    is_static = lambda xs: not any(isinstance(x, jax.Array) for x in xs)  # noqa: E731
+    stacked_xs = jtu.tree_map(lambda *xs: (np if is_static(xs) else jnp).asarray(xs), *xs)
+    carry, outputs = over_stages(scalarised_body, carry, stacked_xs)
+    return carry, [jtu.tree_map(lambda x: x[k], outputs) for k in range(len(xs))]  # noqa: B023

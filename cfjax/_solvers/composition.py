@@ -1,4 +1,4 @@
-"""Compositions: a symmetric method to a higher order, by steps of several lengths."""
+"""Compositions: a symmetric method raised to a higher order by steps of several lengths."""
 
 import itertools
 from typing import Any, ClassVar, NamedTuple
@@ -14,8 +14,8 @@ from .dense import Interpolation, Substeps
 from .substeps import substeps
 
 
-class _Turn(NamedTuple):
-    """Where a part of the step begins and ends, as parts of the whole."""
+class _Interval(NamedTuple):
+    """Where a substep begins and ends, as parts of the step."""
 
     start: Any
     end: Any
@@ -91,11 +91,11 @@ class Composition(AbstractLieSolver):
             )
             solver_state = State(solver_state.compensation, first, solver_state.zero)
         ends = [0.0, *itertools.accumulate(COMPOSITIONS[self.composition_order][:-1]), 1.0]
-        turns = list(itertools.starmap(_Turn, itertools.pairwise(ends)))
+        intervals = list(itertools.starmap(_Interval, itertools.pairwise(ends)))
         (y1, state, result), parts = substeps(
             self.solver,
             lambda _: terms,
-            turns,
+            intervals,
             t0,
             t1,
             args,

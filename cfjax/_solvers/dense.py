@@ -44,7 +44,7 @@ class Interpolation(diffrax.AbstractLocalInterpolation):
 
 
 class AbstractPath(eqx.Module):
-    """The way of a step, for output within it."""
+    """The solution within a step, for dense output."""
 
     @abc.abstractmethod
     def point(self, theta: Any) -> PyTree:
@@ -52,52 +52,52 @@ class AbstractPath(eqx.Module):
 
 
 class Substeps(AbstractPath):
-    """The way of a step that is made of several, of which each has the same part of its time."""
+    """The path of a step of several substeps, each of which has the same part of its time."""
 
-    parts: Sequence[diffrax.AbstractLocalInterpolation]
+    interpolations: Sequence[diffrax.AbstractLocalInterpolation]
 
     def point(self, theta: Any) -> PyTree:
-        theta = theta * len(self.parts)
-        now = jnp.clip(jnp.ceil(theta) - 1, 0, len(self.parts) - 1)
-        # Output takes longer to compile than to choose what it is made of: once for all alike.
-        kinds: dict[Any, list[int]] = {}
-        for k, part in enumerate(self.parts):
-            kinds.setdefault(jtu.tree_structure(part), []).append(k)
-        points = [self._chosen(places, theta, now) for places in kinds.values()]
+        theta = theta * len(self.interpolations)
+        current = jnp.clip(jnp.ceil(theta) - 1, 0, len(self.interpolations) - 1)
+        # Output takes longer to compile than its operands to select: once for all of one structure.
+        groups: dict[Any, list[int]] = {}
+        for k, interpolation in enumerate(self.interpolations):
+            groups.setdefault(jtu.tree_structure(interpolation), []).append(k)
+        points = [self._nearest(indices, theta, current) for indices in groups.values()]
         point, _ = points[0]
-        for other, is_now in points[1:]:
-            point = jtu.tree_map(lambda a, b: jnp.where(is_now, b, a), point, other)  # noqa: B023
+        for candidate, is_current in points[1:]:
+            point = jtu.tree_map(lambda a, b: jnp.where(is_current, b, a), point, candidate)  # noqa: B023
         return point
 
-    def _chosen(self, places: list[int], theta: Any, now: Any) -> tuple[PyTree, Any]:
-        """The output of the part at `now`, and whether it is one of these."""
-        here = jnp.asarray(places, theta.dtype)
-        nearest = jnp.argmin(jnp.abs(here - now))
-        arrays, rest = zip(
-            *(eqx.partition(self.parts[k], eqx.is_array) for k in places), strict=True
+    def _nearest(self, indices: list[int], theta: Any, current: Any) -> tuple[PyTree, Any]:
+        """The output of the substep `current`, and whether it is one of `indices`."""
+        candidates = jnp.asarray(indices, theta.dtype)
+        nearest = jnp.argmin(jnp.abs(candidates - current))
+        arrays, static = zip(
+            *(eqx.partition(self.interpolations[k], eqx.is_array) for k in indices), strict=True
         )
         arrays = jtu.tree_map(lambda *xs: jnp.stack(xs)[nearest], *arrays)
-        part, place = eqx.combine(arrays, rest[0]), here[nearest]
-        is_now, c = place == now, theta - place
-        # Other parts are asked at a time of their own: another may be an error there.
-        c = jnp.where(is_now, c, jnp.clip(c, 0, 1))
-        return part.evaluate(time_at(c, part.t0, part.t1)), is_now
+        interpolation, index = eqx.combine(arrays, static[0]), candidates[nearest]
+        is_current, c = index == current, theta - index
+        # The others are evaluated at a time of their own, as another may be an error there.
+        c = jnp.where(is_current, c, jnp.clip(c, 0, 1))
+        return interpolation.evaluate(time_at(c, interpolation.t0, interpolation.t1)), is_current
 
 
 class Path(AbstractPath):
-    """The fields of a step, where it starts, and the continuous extension that they go into.
+    """The start and the fields of a step, and the continuous extension that combines them.
 
-    Arrays that occur several times are kept once: of fields on a common span, every block of
-    columns is in all that came after it. Which are the same is seen from the objects: within one
-    trace, the same object is the same value, and a copy that is not seen costs memory only. What is
-    kept is put back in all its places, so fields on a common span know it as one again.
+    An array that occurs several times is stored once: fields on a common span share their blocks of
+    columns. Equal arrays are recognised as equal objects: within one trace the same object is the
+    same value, and a copy that is missed costs memory only. `unflatten` puts one object in
+    all places of an array, so the fields share their span again.
     """
 
     arrays: tuple[Array | np.ndarray, ...]
-    places: tuple[int, ...] = eqx.field(static=True)
-    structure: Any = eqx.field(static=True)
+    indices: tuple[int, ...] = eqx.field(static=True)
+    treedef: Any = eqx.field(static=True)
     continuous_extension: ContinuousExtension = eqx.field(static=True)
-    # Where a combination of the fields leads from a point.
+    # `apply_flow(field, point)` is the end of the flow of a combination of the fields.
     apply_flow: Callable[[PyTree, PyTree], PyTree] = eqx.field(static=True)
 
     @classmethod
@@ -108,23 +108,23 @@ class Path(AbstractPath):
         fields: list[PyTree],
         apply_flow: Callable[[PyTree, PyTree], PyTree] = flow_once,
     ) -> "Path":
-        leaves, structure = jtu.tree_flatten((start, fields))
+        leaves, treedef = jtu.tree_flatten((start, fields))
         arrays = {id(leaf): leaf for leaf in leaves}
-        index = {key: i for i, key in enumerate(arrays)}
-        places = tuple(index[id(leaf)] for leaf in leaves)
-        return cls(tuple(arrays.values()), places, structure, continuous_extension, apply_flow)
+        positions = {key: i for i, key in enumerate(arrays)}
+        indices = tuple(positions[id(leaf)] for leaf in leaves)
+        return cls(tuple(arrays.values()), indices, treedef, continuous_extension, apply_flow)
 
-    def parts(self, arrays: tuple[Array | np.ndarray, ...]) -> tuple[PyTree, list[PyTree]]:
-        """The start and the fields that are made of these arrays."""
-        return jtu.tree_unflatten(self.structure, [arrays[i] for i in self.places])
+    def unflatten(self, arrays: tuple[Array | np.ndarray, ...]) -> tuple[PyTree, list[PyTree]]:
+        """The start and the fields with these arrays as leaves."""
+        return jtu.tree_unflatten(self.treedef, [arrays[i] for i in self.indices])
 
     def point(self, theta: Any) -> PyTree:
         """The solution at a part `theta` of the step."""
         powers, theta = _by_power(self.continuous_extension), jnp.asarray(theta)
         num_flows = powers.shape[1]
-        point, fields = self.parts(self.arrays)
-        # Of small states too: an event's root finder differentiates it, and a loop of flows on
-        # short vectors is as fast in batches.
+        point, fields = self.unflatten(self.arrays)
+        # For small states too: an event's root finder differentiates this, and in batches a loop of
+        # flows on short vectors is as fast.
         if self.apply_flow is flow_once and num_flows > 1 and can_roll(None, fields[0], point):
             # There may be no field at the end of the step, where it has no weight.
             rows = powers.swapaxes(0, 1)[..., : len(fields)].astype(theta.dtype)
@@ -133,36 +133,36 @@ class Path(AbstractPath):
 
         weights = _polynomials(powers, theta)
 
-        def end(arrays: tuple[Array | np.ndarray, ...]) -> PyTree:
-            point, fields = self.parts(arrays)
+        def evaluate(arrays: tuple[Array | np.ndarray, ...]) -> PyTree:
+            point, fields = self.unflatten(arrays)
             for j in range(num_flows):
-                used = np.flatnonzero(powers[:, j].any(axis=0))
-                row = [(weights[j, k], fields[k]) for k in used]
+                nonzero = np.flatnonzero(powers[:, j].any(axis=0))
+                row = [(weights[j, k], fields[k]) for k in nonzero]
                 point = self.apply_flow(combine(*zip(*row, strict=True)), point)
             return from_chart(fields[0], point)
 
-        return scalarised(end, self.arrays)
+        return scalarised(evaluate, self.arrays)
 
 
 @functools.lru_cache
 def _by_power(extension: ContinuousExtension) -> Float[np.ndarray, "powers flows stages"]:
-    """Its coefficients; flows may have different numbers of powers."""
-    size = max(map(len, extension)), len(extension), len(extension[0][0])
-    found = np.zeros(size)
+    """The coefficients as one array, with zeros where a flow has fewer powers than another."""
+    shape = max(map(len, extension)), len(extension), len(extension[0][0])
+    padded = np.zeros(shape)
     for j, powers in enumerate(extension):
-        found[: len(powers), j] = np.array(powers, float)
-    return found
+        padded[: len(powers), j] = np.array(powers, float)
+    return padded
 
 
 def _polynomials(
-    powers: Real[np.ndarray | Array, "powers *rest"], theta: Real[Array, ""]
-) -> Real[Array, "*rest"]:
+    powers: Real[np.ndarray | Array, "powers *shape"], theta: Real[Array, ""]
+) -> Real[Array, "*shape"]:
     """The weights of fields, `sum_i powers[i] theta^(i+1)`.
 
     One array: number by number they would be most of the program of output within a step.
     """
-    *rest, total = powers.astype(theta.dtype)
+    *lower, total = powers.astype(theta.dtype)
     total = total * theta
-    for coefficients in reversed(rest):
+    for coefficients in reversed(lower):
         total = (total + coefficients) * theta
     return total

@@ -1,4 +1,4 @@
-"""Which fields depend on the state, or on time: some methods must know."""
+"""Which fields depend on the state or on time, which some methods exclude."""
 
 from collections.abc import Callable
 from typing import Any
@@ -12,17 +12,17 @@ from jaxtyping import PyTree
 from .._field import is_field, to_chart
 
 
-def depending_on_state(field: Callable[[PyTree], PyTree], y0: PyTree) -> list[tuple[str, Any]]:
+def state_dependent(field: Callable[[PyTree], PyTree], y0: PyTree) -> list[tuple[str, Any]]:
     """The parts of `field(y)` that depend on y or on being frozen there, each with its place."""
-    return _parts_depending(lambda y: (field(y), y), y0)
+    return _dependent_parts(lambda y: (field(y), y), y0)
 
 
-def depending_on_time(field: Callable[[Any], PyTree], t: Any, y: PyTree) -> list[tuple[str, Any]]:
+def time_dependent(field: Callable[[Any], PyTree], t: Any, y: PyTree) -> list[tuple[str, Any]]:
     """The parts of `field(t)` that depend on t, each with its place; y is any state."""
-    return _parts_depending(lambda t: (field(t), y), t)
+    return _dependent_parts(lambda t: (field(t), y), t)
 
 
-def _parts_depending(
+def _dependent_parts(
     fun: Callable[[PyTree], tuple[PyTree, PyTree]], x: PyTree
 ) -> list[tuple[str, Any]]:
     """The parts of a field that depend on x, where `fun(x)` is the field and its state."""
@@ -34,11 +34,11 @@ def _parts_depending(
         names = [(jtu.keystr(path), part) for path, part in parts]
         return list(zip(names, charted, strict=True))
 
-    found = depending(parts, x)
-    return [("", None)] if found is None else found
+    dependent = dependents(parts, x)
+    return [("", None)] if dependent is None else dependent
 
 
-def depending(fun: Callable[[PyTree], list[tuple[Any, PyTree]]], x: PyTree) -> list[Any] | None:
+def dependents(fun: Callable[[PyTree], list[tuple[Any, PyTree]]], x: PyTree) -> list[Any] | None:
     """The names of those values of `fun(x)`, pairs of a name and a value, that depend on x.
 
     Under `jax.vmap` over x alone, what does not depend on it has no axis of the batch. That sees
@@ -48,13 +48,13 @@ def depending(fun: Callable[[PyTree], list[tuple[Any, PyTree]]], x: PyTree) -> l
 
     **Raises** what `fun(x)` itself raises.
     """
-    found: list[Any] = []
+    dependent: list[Any] = []
 
-    def look(x: PyTree) -> PyTree:
+    def probe_values(x: PyTree) -> PyTree:
         for name, value in fun(x):
 
             def rule(size, is_mapped, leaves, name=name):
-                found.append(name)
+                dependent.append(name)
                 return leaves, is_mapped[0]
 
             probe = jax.custom_batching.custom_vmap(lambda leaves: leaves)
@@ -63,20 +63,20 @@ def depending(fun: Callable[[PyTree], list[tuple[Any, PyTree]]], x: PyTree) -> l
         return x
 
     if jtu.tree_leaves(x):
-        many = jtu.tree_map(
+        batched = jtu.tree_map(
             lambda x: jax.ShapeDtypeStruct((1, *jnp.shape(x)), jnp.result_type(x)), x
         )
         try:
-            jax.eval_shape(jax.vmap(look), many)
+            jax.eval_shape(jax.vmap(probe_values), batched)
         except Exception:
-            # What is wrong with the field itself, it says itself.
+            # If the field itself is wrong, this raises its own error.
             eqx.filter_eval_shape(fun, x)
             return None
-    return found
+    return dependent
 
 
-def unseen(name: str) -> str:
-    """What gives None as the part that depends on `name`."""
+def unknown_dependence(name: str) -> str:
+    """The cause of a dependence on `name` for which no part is known, for an error message."""
     return (
         f"The field gives {name} to a function of the host (jax.pure_callback without vmap_method, "
         "or jax.experimental.io_callback), or to another operation that JAX has no rule for in a "

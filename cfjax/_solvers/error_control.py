@@ -45,7 +45,7 @@ class ErrorNorm(eqx.Module):
                 raise TypeError(
                     f"scales{jtu.keystr(path)} must be a real number, got {describe(scale)}."
                 )
-        self.scales = jtu.tree_map(_checked, scales)
+        self.scales = jtu.tree_map(_positive, scales)
 
     def __call__(self, y: PyTree) -> Real[Array, ""]:
         scales, treedef = jtu.tree_flatten(self.scales)
@@ -53,11 +53,11 @@ class ErrorNorm(eqx.Module):
         for scale, part in zip(scales, treedef.flatten_up_to(y), strict=True):
             square = _mean_square(part)
             squares.append(square / jnp.square(scale.astype(square.dtype)))
-        # The root has no derivative at zero; error control asks for none.
+        # The root has no derivative at zero, and error control needs none.
         return jnp.sqrt(lax.stop_gradient(jnp.asarray(sum(squares)) / len(squares)))
 
 
-def _checked(scale: Any) -> Real[Array, ""]:
+def _positive(scale: Any) -> Real[Array, ""]:
     scale = jnp.asarray(scale)
     return eqx.error_if(scale, ~(scale > 0), "scales must be positive.")
 
@@ -111,30 +111,30 @@ def starting_step(
     y0 = as_state(y0)
     dtype = time_dtype(y0)
     times = {"t0": t0, "t1": t1, "atol": atol}
-    t0, t1, unit = (time_scalar(name, x, dtype) for name, x in times.items())
-    unit = eqx.error_if(unit, ~(unit > 0), "atol must be positive.")
-    longest = jnp.abs(t1 - t0)
+    t0, t1, atol = (time_scalar(name, x, dtype) for name, x in times.items())
+    atol = eqx.error_if(atol, ~(atol > 0), "atol must be positive.")
+    length = jnp.abs(t1 - t0)
     sign = jnp.sign(t1 - t0)
 
-    def scaled(y):
-        return norm(jtu.tree_map(lambda leaf: leaf / unit.astype(leaf.dtype), y))
+    def scaled_norm(y):
+        return norm(jtu.tree_map(lambda leaf: leaf / atol.astype(leaf.dtype), y))
 
     f0 = term.vf(t0, y0, args)
     v0 = tangent(f0, y0)
     # In units of atol.
-    size, speed = scaled(y0), scaled(v0)
-    way = jnp.where(jnp.isfinite(longest), speed * longest, 1)
-    size = jnp.maximum(size, jnp.sqrt(way))
-    time = jnp.where(speed > 0, size / jnp.where(speed > 0, speed, 1), longest)
-    h0 = (0.01 * jnp.minimum(time, longest)).astype(dtype)
+    size, speed = scaled_norm(y0), scaled_norm(v0)
+    distance = jnp.where(jnp.isfinite(length), speed * length, 1)
+    size = jnp.maximum(size, jnp.sqrt(distance))
+    time = jnp.where(speed > 0, size / jnp.where(speed > 0, speed, 1), length)
+    h0 = (0.01 * jnp.minimum(time, length)).astype(dtype)
     y1 = flow(term.prod(f0, sign * h0), y0)
     v1 = tangent(term.vf(t0 + sign * h0, y1, args), y1)
-    change = scaled(jtu.tree_map(jnp.subtract, v1, v0))
-    speed = jnp.maximum(speed, scaled(v1))
+    change = scaled_norm(jtu.tree_map(jnp.subtract, v1, v0))
+    speed = jnp.maximum(speed, scaled_norm(v1))
     # How fast the velocity changes, as a rate: derivatives are taken to grow by it.
     rate = change / (jnp.where(h0 > 0, h0, 1) * jnp.where(speed > 0, speed, 1))
     order = solver.order(term) or 1
     error = speed * rate**order
-    h1 = jnp.where(error > 0, (0.01 / jnp.where(error > 0, error, 1)) ** (1 / (order + 1)), longest)
-    step = jnp.minimum(jnp.where(speed > 0, jnp.minimum(100 * h0, h1), longest), longest)
+    h1 = jnp.where(error > 0, (0.01 / jnp.where(error > 0, error, 1)) ** (1 / (order + 1)), length)
+    step = jnp.minimum(jnp.where(speed > 0, jnp.minimum(100 * h0, h1), length), length)
     return lax.stop_gradient((sign * step).astype(dtype))

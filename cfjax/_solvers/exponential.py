@@ -18,14 +18,14 @@ from .._fields.semilinear import AbstractSemilinearField
 from .._methods import exponential as _exponential
 from .._methods.exponential import Columns, Combination, ExponentialTableau
 from .._term import product
-from .base import AbstractOfTableau, check_choice
+from .base import AbstractTableauSolver, check_choice
 from .compiled import materialised_if_long
 from .dense import AbstractPath
-from .dependence import depending
+from .dependence import dependents
 from .step import AbstractChartSolver, Step
 
 
-class AbstractExponential(AbstractOfTableau, AbstractChartSolver):
+class AbstractExponential(AbstractTableauSolver, AbstractChartSolver):
     """Steps for `x' = L x + g(t, x)` that are exact in L, with g as a polynomial in time.
 
     The field must return `cfjax.Affine`, `cfjax.LinearAffine`, another
@@ -50,9 +50,9 @@ class AbstractExponential(AbstractOfTableau, AbstractChartSolver):
 
     tableau: eqx.AbstractVar[ExponentialTableau]
     estimate: Literal["group"] | None = eqx.field(static=True, default="group", kw_only=True)
-    # Of steps that are equal: their length, as differences of times would differ from step to step
-    # by their rounding, and for each part of the field the coefficients of its linear part, where
-    # that is the same in all steps.
+    # For equal steps: their length, as differences of times would differ from step to step by their
+    # rounding, and for each part of the field the coefficients of its linear part, where that is
+    # the same in all steps.
     equal_length: Real[Array, ""] | None = eqx.field(default=None, kw_only=True)
     known: tuple[Any, ...] | None = eqx.field(default=None, kw_only=True)
 
@@ -83,11 +83,11 @@ class AbstractExponential(AbstractOfTableau, AbstractChartSolver):
             first, _ = to_chart(product(terms, terms.vf(t, y, args), control), y, ())
             return list(enumerate(solver._linear_part(first).coefficients))
 
-        changing = depending(coefficients, (t0, y0))
-        if changing is None:
+        dependent = dependents(coefficients, (t0, y0))
+        if dependent is None:
             return solver
-        made = coefficients((t0, y0))
-        return solver._with(known=tuple(None if k in changing else part for k, part in made))
+        pairs = coefficients((t0, y0))
+        return solver._with(known=tuple(None if k in dependent else part for k, part in pairs))
 
     def interval(self, t0: Any, t1: Any) -> tuple[Any, Any]:
         if self.equal_length is None:
@@ -98,15 +98,15 @@ class AbstractExponential(AbstractOfTableau, AbstractChartSolver):
         tableau, first = self.tableau, chart.first
         linear = self._linear_part(first)
         # The velocity at the start, and by how much g differs there and at each later stage.
-        changes = {1: _rest(first, combine([0.0], [first]), chart.origin)}
-        g = _rest(first, first, chart.origin)
+        changes = {1: _nonlinear(first, combine([0.0], [first]), chart.origin)}
+        g = _nonlinear(first, first, chart.origin)
 
         def reach(row: Columns, changes: dict[int, PyTree]) -> PyTree:
             point = jtu.tree_map(jnp.add, chart.start, linear.increment(row, changes))
             return chart.branching(point)
 
         def change(field: PyTree, point: PyTree) -> PyTree:
-            return jtu.tree_map(jnp.subtract, _rest(field, first, chart.sums.state(point)), g)
+            return jtu.tree_map(jnp.subtract, _nonlinear(field, first, chart.sums.state(point)), g)
 
         *rows, last_row = self._rows
         fields = [first]
@@ -119,7 +119,7 @@ class AbstractExponential(AbstractOfTableau, AbstractChartSolver):
             combine([float(w) for _, w in power], [changes[j] for j, _ in power])
             for power in tableau.powers
         ]
-        path = _Path(type(self).__name__, first, chart.origin, changes[1], powers)
+        path = _PolynomialPath(type(self).__name__, first, chart.origin, changes[1], powers)
         if self._error is None:
             return Step(chart.end(end), path)
         last = None
@@ -141,7 +141,7 @@ class AbstractExponential(AbstractOfTableau, AbstractChartSolver):
 
     @property
     def _rows(self) -> list[Columns]:
-        """With the coefficient of the velocity as the first column: stages from 2 on, the end."""
+        """The rows of the stages from 2 on and of the end, with the velocity as first column."""
         tableau = self.tableau
         ends = zip((*tableau.c[1:], Fraction(1)), (*tableau.a[1:], tableau.b), strict=True)
         return [((1, ((1, c, c),)), *row) for c, row in ends]
@@ -150,7 +150,7 @@ class AbstractExponential(AbstractOfTableau, AbstractChartSolver):
 class _LinearPart:
     """The coefficients of a step: functions of the linear part of its first field.
 
-    `known` has those of each part of the field, or None for a part whose linear part may change.
+    `stored` has those of each part of the field, or None for a part whose linear part may change.
     """
 
     def __init__(
@@ -158,28 +158,28 @@ class _LinearPart:
         solver: str,
         first: PyTree,
         rows: Sequence[Columns],
-        known: Sequence[Any] | None = None,
+        stored: Sequence[Any] | None = None,
     ):
-        paths, self.structure = jtu.tree_flatten_with_path(first, is_leaf=is_field)
+        paths, self.treedef = jtu.tree_flatten_with_path(first, is_leaf=is_field)
         for path, part in paths:
             if is_field(part) and not isinstance(part, AbstractSemilinearField | Rest):
                 raise TypeError(_has_no_linear_part(solver, jtu.keystr(path), part))
         self.parts = [part for _, part in paths]
         self.combinations = list(dict.fromkeys(terms for row in rows for _, terms in row))
         self.coefficients = [
-            _coefficients(part, self.combinations) if made is None else made
-            for part, made in zip(self.parts, known or [None] * len(self.parts), strict=True)
+            _coefficients(part, self.combinations) if values is None else values
+            for part, values in zip(self.parts, stored or [None] * len(self.parts), strict=True)
         ]
 
     def increment(self, row: Columns, changes: dict[int, PyTree]) -> PyTree:
-        """The sum over the columns of a row, of which each multiplies a change."""
-        flat = {j: self.structure.flatten_up_to(changes[j]) for j, _ in row}
+        """The sum over the columns of a row, each times its change."""
+        flat = {j: self.treedef.flatten_up_to(changes[j]) for j, _ in row}
 
         def of_part(k: int, part: Any) -> PyTree:
             coefficients = dict(zip(self.combinations, self.coefficients[k], strict=True))
-            return _sum([_times(part, coefficients[terms], flat[j][k]) for j, terms in row])
+            return _sum([_multiply(part, coefficients[terms], flat[j][k]) for j, terms in row])
 
-        return self.structure.unflatten(of_part(k, part) for k, part in enumerate(self.parts))
+        return self.treedef.unflatten(of_part(k, part) for k, part in enumerate(self.parts))
 
 
 def _sum(trees: Sequence[PyTree]) -> PyTree:
@@ -194,20 +194,20 @@ def _coefficients(part: Any, combinations: Sequence[Combination]) -> list[Any]:
     functions = dict(zip(pairs, part.functions(pairs), strict=True))
 
     def combined(terms: Combination) -> Any:
-        used = [(float(w), functions[float(c), k]) for k, c, w in terms]
-        return _sum([jtu.tree_map(lambda x: w * x, function) for w, function in used])  # noqa: B023
+        weighted = [(float(w), functions[float(c), k]) for k, c, w in terms]
+        return _sum([jtu.tree_map(lambda x: w * x, function) for w, function in weighted])  # noqa: B023
 
     return list(map(combined, combinations))
 
 
-def _times(part: Any, coefficient: Any, x: PyTree) -> PyTree:
+def _multiply(part: Any, coefficient: Any, x: PyTree) -> PyTree:
     if isinstance(part, AbstractSemilinearField):
         return part.times(coefficient, x)
     return jtu.tree_map(lambda x: coefficient * x, x)
 
 
-def _rest(field: PyTree, first: PyTree, point: PyTree) -> PyTree:
-    """The velocity less that of the linear part of the first field."""
+def _nonlinear(field: PyTree, first: PyTree, point: PyTree) -> PyTree:
+    """The velocity less that of the linear part of the first field: g."""
 
     def part(f: Any, first: Any, x: PyTree) -> PyTree:
         if not is_field(f):
@@ -225,8 +225,8 @@ def _has_no_linear_part(solver: str, place: str, part: Any) -> str:
     )
 
 
-class _Path(AbstractPath):
-    """The way of a step: the flow along a polynomial in time."""
+class _PolynomialPath(AbstractPath):
+    """The path of a step: the flow along a polynomial in time."""
 
     solver: str = eqx.field(static=True)
     first: PyTree

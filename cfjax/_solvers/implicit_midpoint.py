@@ -13,7 +13,7 @@ from .._term import product
 from .base import AbstractLieSolver, time_at
 from .dense import Interpolation, Path
 from .fixed_point import fixed_point
-from .step import Step, begun, ended
+from .step import Step, begin_step, finish_step
 from .sums import Sums
 
 # The flow of the step's one field, for a part of the step.
@@ -75,7 +75,7 @@ class ImplicitMidpoint(AbstractLieSolver):
         return self
 
     def step(self, terms, t0, t1, y0, args, solver_state, made_jump):
-        t0, _ = begun(solver_state, t0, lambda t0: None, made_jump)
+        t0, _ = begin_step(solver_state, t0, lambda t0: None, made_jump)
         control, middle = terms.contr(t0, t1), time_at(0.5, t0, t1)
 
         def field(y: PyTree) -> PyTree:
@@ -83,15 +83,15 @@ class ImplicitMidpoint(AbstractLieSolver):
 
         y, has_converged = fixed_point(lambda y: _mean(field(y), y0), y0, self.rtol, self.max_steps)
 
-        def stepped(y0: PyTree) -> Step:
+        def step_from(y0: PyTree) -> Step:
             frozen, sums = field(y), Sums(y0, solver_state.compensation)
-            end, _ = sums.shared(sums.moved(frozen, sums.start), None, is_followed=True)
-            charted, point = Sums(y0).entered(frozen, y0)
+            end, _ = sums.materialised(sums.flow_frozen(frozen, sums.start), None, is_followed=True)
+            charted, point = Sums(y0).to_chart(frozen, y0)
             return Step(end, Path.of(_EXTENSION, point, [charted]))
 
-        y1, error, dense_info, state, result = ended(solver_state, stepped, y0)
-        failed: Any = diffrax.RESULTS.nonlinear_divergence
-        result = diffrax.RESULTS.where(has_converged, result, failed)
+        y1, error, dense_info, state, result = finish_step(solver_state, step_from, y0)
+        divergence: Any = diffrax.RESULTS.nonlinear_divergence
+        result = diffrax.RESULTS.where(has_converged, result, divergence)
         return y1, error, dense_info, state, result
 
 

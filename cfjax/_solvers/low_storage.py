@@ -34,9 +34,9 @@ class AbstractLowStorage(AbstractCommutatorFree, diffrax.AbstractStratonovichSol
         rows = trimmed(self.tableau.beta)
         embedded = None if self.estimate is None else self.tableau.embedded
         penultimate = embedded is not None and trimmed(embedded) == rows[:-1]
-        # All fields are in an estimate but that of the point before the end.
-        other = embedded is not None and not (penultimate and self.estimate == "group")
-        if not (other or self._is_unrolled(chart.start)) and is_uniform(chart):
+        # Every estimate uses all fields, except that of the point before the end.
+        needs_all_fields = embedded is not None and not (penultimate and self.estimate == "group")
+        if not (needs_all_fields or self._is_unrolled(chart.start)) and is_uniform(chart):
             return self._stages_in_loop(chart)
         fields: list[PyTree] = [chart.first]
         points: dict[Product, PyTree] = {(): chart.start}
@@ -56,20 +56,20 @@ class AbstractLowStorage(AbstractCommutatorFree, diffrax.AbstractStratonovichSol
         def stage(carry, coefficients):
             a, b, c = coefficients
             total, point, _ = carry
-            here = chart.field(c, point, [total])
-            total = combine((a, 1.0), (total, here))
-            return (total, chart.flow(combine((b,), (total,)), point), point), here
+            field = chart.field(c, point, [total])
+            total = combine((a, 1.0), (total, field))
+            return (total, chart.flow(combine((b,), (total,)), point), point), field
 
         start, rows = chart.start, trimmed(self.tableau.beta)
-        after = chart.flow(combine((float(self.b[0]),), (chart.first,)), start)
+        point = chart.flow(combine((float(self.b[0]),), (chart.first,)), start)
         coefficients = tuple(
             jnp.asarray([float(x) for x in row[1:]]) for row in (self.a, self.b, self.tableau.c)
         )
-        (_, end, before), later = lax.scan(stage, (chart.first, after, start), coefficients)
+        (_, end, penultimate), stacked = lax.scan(stage, (chart.first, point, start), coefficients)
         # The compiler drops them where the caller asks for no output within the step.
         fields = [chart.first]
-        fields += [jtu.tree_map(itemgetter(i), later) for i in range(len(self.b) - 1)]
-        return Stages(chart, fields, {(): start, rows[:-1]: before, rows: end})
+        fields += [jtu.tree_map(itemgetter(i), stacked) for i in range(len(self.b) - 1)]
+        return Stages(chart, fields, {(): start, rows[:-1]: penultimate, rows: end})
 
     def _is_unrolled(self, point: PyTree) -> bool:
         if self.unroll is not None:

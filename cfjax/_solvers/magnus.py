@@ -8,15 +8,15 @@ import numpy as np
 from jaxtyping import PyTree
 
 from .._control_term import is_driven
-from .._field import combine, is_field
+from .._field import is_field
 from .._methods import magnus as _magnus
 from .._methods.magnus import MagnusTableau
 from .._methods.tableau import Product
 from .._numerics.checks import Fault
 from .._term import product
-from .base import State, check_choice
+from .base import State, check_choice, combine_nonzero
 from .dense import Path
-from .dependence import depending_on_state, unseen
+from .dependence import state_dependent, unknown_dependence
 from .stacked import can_roll, rolled_flows
 from .step import AbstractChartSolver, Chart, Step
 
@@ -81,8 +81,8 @@ class AbstractMagnus(AbstractChartSolver):
         def field(y):
             return product(terms, terms.vf(t0, y, args), terms.contr(t0, t1))
 
-        if found := depending_on_state(field, y0):
-            raise TypeError(_depends_on_state(type(self).__name__, *found[0]))
+        if dependent := state_dependent(field, y0):
+            raise TypeError(_depends_on_state(type(self).__name__, *dependent[0]))
         return super().start(terms, t0, t1, y0, args)
 
     @property
@@ -91,7 +91,7 @@ class AbstractMagnus(AbstractChartSolver):
 
     def step_in(self, chart):
         tableau, start = self.tableau, chart.start
-        # Any point will do.
+        # The fields do not depend on the point.
         values = [chart.first_value, *(chart.value_at(c, start) for c in tableau.nodes[1:])]
         fields = [chart.first]
         for value in values[1:]:
@@ -107,25 +107,23 @@ class AbstractMagnus(AbstractChartSolver):
         return Step(chart.end(end), path, error, values[-1])
 
     def _flows(self, rows: Product, chart: Chart, fields: list[PyTree], point: PyTree) -> PyTree:
-        weights = [list(map(float, row)) for row in rows]
-        if len(weights) > 1 and can_roll(self.unroll, fields[0], point):
-            return rolled_flows(np.array(weights), fields, point, chart.flow)
-        for row in weights:
-            used = [(a, f) for a, f in zip(row, fields, strict=True) if a != 0]
-            point = chart.flow(combine(*zip(*used, strict=True)), point)
+        if len(rows) > 1 and can_roll(self.unroll, fields[0], point):
+            return rolled_flows(np.array(rows, float), fields, point, chart.flow)
+        for row in rows:
+            point = chart.flow(combine_nonzero(row, fields), point)
         return point
 
 
 def _num_shared(a: Product, b: Product) -> int:
-    """With how many rows both begin."""
+    """The number of rows with which both begin."""
     return next(n for n, (x, y) in enumerate(zip(a, b, strict=False)) if x != y)
 
 
 def _depends_on_state(solver: str, place: str, part: Any) -> str:
     if part is None:
         return (
-            f"{unseen('y')}, and {solver} takes fields that depend on t but not on y: call it with "
-            "t only, or use another method, for example cfjax.CF4()."
+            f"{unknown_dependence('y')}, and {solver} takes fields that depend on t but not on y: "
+            "call it with t only, or use another method, for example cfjax.CF4()."
         )
     name = type(part).__name__ if is_field(part) else "a translation"
     advice = "" if is_field(part) else " Return y' = A(t) y as cfjax.LeftMatrix(A(t))."

@@ -20,14 +20,14 @@ from .._field import (
     dexpinv,
     has_dexpinv,
     is_field,
+    no_bracket_message,
     tangent,
-    without_bracket,
 )
 from .._methods.continuous_extension import RungeKuttaExtension, runge_kutta_extension
 from .._methods.order_conditions import runge_kutta_order
 from .._methods.tableau import ContinuousExtension, Row
 from .._numerics.vectors import smooth
-from .base import check_choice
+from .base import check_choice, combine_nonzero, without_trailing_zeros
 from .compiled import materialised_together, scalarised
 from .dense import Path
 from .stages import rolled_elements
@@ -71,89 +71,88 @@ class AbstractMuntheKaas(AbstractChartSolver, diffrax.AbstractStratonovichSolver
 
     @abc.abstractmethod
     def elements(self, chart: Chart) -> "_Elements":
-        """What v is the combination of that has the weights `b`."""
+        """The elements whose combination with the weights `b` is v."""
 
-    def estimating(self, found: "_Elements", v: PyTree, end: PyTree, chart: Chart) -> "_Elements":
-        """These and what else the estimate takes; v leads to the end."""
-        return found
+    def for_estimate(
+        self, elements: "_Elements", v: PyTree, end: PyTree, chart: Chart
+    ) -> "_Elements":
+        """With the further elements that the estimate takes; v leads to the end."""
+        return elements
 
     def logarithm(self, field: Callable[[Any, PyTree], PyTree], y0: PyTree) -> PyTree:
         """The element v, where `field(c, y)` is `h f(t + c h, y)`."""
         chart = Chart.at_start(field, lambda field: field, Sums(y0), field(0.0, y0))
-        return _combine_nonzero(self.b, self.elements(chart).elements)
+        return combine_nonzero(self.b, self.elements(chart).fields)
 
     def step_in(self, chart):
-        found = self.elements(chart)
-        v = _combine_nonzero(self.b, found.elements)
+        elements = self.elements(chart)
+        v = combine_nonzero(self.b, elements.fields)
         end = chart.flow(v, chart.start)
-        y1 = found.or_nan(chart.end(end))
+        y1 = elements.or_nan(chart.end(end))
         error = None
         # All that follows is for error control and output within the step. The compiler leaves it
         # out where the caller asks for neither.
         if self.estimate is not None and self.b_error is not None:
-            found = self.estimating(found, v, end, chart)
-            off = _combine_nonzero(self.b_error, found.elements)
+            elements = self.for_estimate(elements, v, end, chart)
+            difference = combine_nonzero(self.b_error, elements.fields)
             if self.estimate == "algebra":
-                error = tangent(off, chart.state(end))
+                error = tangent(difference, chart.state(end))
             else:
-                embedded = chart.flow(combine((1.0, -1.0), (v, off)), chart.start)
+                embedded = chart.flow(combine((1.0, -1.0), (v, difference)), chart.start)
                 error = chart.difference(end, embedded)
             # NaN is an infinite error to diffrax, so that the step is taken again, shorter.
-            error = found.or_nan(error)
+            error = elements.or_nan(error)
         # All of them are results then, and XLA would compute the step anew for each.
-        elements = materialised_together(found.elements)
-        return Step(
-            y1, Path.of(self.continuous_extension, chart.origin, elements), error, found.last
-        )
+        fields = materialised_together(elements.fields)
+        path = Path.of(self.continuous_extension, chart.origin, fields)
+        return Step(y1, path, error, elements.last)
 
 
 class _Elements(NamedTuple):
-    """Elements of the algebra, and zero, or NaN if some `dexpinv` among them had no value.
+    """Elements of the algebra, and a zero, which is NaN if some `dexpinv` had no value.
 
-    The elements then mean nothing, but they are finite: of a step that is not kept the derivative
-    must be zero, and that of NaN is NaN. None if nothing is known. `last` is the value of the field
-    at the end of the step, if it has been evaluated.
+    The elements then mean nothing, but they are finite: the derivative of a rejected step must be
+    zero, and that of NaN is NaN. The zero is None if nothing is known. `last` is the value of the
+    field at the end of the step, if it has been evaluated.
     """
 
-    elements: list[PyTree]
-    missing: Real[Array, ""] | None = None
+    fields: list[PyTree]
+    zero: Real[Array, ""] | None = None
     last: PyTree = None
 
-    def and_known(self, *missing: Real[Array, ""] | None) -> "_Elements":
-        known = [x for x in (self.missing, *missing) if x is not None]
-        return self._replace(missing=functools.reduce(jnp.add, known) if known else None)
+    def add_zero(self, zero: Real[Array, ""] | None) -> "_Elements":
+        zeros = [x for x in (self.zero, zero) if x is not None]
+        return self._replace(zero=functools.reduce(jnp.add, zeros) if zeros else None)
 
     def or_nan(self, tree: PyTree) -> PyTree:
         """The same arrays, or NaN where something had no value."""
-        missing = self.missing
-        if missing is None:
-            return tree
-        return jtu.tree_map(lambda x: x + missing.astype(x.dtype), tree)
+        zero = self.zero
+        return tree if zero is None else jtu.tree_map(lambda x: x + zero.astype(x.dtype), tree)
 
 
-# A number and not a predicate: what compares would keep the divisions of the whole step.
+# A number and not a predicate: a comparison would keep the divisions of the whole step.
 @smooth
-def _missing(u: PyTree) -> Real[Array, ""] | None:
+def _zero_or_nan(u: PyTree) -> Real[Array, ""] | None:
     """Zero, or NaN if `dexpinv` at u has no value; None if nothing is known."""
-    found = has_dexpinv(u)
-    if found is None:
+    is_defined = has_dexpinv(u)
+    if is_defined is None:
         return None
     dtype = jnp.finfo(jtu.tree_leaves(u)[0].dtype).dtype
-    return jnp.where(found, jnp.zeros((), dtype), jnp.nan)
+    return jnp.where(is_defined, jnp.zeros((), dtype), jnp.nan)
 
 
-def _first(chart: Chart) -> PyTree:
+def _first_element(chart: Chart) -> PyTree:
     """The field at the start.
 
     **Raises** `TypeError` for a field without a bracket.
     """
     for part in jtu.tree_leaves(chart.first, is_leaf=is_field):
         if is_field(part) and not isinstance(part, AbstractAlgebraElement):
-            raise TypeError(without_bracket(part))
+            raise TypeError(no_bracket_message(part))
     return chart.first
 
 
-def _frozen(chart: Chart, c: float, u: PyTree, earlier: Sequence[PyTree]) -> PyTree:
+def _field_at(chart: Chart, c: float, u: PyTree, earlier: Sequence[PyTree]) -> PyTree:
     """The field at the point where u leads from the start of the step."""
     return chart.field(c, chart.flow(u, chart.start), earlier)
 
@@ -182,9 +181,9 @@ class RKMK3(AbstractMuntheKaas, diffrax.AbstractAdaptiveSolver):
         return 3
 
     def elements(self, chart):
-        k1 = _first(chart)
-        k2 = _frozen(chart, 0.5, combine((1 / 2,), (k1,)), [k1])
-        k3 = _frozen(chart, 1.0, combine((-1.0, 2.0), (k1, k2)), [k1, k2])
+        k1 = _first_element(chart)
+        k2 = _field_at(chart, 0.5, combine((1 / 2,), (k1,)), [k1])
+        k3 = _field_at(chart, 1.0, combine((-1.0, 2.0), (k1, k2)), [k1, k2])
         return _Elements([k1, k2, k3, bracket(k1, k2)])
 
 
@@ -212,10 +211,10 @@ class RKMK4(AbstractMuntheKaas):
         return 4
 
     def elements(self, chart):
-        k1 = _first(chart)
-        k2 = _frozen(chart, 0.5, combine((1 / 2,), (k1,)), [k1])
-        k3 = _frozen(chart, 0.5, combine((1 / 2, -1 / 8), (k2, bracket(k1, k2))), [k1, k2])
-        k4 = _frozen(chart, 1.0, k3, [k1, k2, k3])
+        k1 = _first_element(chart)
+        k2 = _field_at(chart, 0.5, combine((1 / 2,), (k1,)), [k1])
+        k3 = _field_at(chart, 0.5, combine((1 / 2, -1 / 8), (k2, bracket(k1, k2))), [k1, k2])
+        k4 = _field_at(chart, 1.0, k3, [k1, k2, k3])
         return _Elements([k1, k2, k3, k4, bracket(k1, k4)])
 
 
@@ -261,15 +260,15 @@ class RKMK(AbstractMuntheKaas, diffrax.AbstractAdaptiveSolver):
         unroll: bool | None = None,
     ):
         if not isinstance(tableau, diffrax.ButcherTableau):
-            own = getattr(tableau, "tableau", None)
-            is_solver = isinstance(own, diffrax.ButcherTableau)
+            solver_tableau = getattr(tableau, "tableau", None)
+            is_solver = isinstance(solver_tableau, diffrax.ButcherTableau)
             name = tableau.__name__ if isinstance(tableau, type) else type(tableau).__name__
             advice = f" Write diffrax.{name}.tableau." if is_solver else ""
             raise TypeError(f"tableau must be a diffrax.ButcherTableau, got {tableau!r}.{advice}")
         if tableau.implicit:
             raise ValueError("tableau must be explicit, got one of an implicit method.")
-        self.b = _without_zeros(tableau.b_sol.tolist())
-        self.b_error = _without_zeros(tableau.b_error.tolist()) or None
+        self.b = without_trailing_zeros(tableau.b_sol.tolist())
+        self.b_error = without_trailing_zeros(tableau.b_error.tolist()) or None
         n = max(len(self.b), len(self.b_error or ()))
         self.a = ((), *(tuple(row.tolist()) for row in tableau.a_lower[: n - 1]))
         self.c = (0.0, *tableau.c.tolist()[: n - 1])
@@ -284,7 +283,7 @@ class RKMK(AbstractMuntheKaas, diffrax.AbstractAdaptiveSolver):
             return super().error_order(terms)
         return None if self.b_error is None else _order(*self._embedded) + 1
 
-    # What the order of the end and that of the embedded method follow from.
+    # The rows and weights of which `_order` is the order, of the end and of the embedded method.
     @property
     def _end(self) -> _RungeKutta:
         return self.a[1 : len(self.b)], self.b
@@ -305,37 +304,37 @@ class RKMK(AbstractMuntheKaas, diffrax.AbstractAdaptiveSolver):
 
     def elements(self, chart):
         n = len(self.b)
-        return self._stages([_first(chart)], self.a[1:n], self.c[1:n], chart)
+        return self._stages([_first_element(chart)], self.a[1:n], self.c[1:n], chart)
 
-    def estimating(self, found, v, end, chart):
+    def for_estimate(self, elements, v, end, chart):
         n = len(self.b)
         for c, row in zip(self.c[n:], self.a[n:], strict=True):
-            u, here = v, end
+            u, point = v, end
             if row != self.b:
-                u = _combine_nonzero(row, found.elements)
-                here = chart.flow(u, chart.start)
-            value = chart.value_at(c, here)
-            field = chart.frozen(value, here, found.elements)
-            found = found.and_known(_missing(u))._replace(
-                elements=[*found.elements, dexpinv(u, field, self._degree)], last=value
+                u = combine_nonzero(row, elements.fields)
+                point = chart.flow(u, chart.start)
+            value = chart.value_at(c, point)
+            field = chart.frozen(value, point, elements.fields)
+            elements = elements.add_zero(_zero_or_nan(u))._replace(
+                fields=[*elements.fields, dexpinv(u, field, self._degree)], last=value
             )
-        return found
+        return elements
 
     def path_for_output(self, path: Any, field: Callable[[Any, PyTree], PyTree]):
         n = len(self.b)
         _, rows, times = self._extension
         if not rows:
             return path
-        start, elements = path.parts(path.arrays)
+        start, fields = path.unflatten(path.arrays)
 
-        def later(start: PyTree) -> list[PyTree]:
-            same = lambda field: field  # noqa: E731
-            chart = Chart(field, same, Sums(start), None, elements[0], start)
-            found = self._stages(elements[:n], rows, times, chart)
-            return found.or_nan(found.elements[n:])
+        def extra_fields(start: PyTree) -> list[PyTree]:
+            identity = lambda field: field  # noqa: E731
+            chart = Chart(field, identity, Sums(start), None, fields[0], start)
+            elements = self._stages(fields[:n], rows, times, chart)
+            return elements.or_nan(elements.fields[n:])
 
-        elements = [*elements[:n], *scalarised(later, start, in_batches=True)]
-        return Path.of(path.continuous_extension, start, elements)
+        fields = [*fields[:n], *scalarised(extra_fields, start, in_batches=True)]
+        return Path.of(path.continuous_extension, start, fields)
 
     @property
     def _extension(self) -> RungeKuttaExtension:
@@ -346,25 +345,24 @@ class RKMK(AbstractMuntheKaas, diffrax.AbstractAdaptiveSolver):
         return self.order(None) - 2
 
     def _stages(
-        self, known: list[PyTree], rows: Sequence[Row], times: Sequence[float], chart: Chart
+        self, fields: list[PyTree], rows: Sequence[Row], times: Sequence[float], chart: Chart
     ) -> _Elements:
-        """These, and a stage for each row and time."""
-
+        """These fields, and a stage for each row and time."""
         inverse = functools.partial(dexpinv, degree=self._degree)
-        made = rolled_elements(self.unroll, chart, known, rows, times, inverse, _missing)
-        if made is not None:
-            return _Elements(*made)
-        found = _Elements(known)
+        rolled = rolled_elements(self.unroll, chart, fields, rows, times, inverse, _zero_or_nan)
+        if rolled is not None:
+            return _Elements(*rolled)
+        elements = _Elements(fields)
         for c, row in zip(times, rows, strict=True):
             if not any(row):
-                stage = chart.field(c, chart.start, found.elements)
+                stage = chart.field(c, chart.start, elements.fields)
             else:
-                # Rows may be shorter than what is known.
-                u = _combine_nonzero(row, found.elements)
-                stage = inverse(u, _frozen(chart, c, u, found.elements))
-                found = found.and_known(_missing(u))
-            found = found._replace(elements=[*found.elements, stage])
-        return found
+                # Rows may be shorter than the list of fields.
+                u = combine_nonzero(row, elements.fields)
+                stage = inverse(u, _field_at(chart, c, u, elements.fields))
+                elements = elements.add_zero(_zero_or_nan(u))
+            elements = elements._replace(fields=[*elements.fields, stage])
+        return elements
 
 
 class RKMK5(RKMK):
@@ -410,26 +408,16 @@ class RKMK8(RKMK):
 
 @functools.lru_cache
 def _order(a: tuple[tuple[float, ...], ...], b: tuple[float, ...]) -> int:
-    known = _proved()
-    return known[a, b] if (a, b) in known else runge_kutta_order(a, b)
+    stored = _stored_orders()
+    return stored[a, b] if (a, b) in stored else runge_kutta_order(a, b)
 
 
 @functools.cache
-def _proved() -> dict[_RungeKutta, int]:
+def _stored_orders() -> dict[_RungeKutta, int]:
     """Orders that tests prove, as it takes longer than to trace a small step."""
-    long = RKMK(diffrax.Dopri8.tableau)
-    return {long._end: 8, long._embedded: 7}
-
-
-def _without_zeros(row: Sequence[float]) -> tuple[float, ...]:
-    """Without those at the end."""
-    return tuple(row[: max((k for k, x in enumerate(row, 1) if x != 0), default=0)])
+    method = RKMK(diffrax.Dopri8.tableau)
+    return {method._end: 8, method._embedded: 7}
 
 
 def _padded(row: Sequence[float], n: int) -> list[float]:
     return [*row, *[0.0] * (n - len(row))]
-
-
-def _combine_nonzero(weights: Any, fields: Any) -> PyTree:
-    used = [(float(w), f) for w, f in zip(weights, fields, strict=False) if w != 0]
-    return combine(*zip(*used, strict=True))

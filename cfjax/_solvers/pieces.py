@@ -23,13 +23,13 @@ from .base import AbstractLieSolver, result_of
 from .commutator_free import CF4, LieEuler
 from .compiled import control_of
 from .dense import Interpolation, Substeps
-from .dependence import depending_on_state
+from .dependence import state_dependent
 from .step import AbstractChartSolver
 from .substeps import substeps
 
 
 class _Piece(NamedTuple):
-    """The parts of the step's time, of W and of H in a piece, and where it starts and ends."""
+    """The parts (a, b, c) of the step's time, W and H in a piece, and where it starts and ends."""
 
     time: Any
     increment: Any
@@ -55,7 +55,7 @@ class AbstractPieces(AbstractLieSolver, diffrax.AbstractStratonovichSolver):
         _check_solver("solver", self.solver)
 
     @abc.abstractmethod
-    def check_for_state(self) -> None:
+    def check_state_dependent_noise(self) -> None:
         """Raises `TypeError` if the fields of the noise must not depend on the state."""
 
     def solver_of(self, piece: _Piece, is_constant: bool) -> AbstractChartSolver:
@@ -74,25 +74,24 @@ class AbstractPieces(AbstractLieSolver, diffrax.AbstractStratonovichSolver):
     def start(self, terms, t0, t1, y0, args):
         _check_paths(type(self).__name__, terms)
         if not _is_constant(terms, t0, t1, y0, args):
-            self.check_for_state()
+            self.check_state_dependent_noise()
         return super().start(terms, t0, t1, y0, args)
 
     def step(self, terms, t0, t1, y0, args, solver_state, made_jump):
         control = control_of(terms, t0, t1, use_levy=True)
         is_constant = _is_constant(terms, t0, t1, y0, args)
-        ends = itertools.accumulate((a for a, *_ in self.rows), initial=0.0)
-        pieces = [
-            _Piece(*row, *of) for row, of in zip(self.rows, itertools.pairwise(ends), strict=True)
-        ]
+        times = itertools.accumulate((a for a, *_ in self.rows), initial=0.0)
+        intervals = itertools.pairwise(times)
+        pieces = [_Piece(*row, *ends) for row, ends in zip(self.rows, intervals, strict=True)]
 
-        def kind(piece: _Piece) -> tuple[AbstractChartSolver, bool]:
+        def solver_and_drift(piece: _Piece) -> tuple[AbstractChartSolver, bool]:
             return self.solver_of(piece, is_constant), piece.time > 0
 
         progress, parts = (y0, solver_state, diffrax.RESULTS.successful), []
-        for (solver, _), alike in itertools.groupby(pieces, kind):
-            along = functools.partial(_along, terms, control)
-            progress, more = substeps(solver, along, list(alike), t0, t1, args, progress)
-            parts += more
+        for (solver, _), group in itertools.groupby(pieces, solver_and_drift):
+            terms_of = functools.partial(_terms_along, terms, control)
+            progress, new_parts = substeps(solver, terms_of, list(group), t0, t1, args, progress)
+            parts += new_parts
         y1, state, _ = progress
         return y1, None, dict(path=Substeps(parts)), state, result_of(y1)
 
@@ -121,8 +120,8 @@ class WeakOrder2(AbstractPieces):
     def __check_init__(self):
         _check_order("solver", self.solver, 3)
 
-    def check_for_state(self):
-        _check_for_state("WeakOrder2", "solver", self.solver)
+    def check_state_dependent_noise(self):
+        _check_order_for_state("WeakOrder2", "solver", self.solver)
 
 
 class ShiftedNoise(AbstractPieces):
@@ -149,10 +148,10 @@ class ShiftedNoise(AbstractPieces):
         if self.noise_solver is not None:
             _check_solver("noise_solver", self.noise_solver)
 
-    def check_for_state(self):
-        _check_for_state("ShiftedNoise", "solver", self.solver)
+    def check_state_dependent_noise(self):
+        _check_order_for_state("ShiftedNoise", "solver", self.solver)
         if self.noise_solver is not None:
-            _check_for_state("ShiftedNoise", "noise_solver", self.noise_solver)
+            _check_order_for_state("ShiftedNoise", "noise_solver", self.noise_solver)
 
     def solver_of(self, piece, is_constant):
         if piece.time:
@@ -160,7 +159,7 @@ class ShiftedNoise(AbstractPieces):
         return self.noise_solver or (LieEuler() if is_constant else self.solver)
 
 
-class _Held(diffrax.AbstractTerm):
+class _PieceTerm(diffrax.AbstractTerm):
     """A term with the control of a piece."""
 
     term: diffrax.AbstractTerm
@@ -176,48 +175,48 @@ class _Held(diffrax.AbstractTerm):
         return self.term.prod(vf, control)
 
 
-def _along(terms: diffrax.AbstractTerm, control: PyTree, piece: _Piece) -> diffrax.AbstractTerm:
+def _terms_along(terms: Any, control: PyTree, piece: _Piece) -> diffrax.AbstractTerm:
     """The terms along a piece. One without time has those of the noise alone."""
-    held = [
-        _Held(term, _part(value, piece))
-        for term, value in _pairs(terms, control)
+    piece_terms = [
+        _PieceTerm(term, _control_along(value, piece))
+        for term, value in _terms_with_controls(terms, control)
         if _is_noise(value) or not (isinstance(piece.time, float) and piece.time == 0)
     ]
-    return held[0] if len(held) == 1 else diffrax.MultiTerm(*held)
+    return piece_terms[0] if len(piece_terms) == 1 else diffrax.MultiTerm(*piece_terms)
 
 
-def _pairs(terms: Any, control: Any) -> list[tuple[diffrax.AbstractTerm, PyTree]]:
+def _terms_with_controls(terms: Any, control: Any) -> list[tuple[diffrax.AbstractTerm, PyTree]]:
     """The terms of a sum, with their controls."""
     if not isinstance(terms, diffrax.MultiTerm):
         return [(terms, control)]
     pairs = zip(terms.terms, control, strict=True)
-    return [pair for term, value in pairs for pair in _pairs(term, value)]
+    return [pair for term, value in pairs for pair in _terms_with_controls(term, value)]
 
 
 def _is_noise(control: PyTree) -> bool:
     return isinstance(control, diffrax.AbstractSpaceTimeLevyArea)
 
 
-def _part(control: Any, piece: _Piece) -> PyTree:
-    def part(h: Any, w: Any, area: Any) -> Any:
+def _control_along(control: Any, piece: _Piece) -> PyTree:
+    def increment(h: Any, w: Any, area: Any) -> Any:
         b, c = (jnp.asarray(x, w.dtype) for x in (piece.increment, piece.area))
         # A path that is followed backwards has the same area, and diffrax turns its sign.
         return b * w + c * jnp.sign(h).astype(w.dtype) * area
 
     if not _is_noise(control):
         return jnp.asarray(piece.time, jnp.result_type(control)) * control
-    return jtu.tree_map(part, control.dt, control.W, control.H)
+    return jtu.tree_map(increment, control.dt, control.W, control.H)
 
 
 def _is_constant(terms: Any, t0: Any, t1: Any, y0: PyTree, args: PyTree) -> bool:
     """Whether the noise's fields do not depend on the state."""
-    increments = _Piece(0.0, 1.0, 0.0)
+    noise_piece = _Piece(0.0, 1.0, 0.0)
 
     def field(y: PyTree) -> PyTree:
-        noise = _along(terms, terms.contr(t0, t1, use_levy=True), increments)
+        noise = _terms_along(terms, terms.contr(t0, t1, use_levy=True), noise_piece)
         return product(noise, noise.vf(t0, y, args), noise.contr(t0, t1))
 
-    return not depending_on_state(field, y0)
+    return not state_dependent(field, y0)
 
 
 def _check_paths(name: str, terms: PyTree) -> None:
@@ -240,22 +239,22 @@ def _check_paths(name: str, terms: PyTree) -> None:
 
 def _check_solver(name: str, solver: Any) -> None:
     # For diffrax a wrapped solver is an instance of what it wraps.
-    is_known = issubclass(type(solver), diffrax.AbstractStratonovichSolver | LieEuler)
-    if not issubclass(type(solver), AbstractChartSolver) or not is_known:
+    is_supported = issubclass(type(solver), diffrax.AbstractStratonovichSolver | LieEuler)
+    if not issubclass(type(solver), AbstractChartSolver) or not is_supported:
         raise TypeError(
             f"{name} must be a commutator-free or Munthe-Kaas method, such as cfjax.CF4(), got "
             f"{solver!r}."
         )
 
 
-def _check_order(name: str, solver: Any, least: int) -> None:
-    if isinstance(solver, AbstractChartSolver) and (order := solver.order(None) or 0) < least:
+def _check_order(name: str, solver: Any, min_order: int) -> None:
+    if isinstance(solver, AbstractChartSolver) and (order := solver.order(None) or 0) < min_order:
         raise ValueError(
-            f"{name} must have order {least} or more, got {solver!r} of order {order}."
+            f"{name} must have order {min_order} or more, got {solver!r} of order {order}."
         )
 
 
-def _check_for_state(method: str, name: str, solver: AbstractChartSolver) -> None:
+def _check_order_for_state(method: str, name: str, solver: AbstractChartSolver) -> None:
     if (order := solver.order(None) or 0) < 4:
         raise TypeError(
             f"{method} needs a {name} of order 4 where the noise's fields depend on the state, got "

@@ -43,13 +43,13 @@ class CayleyRK4(AbstractChartSolver, diffrax.AbstractStratonovichSolver):
         return 4
 
     def step_in(self, chart):
-        # It has coordinates of its own, and takes states.
+        # The retraction has coordinates of its own, and takes states.
         y0, first = chart.sums.y0, chart.product(chart.first_value)
         num_axes = jtu.tree_map(_num_axes, first, is_leaf=is_field)
-        end = _End(tuple(jtu.tree_leaves(num_axes)))
+        retract = _Retraction(tuple(jtu.tree_leaves(num_axes)))
 
         def rate(c: float, v: PyTree) -> PyTree:
-            y = end(v, y0)
+            y = retract(v, y0)
             return jtu.tree_map(
                 lambda n, q, v, f: each(_rate, q.ndim - n)(q, v, f) if n else f,
                 num_axes,
@@ -63,21 +63,21 @@ class CayleyRK4(AbstractChartSolver, diffrax.AbstractStratonovichSolver):
         k3 = rate(0.5, combine((1 / 2,), (k2,)))
         k4 = rate(1.0, k3)
         rates = [k1, k2, k3, k4]
-        y1 = end(combine((1 / 6, 1 / 3, 1 / 3, 1 / 6), rates), y0)
+        y1 = retract(combine((1 / 6, 1 / 3, 1 / 3, 1 / 6), rates), y0)
         # A part at rest may be a sum.
         y1 = chart.sums.map(lambda c, y, z: z if c is None else z - y, y1)
-        return Step(y1, Path.of(_EXTENSION, y0, rates, end))
+        return Step(y1, Path.of(_EXTENSION, y0, rates, retract))
 
 
-class _End(NamedTuple):
-    """The point with tangent vector v at q as its coordinates. Equal to itself and hashable."""
+class _Retraction(NamedTuple):
+    """The point with the tangent vector v at q as coordinates. A tuple, so it is hashable."""
 
     num_axes: tuple[int, ...]
 
     def __call__(self, v: PyTree, q: PyTree) -> PyTree:
         num_axes = jtu.tree_unflatten(jtu.tree_structure(q), self.num_axes)
         return jtu.tree_map(
-            lambda n, q, v: each(_end, q.ndim - n)(q, v) if n else q + v, num_axes, q, v
+            lambda n, q, v: each(_retract, q.ndim - n)(q, v) if n else q + v, num_axes, q, v
         )
 
 
@@ -96,7 +96,7 @@ def _num_axes(field: Any) -> int:
     )
 
 
-def _end(q: Array, v: Array) -> Array:
+def _retract(q: Array, v: Array) -> Array:
     return _Cayley(*map(_columns, (q, v))).end().reshape(q.shape)
 
 
@@ -119,9 +119,10 @@ class _Cayley:
         # a = left right^T, of rank 2 p.
         self.left = jnp.concatenate([g, -q], axis=1)
         self.right = jnp.concatenate([q, g], axis=1)
-        small = jnp.eye(2 * p, dtype=q.dtype) - matmul(self.right.T, self.left) / 2
+        capacitance = jnp.eye(2 * p, dtype=q.dtype) - matmul(self.right.T, self.left) / 2
         # Halfway between Q and Y: (I - a / 2)^-1 Q, by the Sherman-Morrison-Woodbury formula.
-        self.middle = q + matmul(self.left, jnp.linalg.solve(small, matmul(self.right.T, q))) / 2
+        solution = jnp.linalg.solve(capacitance, matmul(self.right.T, q))
+        self.middle = q + matmul(self.left, solution) / 2
 
     def end(self) -> Float[Array, "n p"]:
         return 2 * self.middle - self.q
@@ -134,8 +135,8 @@ class _Cayley:
         """
         q = self.q
         target = velocity - matmul(self.left, matmul(self.right.T, velocity)) / 2
-        along = matmul(q.T, target)
+        projection = matmul(q.T, target)
         inverse = jnp.linalg.inv(matmul(q.T, self.middle))
-        x = matmul(target - matmul(q, along), inverse)
-        w = matmul(along + matmul(x.T, self.middle), inverse)
+        x = matmul(target - matmul(q, projection), inverse)
+        w = matmul(projection + matmul(x.T, self.middle), inverse)
         return x + matmul(q, w)

@@ -142,7 +142,7 @@ class Richardson(AbstractSolver, diffrax.AbstractAdaptiveSolver, diffrax.Abstrac
         order = self.order(terms)
         error = jtu.tree_map(lambda a, b: (a - b) / (2**order - 1), y1, y2)
         if not self.as_in_paper:
-            error = jtu.tree_map(partial(_added_up, order), error, y0, y2)
+            error = jtu.tree_map(partial(_accumulated, order), error, y0, y2)
         result = first_failure(result, result_1, result_2)
         if result is not diffrax.RESULTS.successful:
             # What a failed step returns may look like a small error. As in diffrax, it is rejected.
@@ -156,7 +156,7 @@ class Richardson(AbstractSolver, diffrax.AbstractAdaptiveSolver, diffrax.Abstrac
         return self.solver.func(terms, t0, y0, args)
 
 
-def _added_up(order: int, error: Array, y0: Array, y2: Array) -> Array:
+def _accumulated(order: int, error: Array, y0: Array, y2: Array) -> Array:
     """The error of a step, times the number of such steps in the solution's own unit of time."""
     size = lax.stop_gradient(jnp.linalg.norm(jnp.ravel(error)))
     scale = lax.stop_gradient(jnp.maximum(*(jnp.linalg.norm(jnp.ravel(y)) for y in (y0, y2))))

@@ -1,4 +1,4 @@
-"""What `cfjax.integrate` asks of a solver beyond what diffrax does."""
+"""The methods of a solver that `cfjax.integrate` uses beyond those of diffrax."""
 
 from typing import Any
 
@@ -9,11 +9,11 @@ from .._numerics.checks import Fault
 
 
 class AbstractSolver(diffrax.AbstractSolver):
-    """A solver that says more of itself to `cfjax.integrate` than diffrax asks.
+    """A diffrax solver with the methods that `cfjax.integrate` uses beyond those of diffrax.
 
     All solvers of this package derive from it. A solver of your own may do so too, in place of
-    `diffrax.AbstractSolver`, and override what it can say more of. Every other diffrax solver is
-    taken for one that says nothing: these are the defaults.
+    `diffrax.AbstractSolver`, and override any of these methods. Their defaults hold for every other
+    diffrax solver.
     """
 
     @property
@@ -35,22 +35,22 @@ class AbstractSolver(diffrax.AbstractSolver):
     def start(
         self, terms: PyTree, t0: Any, t1: Any, y0: PyTree, args: PyTree
     ) -> tuple[PyTree, Fault]:
-        """As `init`, which raises an error for a wrong start, but returns what is wrong with it."""
+        """As `init`, but returns what is wrong with the start, where `init` raises an error."""
         return self.init(terms, t0, t1, y0, args), Fault.none()
 
     def for_equal_steps(
         self, terms: PyTree, length: Real[Array, ""], t0: Any, y0: PyTree, args: PyTree
     ) -> Any:
-        """The same method for steps of this length alone, which has computed what all share."""
+        """The same method for steps of this length alone, with what all of them share computed."""
         del terms, length, t0, y0, args
         return self
 
     def without_estimate(self) -> Any:
-        """The same method for steps that nobody controls: it makes nothing for an estimate."""
+        """The same method for steps without error control: it computes nothing for an estimate."""
         return self
 
 
-class _Stock(AbstractSolver, diffrax.AbstractWrappedSolver):
+class _DiffraxSolver(AbstractSolver, diffrax.AbstractWrappedSolver):
     """Another solver of diffrax, with the defaults."""
 
     solver: diffrax.AbstractSolver
@@ -77,6 +77,6 @@ class _Stock(AbstractSolver, diffrax.AbstractWrappedSolver):
 
 
 def as_own(solver: diffrax.AbstractSolver) -> AbstractSolver:
-    """The solver, with what `cfjax.integrate` asks of it."""
+    """The solver, wrapped with the defaults of `AbstractSolver` if it is not one."""
     # Not `isinstance`: for diffrax a wrapped solver is an instance of what it wraps.
-    return solver if issubclass(type(solver), AbstractSolver) else _Stock(solver)  # pyright: ignore[reportReturnType]
+    return solver if issubclass(type(solver), AbstractSolver) else _DiffraxSolver(solver)  # pyright: ignore[reportReturnType]

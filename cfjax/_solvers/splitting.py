@@ -14,31 +14,31 @@ from .._field import Rest, combine, is_field
 from .._methods.splitting import BLANES_MOAN_4, BLANES_MOAN_6, STRANG, splitting_order
 from .._term import product
 from .base import AbstractLieSolver, State, fault_of_start, time_at
-from .compiled import by_turns, control_of
+from .compiled import control_of, scan_list
 from .dense import AbstractPath, Interpolation
-from .dependence import depending_on_time, unseen
-from .step import Step, begun, ended
+from .dependence import time_dependent, unknown_dependence
+from .step import Step, begin_step, finish_step
 from .sums import Sums
 
 
 class _Replay(AbstractPath):
-    """The flows of a step again, each for a part of its time: on the manifold, of order 1."""
+    """The flows of a step, each for the same part of its time: on the manifold, of order 1."""
 
     start: PyTree
     first: PyTree
-    # Those of each pair of stages.
-    later: list[tuple[PyTree, ...]]
+    # The fields of each pair of stages.
+    pairs: list[tuple[PyTree, ...]]
 
     def point(self, theta: Any) -> PyTree:
         sums = Sums(self.start)
 
-        def pair(y: PyTree, fields: tuple[PyTree, ...]) -> tuple[PyTree, None]:
+        def pair_end(y: PyTree, fields: tuple[PyTree, ...]) -> tuple[PyTree, None]:
             for field in fields:
-                y = sums.moved(combine((theta,), (field,)), y)
+                y = sums.flow_frozen(combine((theta,), (field,)), y)
             return y, None
 
-        y, _ = pair(self.start, (self.first,))
-        return by_turns(pair, y, self.later)[0]
+        y, _ = pair_end(self.start, (self.first,))
+        return scan_list(pair_end, y, self.pairs)[0]
 
 
 class AbstractSplitting(AbstractLieSolver, diffrax.AbstractStratonovichSolver):
@@ -51,7 +51,7 @@ class AbstractSplitting(AbstractLieSolver, diffrax.AbstractStratonovichSolver):
 
     @property
     def is_symmetric(self):
-        # They come from sums of rounded coefficients.
+        # The stages are sums of rounded coefficients.
         pairs = zip(self.stages, reversed(self.stages), strict=True)
         return all(abs(a - b) < 1e-14 for a, b in pairs)
 
@@ -59,12 +59,12 @@ class AbstractSplitting(AbstractLieSolver, diffrax.AbstractStratonovichSolver):
         return splitting_order(self.stages)
 
     def for_terms(self, terms):
-        name, parts = type(self).__name__, terms.terms
-        if len(parts) < 2:
+        name, summands = type(self).__name__, terms.terms
+        if len(summands) < 2:
             raise TypeError(
-                f"{name} takes a diffrax.MultiTerm of two or more terms, got {len(parts)}."
+                f"{name} takes a diffrax.MultiTerm of two or more terms, got {len(summands)}."
             )
-        if is_driven(parts[:-1]):
+        if is_driven(summands[:-1]):
             raise TypeError(
                 f"{name} takes noise, or what else a path drives, in its last term only: move it "
                 "there, together with what acts at the same time, as a diffrax.MultiTerm."
@@ -75,11 +75,11 @@ class AbstractSplitting(AbstractLieSolver, diffrax.AbstractStratonovichSolver):
         self.for_terms(terms)
         control = terms.contr(t0, t1)
         last = terms.terms[-1]
-        found = depending_on_time(
+        dependent = time_dependent(
             lambda t: product(last, last.vf(t, y0, args), control[-1]), t0, y0
         )
-        if found:
-            cause = f" {unseen('t')}." if found[0][1] is None else ""
+        if dependent:
+            cause = f" {unknown_dependence('t')}." if dependent[0][1] is None else ""
             raise TypeError(
                 f"The last term of {type(self).__name__} must not depend on time, which passes "
                 "while it acts: take another one as the last, or add one at rest, with zeros for "
@@ -99,39 +99,39 @@ class AbstractSplitting(AbstractLieSolver, diffrax.AbstractStratonovichSolver):
         return State(compensation, first, None), fault
 
     def step(self, terms, t0, t1, y0, args, solver_state, made_jump):
-        parts = terms.terms
-        t0, known = begun(solver_state, t0, lambda t0: parts[0].vf(t0, y0, args), made_jump)
+        summands = terms.terms
+        t0, first = begin_step(solver_state, t0, lambda t0: summands[0].vf(t0, y0, args), made_jump)
         controls = control_of(terms, t0, t1)
 
-        def stepped(y0: PyTree) -> Step:
+        def step_from(y0: PyTree) -> Step:
             sums = Sums(y0, solver_state.compensation)
 
             def value(k: int, c: Any, z: PyTree) -> PyTree:
-                return parts[k].vf(time_at(c, t0, t1), sums.state(z), args)
+                return summands[k].vf(time_at(c, t0, t1), sums.state(z), args)
 
             def apply_flow(k: int, value: PyTree, s: Any, z: PyTree) -> tuple[PyTree, PyTree]:
-                field = product(parts[k], value, _scaled(s, controls[k]))
-                return field, sums.moved(field, z)
+                field = product(summands[k], value, _scaled(s, controls[k]))
+                return field, sums.flow_frozen(field, z)
 
-            def pair(carry: tuple[PyTree, PyTree], x: _Pair) -> Any:
+            def pair(carry: tuple[PyTree, PyTree], x: _StagePair) -> Any:
                 z, _ = carry
-                last, fields = len(parts) - 1, []
-                turns = [(k, x.there, x.start) for k in range(1, last)]
-                turns += [(last, x.there + x.back, x.start)]
-                turns += [(k, x.back, x.end) for k in reversed(range(1, last))]
-                for k, s, c in turns:
+                last, fields = len(summands) - 1, []
+                flows = [(k, x.there, x.start) for k in range(1, last)]
+                flows += [(last, x.there + x.back, x.start)]
+                flows += [(k, x.back, x.end) for k in reversed(range(1, last))]
+                for k, s, c in flows:
                     field, z = apply_flow(k, value(k, c, z), s, z)
                     fields.append(field)
-                new = value(0, x.end, z)
-                field, z = apply_flow(0, new, x.kick, z)
-                return (z, new), (*fields, field)
+                next_value = value(0, x.end, z)
+                field, z = apply_flow(0, next_value, x.kick, z)
+                return (z, next_value), (*fields, field)
 
-            field, z = apply_flow(0, known, self.stages[0], sums.start)
-            (z, last), later = by_turns(pair, (z, known), _pairs(self.stages))
-            end, _ = sums.shared(z, None, is_followed=True)
+            field, z = apply_flow(0, first, self.stages[0], sums.start)
+            (z, last), later = scan_list(pair, (z, first), _stage_pairs(self.stages))
+            end, _ = sums.materialised(z, None, is_followed=True)
             return Step(end, _Replay(y0, field, later), last=last)
 
-        return ended(solver_state, stepped, y0)
+        return finish_step(solver_state, step_from, y0)
 
 
 class Splitting(AbstractSplitting):
@@ -205,7 +205,7 @@ class BlanesMoan6(AbstractSplitting):
     stages: ClassVar[tuple[float, ...]] = BLANES_MOAN_6
 
 
-class _Pair(NamedTuple):
+class _StagePair(NamedTuple):
     """Two stages: the parts of the step of the terms on the way there and back, of the first term
     at the end, and the times before and after, as parts of the step.
     """
@@ -217,15 +217,15 @@ class _Pair(NamedTuple):
     end: Any
 
 
-def _pairs(stages: Sequence[float]) -> list[_Pair]:
-    pairs, time = [], 0.0
+def _stage_pairs(stages: Sequence[float]) -> list[_StagePair]:
+    pairs, start = [], 0.0
     for k in range(0, len(stages), 2):
         there, back = stages[k : k + 2]
         is_last = k + 2 == len(stages)
-        after = 1.0 if is_last else time + there + back
+        end = 1.0 if is_last else start + there + back
         kick = back if is_last else back + stages[k + 2]
-        pairs.append(_Pair(there, back, kick, time, after))
-        time = after
+        pairs.append(_StagePair(there, back, kick, start, end))
+        start = end
     return pairs
 
 

@@ -11,7 +11,7 @@ from jax import lax
 from jaxtyping import Array, PyTree, Real
 
 from .._arrays import describe
-from .._field import AbstractFrozenField, is_field
+from .._field import AbstractFrozenField, has_default_combine, is_field
 from .._fields.elementwise import Elementwise
 from .._numerics.matmul import matmul
 from .._numerics.vectors import pack
@@ -22,11 +22,11 @@ def can_roll(unroll: bool | None, field: PyTree, point: PyTree) -> bool:
     """Whether flows of combinations of such fields may be one loop, and where `unroll` is None
     whether that pays.
 
-    Fields must combine in the usual way and have no chart of their own. Fields of far more numbers
+    Fields must have the default `combine` and no chart of their own. Fields of far more numbers
     than the point has are faster unrolled.
     """
-    parts = jtu.tree_leaves(field, is_leaf=is_field)
-    is_possible = any(map(is_field, parts)) and _is_plain(field)
+    fields = list(filter(is_field, jtu.tree_leaves(field, is_leaf=is_field)))
+    is_possible = bool(fields) and all(map(_has_defaults, fields))
     if unroll is not None:
         return is_possible and not unroll
     return is_possible and size_of(field) <= max(limits.MAX_SIZE, 4 * size_of(point))
@@ -36,20 +36,12 @@ def size_of(tree: PyTree) -> int:
     return sum(jnp.size(x) for x in jtu.tree_leaves(tree))
 
 
-def _is_plain(field: PyTree) -> bool:
-    """Whether its parts combine in the usual way and have no chart of their own."""
-    parts = jtu.tree_leaves(field, is_leaf=is_field)
-    return all(_is_plain_part(part) for part in parts if is_field(part))
-
-
-def _is_plain_part(field: AbstractFrozenField) -> bool:
+def _has_defaults(field: AbstractFrozenField) -> bool:
+    """Whether a field has the default `combine` and no chart of its own."""
     cls: Any = type(field.field if isinstance(field, Elementwise) else field)
-    usual: Any = AbstractFrozenField
-    return (
-        cls.combine.__func__ is usual.combine.__func__
-        and cls.to_chart is usual.to_chart
-        and cls.from_chart is usual.from_chart
-    )
+    default = AbstractFrozenField
+    has_chart = cls.to_chart is not default.to_chart or cls.from_chart is not default.from_chart
+    return has_default_combine(cls) and not has_chart
 
 
 def rolled_flows(
@@ -59,19 +51,19 @@ def rolled_flows(
     flow: Callable[[PyTree, PyTree], PyTree],
     weights: Callable[[Array], Real[Array, " stages"]] = lambda row: row,
 ) -> PyTree:
-    """Where flows of combinations of the fields lead, that of the first row first.
+    """The point to which flows of combinations of the fields lead, that of the first row first.
 
-    A combination has the `weights` of its row, which are of the first fields, and zero where all
-    of the row is.
+    Each combination has the `weights` of its row, for as many fields as the row has columns. A
+    weight is zero where the whole column of the row is.
     """
     fields = fields[: rows.shape[-1]]
 
-    def moved(point: PyTree) -> PyTree:
-        # XLA computes what leads to each of the arrays that `jnp.stack` gets for itself.
+    def end_point(point: PyTree) -> PyTree:
+        # Not `jnp.stack`, as XLA would compute each of its operands separately.
         stacked = Stacked(jtu.tree_map(lambda *leaves: pack(leaves), *fields))
 
-        def body(point: PyTree, turn: Any) -> Any:
-            row, is_used = turn
+        def body(point: PyTree, x: Any) -> Any:
+            row, is_used = x
             return flow(stacked.combination(Weights(weights(row), is_used)), point), None
 
         return over_stages(body, point, (rows, rows.any(axis=tuple(range(1, rows.ndim - 1)))))[0]
@@ -79,17 +71,17 @@ def rolled_flows(
     # A weak type would be lost on the way.
     start = jtu.tree_map(lambda x: jnp.asarray(x, jnp.result_type(x)), point)
     # For one system a loop of flows is as fast, and its derivatives compile faster.
-    return scalarised(moved, start, in_batches=True)
+    return scalarised(end_point, start, in_batches=True)
 
 
 class Weights(NamedTuple):
     """The weights of a combination, and which of them are not zero.
 
-    Where the loop over stages is unrolled, the others are left out.
+    If the loop over stages is unrolled, the terms of weight zero drop out.
     """
 
     weights: Any
-    are_used: Any
+    nonzero: Any
 
     @classmethod
     def of(cls, rows: Sequence[Sequence[Any]], n: int) -> "Weights":
@@ -99,22 +91,22 @@ class Weights(NamedTuple):
 
 
 class Stacked(eqx.Module):
-    """Fields that combine in the usual way, stacked along a new first axis of their arrays.
+    """Fields with the default `combine`, stacked along a new first axis of their arrays.
 
-    Those that are not there yet are zero.
+    Fields that are not evaluated yet are zero.
     """
 
     stacked: PyTree
 
     @classmethod
-    def of(cls, known: Sequence[PyTree], n: int) -> "Stacked":
-        fields = cls(first_of(known[0], n))
-        for k, field in enumerate(known[1:], 1):
-            fields = fields.put(k, field)
-        return fields
+    def of(cls, fields: Sequence[PyTree], n: int) -> "Stacked":
+        stacked = cls(stack_with_zeros(fields[0], n))
+        for k, field in enumerate(fields[1:], 1):
+            stacked = stacked.put(k, field)
+        return stacked
 
     def combination(self, row: Weights) -> PyTree:
-        """That of the first fields, as many as the row has entries."""
+        """The combination of the first fields, as many as the row has entries."""
         return jtu.tree_map(lambda f: combination_of(row, f), self.stacked)
 
     def field(self, combination: PyTree) -> PyTree:
@@ -124,51 +116,51 @@ class Stacked(eqx.Module):
         return entry(self.stacked, k)
 
     def put(self, k: Any, field: PyTree) -> "Stacked":
-        """With field k."""
-        return Stacked(with_entry(self.stacked, k, self.entered(field)))
+        """With `field` as field k."""
+        return Stacked(with_entry(self.stacked, k, self.stored(field)))
 
     def point(self, z: PyTree) -> PyTree:
         return z
 
     def coordinates(self, point: PyTree) -> PyTree:
-        """Of a point of the step, in arrays that do not grow."""
+        """The coordinates of a point of the step, in arrays that do not grow."""
         return point
 
-    def kept(self, k: Any) -> PyTree:
-        """What `entered` returns, where no field is evaluated."""
-        # Varying along the axes of a mesh as they do.
+    def placeholder(self, k: Any) -> PyTree:
+        """In place of `stored(field)` where no field is evaluated."""
+        # Varies along the axes of a mesh as the fields do.
         return jtu.tree_map(lambda f: jnp.zeros_like(f[0]), self.stacked)
 
-    def entered(self, field: PyTree) -> PyTree:
-        """What to keep of a field that was evaluated."""
-        return like(self.kept(0), field)
+    def stored(self, field: PyTree) -> PyTree:
+        """The arrays to store of a field that was evaluated."""
+        return cast_like(self.placeholder(0), field)
 
     def enlarged(self, new: PyTree, z: PyTree, k: Any) -> tuple["Stacked", PyTree]:
-        """With room for field k, of which `new` is kept, frozen at the point z; and the field."""
+        """With room for field k, of which `new` is stored, frozen at the point z; and the field."""
         return self, new
 
 
-def is_like(a: PyTree, b: PyTree) -> bool:
+def same_types(a: PyTree, b: PyTree) -> bool:
     return jtu.tree_structure(a) == jtu.tree_structure(b) and _types(a) == _types(b)
 
 
-def like(first: PyTree, value: PyTree) -> PyTree:
-    # What was seen of the field before may not hold for every time.
-    if not is_like(first, value):
+def cast_like(first: PyTree, value: PyTree) -> PyTree:
+    # Only some times of the field were traced before.
+    if not same_types(first, value):
         raise TypeError(
             "The field must return frozen fields of one structure, shape and dtype at all stages "
             f"of a step, got {describe(first)} and {describe(value)}. With unroll=True the solver "
             "accepts other fields too."
         )
-    # Only a weak type may be left over.
+    # Only a weak type may differ.
     return jtu.tree_map(lambda v, f: jnp.asarray(v, f.dtype), value, first)
 
 
-def first_of(tree: PyTree, n: int) -> PyTree:
-    """The first of n."""
-    # Spread over a mesh as it is.
-    pad = lambda x: [(0, n - 1, 0), *[(0, 0, 0)] * jnp.ndim(x)]  # noqa: E731
-    return jtu.tree_map(lambda x: lax.pad(x[None], jnp.zeros((), x.dtype), pad(x)), tree)
+def stack_with_zeros(tree: PyTree, n: int) -> PyTree:
+    """The leaves as the first of n entries along a new axis, of which the others are zero."""
+    # Padding keeps the sharding over a mesh.
+    padding = lambda x: [(0, n - 1, 0), *[(0, 0, 0)] * jnp.ndim(x)]  # noqa: E731
+    return jtu.tree_map(lambda x: lax.pad(x[None], jnp.zeros((), x.dtype), padding(x)), tree)
 
 
 def combination_of(row: Weights, fields: Array) -> Array:
@@ -179,10 +171,10 @@ def combination_of(row: Weights, fields: Array) -> Array:
 
 
 def _sum(row: Weights, fields: Array) -> Array:
-    each = len(fields), *[1] * (fields.ndim - 1)
-    terms = row.weights.astype(fields.dtype).reshape(each) * fields
-    # Where the loop is unrolled, those that are zero are not there.
-    terms = jnp.where(row.are_used.reshape(each), terms, jnp.zeros((), terms.dtype))
+    shape = len(fields), *[1] * (fields.ndim - 1)
+    terms = row.weights.astype(fields.dtype).reshape(shape) * fields
+    # If the loop is unrolled, terms of weight zero drop out.
+    terms = jnp.where(row.nonzero.reshape(shape), terms, jnp.zeros((), terms.dtype))
     return jnp.sum(terms, axis=0)
 
 

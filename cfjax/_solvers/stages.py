@@ -16,57 +16,57 @@ from .stacked import (
     Stacked,
     Weights,
     can_roll,
+    cast_like,
     combination_of,
     entry,
-    first_of,
-    is_like,
-    like,
+    same_types,
     size_of,
+    stack_with_zeros,
     with_entry,
 )
 from .step import Chart
 
 
 def _can_roll_in_room(
-    unroll: bool | None, chart: Chart, known: Sequence[Any], num_stages: int
+    unroll: bool | None, chart: Chart, fields: Sequence[Any], num_stages: int
 ) -> bool:
-    """Whether a field with a chart of its own has room for all stages, after those known.
+    """Whether fields with a chart of their own have room for all stages.
 
     It compiles in a third of the time, and runs an eighth to a third longer.
     """
-    first = known[-1]
-    if unroll or not is_field(first) or type(first).room is AbstractFrozenField.room:
+    field = fields[-1]
+    if unroll or not is_field(field) or type(field).room is AbstractFrozenField.room:
         return False
     pays = unroll is False or size_of(chart.start) <= limits.LARGE
-    if not pays or any(x.span is not first.span for x in known):
+    if not pays or any(x.span is not field.span for x in fields):
         return False
-    room = first.room(chart.start, num_stages)
-    return room is not None and _fits(room, chart, first)
+    room = field.room(chart.start, num_stages)
+    return room is not None and _fits(room, chart, field)
 
 
-def _fits(room: Any, chart: Chart, first: Any) -> bool:
+def _fits(room: Any, chart: Chart, field: Any) -> bool:
     fits = False
 
-    def look() -> None:
+    def trace() -> None:
         nonlocal fits
-        k, z = room.coordinates(first, chart.start)
-        later = chart.field(jnp.zeros(()), room.point(z), [room.field(k)])
-        fits = type(later) is type(first) and is_like(room.kept(0), room.entered(later))
+        k, z = room.coordinates(field, chart.start)
+        second = chart.field(jnp.zeros(()), room.point(z), [room.field(k)])
+        fits = type(second) is type(field) and same_types(room.kept(0), room.entered(second))
 
-    jax.eval_shape(look)
+    jax.eval_shape(trace)
     return fits
 
 
 def is_uniform(chart: Chart) -> bool:
     """Whether the field has one structure, and its arrays one shape and dtype, at all stages."""
-    later = jax.eval_shape(lambda: chart.field(jnp.zeros(()), chart.start, [chart.first]))
-    return is_like(chart.first, later)
+    second = jax.eval_shape(lambda: chart.field(jnp.zeros(()), chart.start, [chart.first]))
+    return same_types(chart.first, second)
 
 
 class _Flow(NamedTuple):
     """A flow of a step: from which point, along which combination of the fields, to which point,
-    and the stage that is evaluated there, with its time. What is no stage has the number after the
-    last one.
+    and the stage that is evaluated there, with its time. A point without a stage has the number
+    after the last one.
     """
 
     source: Any
@@ -81,13 +81,13 @@ def _flows(products: Sequence[Product], stages: Sequence[Product], times: Row) -
 
     The last of `stages` is its end.
     """
-    place = {product: k for k, product in enumerate(products)}
-    evaluated = {rows: k for k, rows in enumerate(stages[:-1])}
+    index = {product: k for k, product in enumerate(products)}
+    stage_of = {rows: k for k, rows in enumerate(stages[:-1])}
     flows = []
     for target, product in enumerate(products[1:], 1):
-        stage = evaluated.get(product, len(times))
-        c = float(times[stage]) if product in evaluated else 0.0
-        flows.append(_Flow(place[product[:-1]], product[-1], target, stage, c))
+        stage = stage_of.get(product, len(times))
+        c = float(times[stage]) if product in stage_of else 0.0
+        flows.append(_Flow(index[product[:-1]], product[-1], target, stage, c))
     source, weights, target, stage, c = zip(*flows, strict=True)
     rows = Weights.of(weights, len(times))
     return _Flow(np.asarray(source), rows, *map(np.asarray, (target, stage, c)))
@@ -119,7 +119,7 @@ def rolled(
         fields = _InRoom.of([first], chart.start, num_stages, num_stages + 1)
     if fields is None:
         return None
-    # Each after those that it begins with. The first has no flows.
+    # Each after its prefixes. The first has no flows.
     products = list(dict.fromkeys(rows[:n] for rows in stages for n in range(len(rows) + 1)))
 
     def body(carry: Any, x: _Flow) -> Any:
@@ -128,15 +128,15 @@ def rolled(
         point = chart.flow(field, fields.point(entry(points, x.source)))
         new = chosen(
             x.stage < num_stages,
-            lambda: fields.entered(chart.field(x.c, point, [field])),
-            lambda: fields.kept(x.stage),
+            lambda: fields.stored(chart.field(x.c, point, [field])),
+            lambda: fields.placeholder(x.stage),
         )
         z = fields.coordinates(point)
         fields, new = fields.enlarged(new, z, x.stage)
         return (with_entry(points, x.target, z), fields.put(x.stage, new)), None
 
     start = fields.coordinates(chart.start)
-    carry = first_of(start, len(products)), fields
+    carry = stack_with_zeros(start, len(products)), fields
     (points, fields), _ = over_stages(body, carry, _flows(products, stages, times))
     return Stages(
         chart._replace(start=fields.point(start)),
@@ -148,64 +148,64 @@ def rolled(
 def rolled_elements(
     unroll: bool | None,
     chart: Chart,
-    known: Sequence[PyTree],
+    stages: Sequence[PyTree],
     rows: Sequence[Sequence[Any]],
     times: Sequence[float],
     element: Callable[[PyTree, PyTree], PyTree],
-    number: Callable[[PyTree], Real[Array, ""] | None],
+    zero_of: Callable[[PyTree], Real[Array, ""] | None],
 ) -> tuple[list[PyTree], Real[Array, ""] | None] | None:
-    """The known stages k, and for each row and time c the stage `element(u, f)`; and the sum of the
-    `number` of each u, or None.
+    """The `stages` k, and for each row and time c a further stage `element(u, f)`; and the sum of
+    `zero_of(u)` over all u, or None.
 
     Here `u = sum_j row[j] k[j]`, and f is the field at time c and the point where u leads from the
     start. None where the field allows no loop, where `unroll` asks for none, and where it does not
     pay.
     """
-    first, n = known[0], len(known) + len(rows)
+    first, n = stages[0], len(stages) + len(rows)
     if len(rows) < 2 or not all(map(any, rows)):
         return None
 
     if can_roll(unroll, first, first) and is_uniform(chart):
-        fields = Stacked.of(known, n)
-        made, total = _rolled_elements(chart, fields, len(known), rows, times, element, number)
-        return [*known, *made[len(known) :]], total
-    if not _can_roll_in_room(unroll, chart, known, n):
+        fields = Stacked.of(stages, n)
+        values, total = _rolled_elements(chart, fields, len(stages), rows, times, element, zero_of)
+        return [*stages, *values[len(stages) :]], total
+    if not _can_roll_in_room(unroll, chart, stages, n):
         return None
     # A bracket takes time as the third power of the room: less for the first ones.
     half = len(rows) // 2 if len(rows) > limits.MANY else 0
-    for few in (slice(half), slice(half, None)) if half else (slice(None),):
-        m = len(known) + len(rows[few])
-        fields = _InRoom.of(known, chart.start, m, m)
-        known, _ = _rolled_elements(chart, fields, len(known), rows[few], times[few], element)
-    return list(known), None
+    for chunk in (slice(half), slice(half, None)) if half else (slice(None),):
+        m = len(stages) + len(rows[chunk])
+        fields = _InRoom.of(stages, chart.start, m, m)
+        stages, _ = _rolled_elements(chart, fields, len(stages), rows[chunk], times[chunk], element)
+    return list(stages), None
 
 
 def _rolled_elements(
     chart: Chart,
     fields: Any,
-    num_known: int,
+    num_stages: int,
     rows: Sequence[Sequence[Any]],
     times: Sequence[float],
     element: Callable[[PyTree, PyTree], PyTree],
-    number: Callable[[PyTree], Real[Array, ""] | None] = lambda u: None,
+    zero_of: Callable[[PyTree], Real[Array, ""] | None] = lambda u: None,
 ) -> tuple[list[PyTree], Real[Array, ""] | None]:
-    n = num_known + len(rows)
+    n = num_stages + len(rows)
 
     def body(carry: Any, x: Any) -> Any:
         (fields, total), (k, row, c) = carry, x
         combination = fields.combination(row)
         u = fields.field(combination)
         point = chart.flow(u, chart.start)
-        new = fields.entered(chart.field(c, point, [u]))
+        new = fields.stored(chart.field(c, point, [u]))
         fields, new = fields.enlarged(new, fields.coordinates(point), k)
         u = fields.field(combination)
-        total = None if total is None else total + number(u)
+        total = None if total is None else total + zero_of(u)
         return (fields.put(k, element(u, new)), total), None
 
-    turns = np.arange(num_known, n), Weights.of(rows, n), np.asarray(times, float)
-    # Of zero, which varies along the axes of a mesh as the known ones do.
+    xs = np.arange(num_stages, n), Weights.of(rows, n), np.asarray(times, float)
+    # Computed, as it must vary along the axes of a mesh as the fields do.
     zero = combine((0.0,), (fields.at(0),))
-    (fields, total), _ = over_stages(body, (fields, number(zero)), turns)
+    (fields, total), _ = over_stages(body, (fields, zero_of(zero)), xs)
     return [fields.at(k) for k in range(n)], total
 
 
@@ -218,12 +218,12 @@ class _InRoom(eqx.Module):
     ks: Real[Array, "n m m"]
 
     @classmethod
-    def of(cls, known: Sequence[Any], point: Any, num_fields: int, n: int) -> "_InRoom | None":
+    def of(cls, fields: Sequence[Any], point: Any, num_fields: int, n: int) -> "_InRoom | None":
         """With room for some fields and coordinates of n; None where they offer no room."""
-        room = known[-1].room(point, num_fields)
+        room = fields[-1].room(point, num_fields)
         if room is None:
             return None
-        ks = [room.coordinates(field, point)[0] for field in known]
+        ks = [room.coordinates(field, point)[0] for field in fields]
         return cls(room, jnp.zeros((n, *ks[0].shape), ks[0].dtype).at[: len(ks)].set(jnp.stack(ks)))
 
     def combination(self, row: Weights) -> Array:
@@ -244,11 +244,11 @@ class _InRoom(eqx.Module):
     def coordinates(self, point: Any) -> Array:
         return jnp.pad(point.z, ((0, self.ks.shape[1] - len(point.z)), (0, 0)))
 
-    def kept(self, k: Any) -> Any:
+    def placeholder(self, k: Any) -> Any:
         return self.room.kept(k)
 
-    def entered(self, field: Any) -> Any:
-        return like(self.room.kept(0), self.room.entered(field))
+    def stored(self, field: Any) -> Any:
+        return cast_like(self.room.kept(0), self.room.entered(field))
 
     def enlarged(self, new: Any, z: Array, k: Any) -> tuple["_InRoom", Any]:
         room, new = self.room.enlarged(new, z, k)

@@ -29,18 +29,18 @@ Time = float | Real[Array, ""]
 
 
 class Step(eqx.Module):
-    """A step: where it ends, the way there for output within it, and an estimate of its error.
+    """A step: its end, its path for output within it, and an estimate of its error.
 
     The end is a point of the step, see `Sums`. `last` is the value of the field with which the next
-    step begins, if the step has it. `is_shared` says that the end is materialised, with all that
-    the estimate is made of.
+    step begins, if the step has it. `is_materialised` says that the end and the estimate are
+    materialised together.
     """
 
     end: PyTree
     path: AbstractPath
     error: PyTree = None
     last: PyTree = None
-    is_shared: bool = eqx.field(static=True, default=False)
+    is_materialised: bool = eqx.field(static=True, default=False)
 
 
 class Chart(NamedTuple):
@@ -49,14 +49,14 @@ class Chart(NamedTuple):
     A part of a point is in the coordinates that its field chooses
     (`AbstractFrozenField.to_chart`), or, if it is a compensated sum, the increment from the start
     (`Sums`). A method need not know which. The field `h f(t + c h, y)` of a step of length h is
-    made in two steps, as the next step may begin with what the first of them gives: its *value*,
-    what the term's `vf` returns, and the frozen field, `product` of the value.
+    computed in two stages, as the next step may begin with the first: its *value*, which the term's
+    `vf` returns, and the frozen field, `product` of the value.
     """
 
     value: Callable[[Time, PyTree], PyTree]
     product: Callable[[PyTree], PyTree]
     sums: Sums
-    # What has been evaluated first, and where.
+    # The first evaluation, and its point.
     first_value: PyTree
     first: PyTree
     start: PyTree
@@ -70,7 +70,7 @@ class Chart(NamedTuple):
         first_value: PyTree,
     ) -> "Chart":
         """With the first field, from whose point all flows start. It may correct a drift."""
-        first, start = sums.entered(product(first_value), sums.start)
+        first, start = sums.to_chart(product(first_value), sums.start)
         return cls(value, product, sums, first_value, first, start)
 
     def value_at(self, c: Time, point: PyTree) -> PyTree:
@@ -79,7 +79,7 @@ class Chart(NamedTuple):
 
     def frozen(self, value: PyTree, point: PyTree, earlier: Sequence[PyTree]) -> PyTree:
         """The field with this value at a point, after `earlier` ones, in the same coordinates."""
-        return self.sums.entered(self.product(value), point, earlier)[0]
+        return self.sums.to_chart(self.product(value), point, earlier)[0]
 
     def field(self, c: Time, point: PyTree, earlier: Sequence[PyTree]) -> PyTree:
         """The field at a point, `h f(t + c h, point)`, after `earlier` ones."""
@@ -141,52 +141,51 @@ class AbstractChartSolver(AbstractLieSolver):
         return t0, t1
 
     def path_for_output(self, path: Any, field: Callable[[Any, PyTree], PyTree]) -> AbstractPath:
-        """The way of a step with what only output within it takes.
+        """The path of a step with the further evaluations that output within it needs.
 
-        `field(c, y)` is `h f(t + c h, y)`. Apart from `step_in`, which is compiled whether anybody
-        asks for that or not.
+        `field(c, y)` is `h f(t + c h, y)`. This is separate from `step_in`, so that it is compiled
+        only for output.
         """
         return path
 
     def step(self, terms, t0, t1, y0, args, solver_state, made_jump):
-        # Not where times are known.
+        # Not for concrete times.
         step = _step_once if isinstance(t0, Tracer) else AbstractChartSolver._step
         solver: Any = self.for_terms(terms)
         return step(solver, terms, t0, t1, y0, args, solver_state, made_jump)
 
     def _step(self, terms, t0, t1, y0, args, solver_state, made_jump):
         compensation = solver_state.compensation
-        t0, first = begun(solver_state, t0, lambda t0: terms.vf(t0, y0, args), made_jump)
+        t0, first = begin_step(solver_state, t0, lambda t0: terms.vf(t0, y0, args), made_jump)
 
         def value(c: Time, y: PyTree) -> PyTree:
             return materialised_in_rows(terms.vf(time_at(c, t0, t1), y, args))
 
-        def stepped(y0: PyTree) -> Step:
+        def step_from(y0: PyTree) -> Step:
             control = control_of(terms, *self.interval(t0, t1))
             sums = Sums(y0, compensation)
-            known = value(self.first_time, y0) if first is None else first
-            step = self.step_in(
-                Chart.at_start(value, lambda value: product(terms, value, control), sums, known)
-            )
+            first_value = value(self.first_time, y0) if first is None else first
+            frozen = lambda value: product(terms, value, control)  # noqa: E731
+            step = self.step_in(Chart.at_start(value, frozen, sums, first_value))
             end, error, last = step.end, step.error, None if first is None else step.last
-            if not step.is_shared:
-                end, error = sums.shared(end, error, is_followed=first is not None)
+            if not step.is_materialised:
+                end, error = sums.materialised(end, error, is_followed=first is not None)
             if last is not None and self.is_of_state:
                 # From the end alone, which is one evaluation more.
                 last = computed_again(last, lambda: value(1.0, sums.state(end)))
             return Step(end, step.path, error, last)
 
-        y1, error, dense_info, state, result = ended(solver_state, stepped, y0)
+        y1, error, dense_info, state, result = finish_step(solver_state, step_from, y0)
         path = self.path_for_output(
             dense_info["path"], lambda c, y: product(terms, value(c, y), terms.contr(t0, t1))
         )
         return y1, error, dict(path=path), state, result
 
 
-def begun(
+def begin_step(
     solver_state: State, t0: Any, evaluate: Callable[[Any], PyTree], made_jump: Any
 ) -> tuple[Any, PyTree]:
-    """The time of a step, NaN if the start was wrong, and the field there if that is known."""
+    """The time of a step, NaN if the start was wrong, and the value of the field there, or None."""
     first = solver_state.first
     if solver_state.zero is not None:
         # Of a weak type, if the time is.
@@ -198,19 +197,19 @@ def begun(
     return t0, lax.cond(made_jump, evaluate, lambda _: first, t0)
 
 
-def ended(
-    solver_state: State, stepped: Callable[[PyTree], Step], y0: PyTree
+def finish_step(
+    solver_state: State, step_from: Callable[[PyTree], Step], y0: PyTree
 ) -> tuple[PyTree, PyTree, dict[str, Any], State, Any]:
-    """What diffrax takes of a step: the state after it, the estimate of its error, what output
-    within it takes, the solver's state, and the result.
+    """The outputs of `solver.step` of diffrax: the state after the step, the estimate of its error,
+    the path for dense output, the solver's state, and the result.
     """
 
-    def parts(y0: PyTree) -> tuple[PyTree, PyTree]:
-        step = stepped(y0)
+    def outputs(y0: PyTree) -> tuple[PyTree, PyTree]:
+        step = step_from(y0)
         return (step.end, step.last, step.error), step.path
 
-    (end, last, error), path = scalarised(parts, y0, is_pair=True)
-    y1, compensation = Sums(y0, solver_state.compensation).ended(end)
+    (end, last, error), path = scalarised(outputs, y0, is_pair=True)
+    y1, compensation = Sums(y0, solver_state.compensation).fast_two_sum(end)
     state = State(compensation, last, solver_state.zero)
     return y1, error, dict(path=path), state, result_of(y1)
 
@@ -218,6 +217,6 @@ def ended(
 # diffrax traces a step three times, which takes longer than all else that it traces. Inline, the
 # program is as if traced anew. Newer JAX has two ways for that, and with True it leaves a call in
 # the program. (equinox hands on what it does not know to `jax.jit`.)
-_kinds = getattr(jax, "Inline", None)
-_inline: Any = True if _kinds is None else _kinds.JAX_EARLY
+_inline_modes = getattr(jax, "Inline", None)
+_inline: Any = True if _inline_modes is None else _inline_modes.JAX_EARLY
 _step_once = eqx.filter_jit(AbstractChartSolver._step, inline=_inline)  # pyright: ignore[reportCallIssue]

@@ -20,7 +20,7 @@ from .compiled import materialised_in_rows, materialised_together
 
 
 def flow_once(field: PyTree, point: PyTree) -> PyTree:
-    """`flow(field, point)`, computed once: with leading axes neighbours would compute it anew."""
+    """`flow(field, point)`, computed once: with leading axes each use would compute it anew."""
     return jtu.tree_map(
         lambda f, p: materialised_in_rows(flow(f, p)) if is_field(f) else flow(f, p),
         field,
@@ -32,9 +32,8 @@ def flow_once(field: PyTree, point: PyTree) -> PyTree:
 class Sums(NamedTuple):
     """The state where a step starts, and which parts of it are compensated sums.
 
-    A point of the step is shaped like the state. For a part that is such a sum it has the
-    increment from the start, for another the state, in the coordinates of its field if these are
-    others.
+    A point of the step is shaped like the state. A part that is such a sum has the increment from
+    the start there, any other part the state, in the chart of its field.
 
     `compensation` is a pytree like the field of a step, with an array for each sum and None for
     every other part.
@@ -45,7 +44,7 @@ class Sums(NamedTuple):
 
     @classmethod
     def of(cls, field: PyTree, y0: PyTree) -> "Sums":
-        """Those of the first step: zeros where `field` offers increments from a state as it is."""
+        """The sums of the first step: zeros where `field` offers increments and has no chart."""
 
         def part(f: Any, y: PyTree) -> Array | None:
             is_array = is_field(f) and jtu.all_leaves([y])
@@ -73,19 +72,19 @@ class Sums(NamedTuple):
         """The same point with its increments added up, still in the coordinates of the field."""
         return self.map(lambda c, y, z: z if c is None else y + z, point)
 
-    def way(self, end: PyTree) -> PyTree:
+    def displacement(self, end: PyTree) -> PyTree:
         """How far the end of the step is from its start."""
         return self.map(lambda c, y, z: jtu.tree_map(jnp.subtract, z, y) if c is None else z, end)
 
-    def entered(
+    def to_chart(
         self, field: PyTree, point: PyTree, earlier: Sequence[PyTree] = ()
     ) -> tuple[PyTree, PyTree]:
         """A field that is frozen at a point, and the point, in the chart of the field.
 
         `earlier` are fields of the step that are in the chart already.
         """
-        field, here = to_chart(field, self.state(point), earlier)
-        return field, self.map(lambda c, y, z, new: new if c is None else z, point, here)
+        field, charted = to_chart(field, self.state(point), earlier)
+        return field, self.map(lambda c, y, z, new: new if c is None else z, point, charted)
 
     def flow(self, field: PyTree, point: PyTree) -> PyTree:
         """Where a field carries a point in unit time, both in the chart of the field."""
@@ -100,24 +99,24 @@ class Sums(NamedTuple):
         starts = self.map(lambda c, y: None if c is None else y)
         return jtu.tree_map(part, field, point, starts, is_leaf=is_field)
 
-    def moved(self, field: PyTree, point: PyTree) -> PyTree:
+    def flow_frozen(self, field: PyTree, point: PyTree) -> PyTree:
         """Where a field that is frozen at a point carries it."""
-        field, point = self.entered(field, point)
+        field, point = self.to_chart(field, point)
         return materialised_in_rows(from_chart(field, self.flow(field, point)), alone=True)
 
-    def shared(self, end: PyTree, error: PyTree, is_followed: bool) -> tuple[PyTree, PyTree]:
+    def materialised(self, end: PyTree, error: PyTree, is_followed: bool) -> tuple[PyTree, PyTree]:
         """The end of a step and its error, which XLA would otherwise compute for each use of an
         entry.
 
         A sum uses each increment several times, and so does what follows from the end.
         """
         is_used = is_followed or error is not None
-        moving = self.map(lambda c, y, z: z if is_used or c is not None else None, end)
-        moving, error = materialised_together((moving, error))
-        end = self.map(lambda c, y, z, new: new if is_used or c is not None else z, end, moving)
+        used = self.map(lambda c, y, z: z if is_used or c is not None else None, end)
+        used, error = materialised_together((used, error))
+        end = self.map(lambda c, y, z, new: new if is_used or c is not None else z, end, used)
         return end, error
 
-    def ended(self, end: PyTree) -> tuple[PyTree, PyTree]:
+    def fast_two_sum(self, end: PyTree) -> tuple[PyTree, PyTree]:
         """The state at the end of the step, and the compensation of the next step (Dekker's
         FastTwoSum).
         """
@@ -130,5 +129,5 @@ class Sums(NamedTuple):
             return total, lax.stop_gradient(b - (total - a))
 
         pairs = self.map(part, end)
-        first, second = (self.map(lambda c, y, pair: pair[k], pairs) for k in range(2))  # noqa: B023
-        return first, second
+        y1, compensation = (self.map(lambda c, y, pair: pair[k], pairs) for k in range(2))  # noqa: B023
+        return y1, compensation
