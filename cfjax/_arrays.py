@@ -1,4 +1,4 @@
-"""Linear combinations of arrays, and what errors say of arrays."""
+"""Linear combinations of arrays, and descriptions of arrays for error messages."""
 
 from collections.abc import Sequence
 from typing import Any

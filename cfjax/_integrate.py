@@ -198,8 +198,8 @@ def equal_steps(
         y, _, _, solver_state, step_result = solver.step(
             term, time(n), time(n + direction), y, args, solver_state, made_jump=False
         )
-        # What the last state shows as well need not be in the loop: one of small steps feels every
-        # operation.
+        # A failure that shows in the last state need not be in the loop: every operation slows down
+        # a loop of small steps.
         if not solver.shows_failure and step_result is not diffrax.RESULTS.successful:
             is_first = result == diffrax.RESULTS.successful
             result = diffrax.RESULTS.where(is_first, step_result, result)

@@ -30,7 +30,7 @@ from .._xla import where_scalarised as where_scalarised
 def control_of(terms: diffrax.AbstractTerm, t0: Any, t1: Any, **kwargs: Any) -> PyTree:
     """The control of a step, whose random numbers are drawn once."""
     control = terms.contr(t0, t1, **kwargs)
-    # Otherwise XLA makes normal numbers of the random bits again for each flow that uses them.
+    # Otherwise XLA would turn the random bits into normal numbers anew for each flow.
     return computed_once(control) if is_driven(terms) else control
 
 

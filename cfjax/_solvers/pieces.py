@@ -55,7 +55,7 @@ class AbstractPieces(AbstractLieSolver, diffrax.AbstractStratonovichSolver):
         _check_solver("solver", self.solver)
 
     @abc.abstractmethod
-    def check_state_dependent_noise(self) -> None:
+    def check_for_state(self) -> None:
         """Raises `TypeError` if the fields of the noise must not depend on the state."""
 
     def solver_of(self, piece: _Piece, is_constant: bool) -> AbstractChartSolver:
@@ -74,7 +74,7 @@ class AbstractPieces(AbstractLieSolver, diffrax.AbstractStratonovichSolver):
     def start(self, terms, t0, t1, y0, args):
         _check_paths(type(self).__name__, terms)
         if not _is_constant(terms, t0, t1, y0, args):
-            self.check_state_dependent_noise()
+            self.check_for_state()
         return super().start(terms, t0, t1, y0, args)
 
     def step(self, terms, t0, t1, y0, args, solver_state, made_jump):
@@ -120,7 +120,7 @@ class WeakOrder2(AbstractPieces):
     def __check_init__(self):
         _check_order("solver", self.solver, 3)
 
-    def check_state_dependent_noise(self):
+    def check_for_state(self):
         _check_order_for_state("WeakOrder2", "solver", self.solver)
 
 
@@ -148,7 +148,7 @@ class ShiftedNoise(AbstractPieces):
         if self.noise_solver is not None:
             _check_solver("noise_solver", self.noise_solver)
 
-    def check_state_dependent_noise(self):
+    def check_for_state(self):
         _check_order_for_state("ShiftedNoise", "solver", self.solver)
         if self.noise_solver is not None:
             _check_order_for_state("ShiftedNoise", "noise_solver", self.noise_solver)

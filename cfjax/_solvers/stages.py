@@ -171,7 +171,7 @@ def rolled_elements(
         return [*stages, *values[len(stages) :]], total
     if not _can_roll_in_room(unroll, chart, stages, n):
         return None
-    # A bracket takes time as the third power of the room: less for the first ones.
+    # The time of a bracket grows with the cube of the room: the first ones get a smaller room.
     half = len(rows) // 2 if len(rows) > limits.MANY else 0
     for chunk in (slice(half), slice(half, None)) if half else (slice(None),):
         m = len(stages) + len(rows[chunk])

@@ -171,7 +171,7 @@ class AbstractChartSolver(AbstractLieSolver):
             if not step.is_materialised:
                 end, error = sums.materialised(end, error, is_followed=first is not None)
             if last is not None and self.is_of_state:
-                # From the end alone, which is one evaluation more.
+                # From the end alone, which costs one evaluation more.
                 last = computed_again(last, lambda: value(1.0, sums.state(end)))
             return Step(end, step.path, error, last)
 

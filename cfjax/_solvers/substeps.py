@@ -48,7 +48,7 @@ def first_failure(*results: Any) -> Any:
     """The first of some results that is a failure, or success."""
     first, *later = results
     for result in later:
-        # Left out where no step can fail: a loop of small steps feels every operation.
+        # Left out where no step can fail: every operation slows a loop of small steps.
         if result is not diffrax.RESULTS.successful:
             is_first = first == diffrax.RESULTS.successful
             first = diffrax.RESULTS.where(is_first, result, first)
