@@ -253,7 +253,7 @@ def equal_steps(
         else n + save_every * jnp.arange(1, num_saves + 1, dtype=n.dtype)
     )
     if save_initial:
-        prepend = lambda initial, rest: jnp.concatenate([initial[None], rest])  # noqa: E731
+        prepend = lambda initial, saved: jnp.concatenate([initial[None], saved])  # noqa: E731
         ts, ys = jtu.tree_map(prepend, (t0, start), (ts, ys))
     ts, end = needing(zero, (ts, t1))
     # Of the saved states alone, outside the loop: sums and products keep infinity and NaN, so a

@@ -108,7 +108,7 @@ class AbstractCommutatorFree(AbstractTableauSolver, AbstractChartSolver):
             if stages is not None:
                 return stages
         prefixes = {rows[:n] for rows in (*alpha, beta) for n in range(1, len(rows))}
-        fields, points = [chart.first], {(): chart.start}
+        fields, points = [chart.first_field], {(): chart.start}
         for c, rows in list(zip(tableau.c, alpha, strict=True))[1:]:
             points = with_product(rows, Stages(chart, fields, points))
             if rows in prefixes:

@@ -92,7 +92,7 @@ class Composition(AbstractLieSolver):
             solver_state = State(solver_state.compensation, first, solver_state.zero)
         ends = [0.0, *itertools.accumulate(COMPOSITIONS[self.composition_order][:-1]), 1.0]
         intervals = list(itertools.starmap(_Interval, itertools.pairwise(ends)))
-        (y1, state, result), parts = substeps(
+        (y1, state, result), outputs = substeps(
             self.solver,
             lambda _: terms,
             intervals,
@@ -102,4 +102,4 @@ class Composition(AbstractLieSolver):
             (y0, solver_state, diffrax.RESULTS.successful),
         )
         result = result_of(y1) if self.shows_failure else result
-        return y1, None, dict(path=Substeps(parts)), state, result
+        return y1, None, dict(path=Substeps(outputs)), state, result

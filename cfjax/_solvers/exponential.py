@@ -77,8 +77,8 @@ class AbstractExponential(AbstractTableauSolver, AbstractChartSolver):
         """
         solver: Any = self._with(equal_length=length)
 
-        def coefficients(at: tuple[Any, PyTree]) -> list[tuple[Any, Any]]:
-            t, y = at
+        def coefficients(time_and_state: tuple[Any, PyTree]) -> list[tuple[Any, Any]]:
+            t, y = time_and_state
             control = terms.contr(*solver.interval(t, t))
             first, _ = to_chart(product(terms, terms.vf(t, y, args), control), y, ())
             return list(enumerate(solver._linear_part(first).coefficients))
@@ -95,7 +95,7 @@ class AbstractExponential(AbstractTableauSolver, AbstractChartSolver):
         return jnp.zeros_like(self.equal_length), self.equal_length
 
     def step_in(self, chart):
-        tableau, first = self.tableau, chart.first
+        tableau, first = self.tableau, chart.first_field
         linear = self._linear_part(first)
         # The velocity at the start, and by how much g differs there and at each later stage.
         changes = {1: _nonlinear(first, combine([0.0], [first]), chart.origin)}

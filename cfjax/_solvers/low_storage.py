@@ -38,9 +38,9 @@ class AbstractLowStorage(AbstractCommutatorFree, diffrax.AbstractStratonovichSol
         needs_all_fields = embedded is not None and not (penultimate and self.estimate == "group")
         if not (needs_all_fields or self._is_unrolled(chart.start)) and is_uniform(chart):
             return self._stages_in_loop(chart)
-        fields: list[PyTree] = [chart.first]
+        fields: list[PyTree] = [chart.first_field]
         points: dict[Product, PyTree] = {(): chart.start}
-        total, point = chart.first, chart.start
+        total, point = chart.first_field, chart.start
         for k, (a, b, c) in enumerate(zip(self.a, self.b, self.tableau.c, strict=True)):
             if k:
                 points[rows[:k]] = point = chart.branching(point)
@@ -60,14 +60,14 @@ class AbstractLowStorage(AbstractCommutatorFree, diffrax.AbstractStratonovichSol
             total = combine((a, 1.0), (total, field))
             return (total, chart.flow(combine((b,), (total,)), point), point), field
 
-        start, rows = chart.start, trimmed(self.tableau.beta)
-        point = chart.flow(combine((float(self.b[0]),), (chart.first,)), start)
+        first, start, rows = chart.first_field, chart.start, trimmed(self.tableau.beta)
+        point = chart.flow(combine((float(self.b[0]),), (first,)), start)
         coefficients = tuple(
             jnp.asarray([float(x) for x in row[1:]]) for row in (self.a, self.b, self.tableau.c)
         )
-        (_, end, penultimate), stacked = lax.scan(stage, (chart.first, point, start), coefficients)
+        (_, end, penultimate), stacked = lax.scan(stage, (first, point, start), coefficients)
         # The compiler drops them where the caller asks for no output within the step.
-        fields = [chart.first]
+        fields = [first]
         fields += [jtu.tree_map(itemgetter(i), stacked) for i in range(len(self.b) - 1)]
         return Stages(chart, fields, {(): start, rows[:-1]: penultimate, rows: end})
 

@@ -93,7 +93,7 @@ class AbstractMagnus(AbstractChartSolver):
         tableau, start = self.tableau, chart.start
         # The fields do not depend on the point.
         values = [chart.first_value, *(chart.value_at(c, start) for c in tableau.nodes[1:])]
-        fields = [chart.first]
+        fields = [chart.first_field]
         for value in values[1:]:
             fields = [*fields, chart.frozen(value, start, fields)]
         embedded = None if self.estimate is None else tableau.embedded

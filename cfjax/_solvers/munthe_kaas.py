@@ -146,10 +146,10 @@ def _first_element(chart: Chart) -> PyTree:
 
     **Raises** `TypeError` for a field without a bracket.
     """
-    for part in jtu.tree_leaves(chart.first, is_leaf=is_field):
+    for part in jtu.tree_leaves(chart.first_field, is_leaf=is_field):
         if is_field(part) and not isinstance(part, AbstractAlgebraElement):
             raise TypeError(no_bracket_message(part))
-    return chart.first
+    return chart.first_field
 
 
 def _field_at(chart: Chart, c: float, u: PyTree, earlier: Sequence[PyTree]) -> PyTree:

@@ -84,16 +84,16 @@ class AbstractPieces(AbstractLieSolver, diffrax.AbstractStratonovichSolver):
         intervals = itertools.pairwise(times)
         pieces = [_Piece(*row, *ends) for row, ends in zip(self.rows, intervals, strict=True)]
 
-        def solver_and_drift(piece: _Piece) -> tuple[AbstractChartSolver, bool]:
+        def key(piece: _Piece) -> tuple[AbstractChartSolver, bool]:
             return self.solver_of(piece, is_constant), piece.time > 0
 
-        progress, parts = (y0, solver_state, diffrax.RESULTS.successful), []
-        for (solver, _), group in itertools.groupby(pieces, solver_and_drift):
+        progress, outputs = (y0, solver_state, diffrax.RESULTS.successful), []
+        for (solver, _), group in itertools.groupby(pieces, key):
             terms_of = functools.partial(_terms_along, terms, control)
-            progress, new_parts = substeps(solver, terms_of, list(group), t0, t1, args, progress)
-            parts += new_parts
+            progress, new_outputs = substeps(solver, terms_of, list(group), t0, t1, args, progress)
+            outputs += new_outputs
         y1, state, _ = progress
-        return y1, None, dict(path=Substeps(parts)), state, result_of(y1)
+        return y1, None, dict(path=Substeps(outputs)), state, result_of(y1)
 
 
 class WeakOrder2(AbstractPieces):

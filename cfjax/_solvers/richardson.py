@@ -173,5 +173,5 @@ class _HalvesFactory(NamedTuple):
     def __call__(self, *, t0, t1, first, second) -> Interpolation:
         middle = t0 + (t1 - t0) / 2
         halves = (t0, middle, first), (middle, t1, second)
-        parts = [self.interpolation_cls(t0=t0, t1=t1, **info) for t0, t1, info in halves]
-        return Interpolation(t0=t0, t1=t1, path=Substeps(parts))
+        outputs = [self.interpolation_cls(t0=t0, t1=t1, **info) for t0, t1, info in halves]
+        return Interpolation(t0=t0, t1=t1, path=Substeps(outputs))

@@ -144,16 +144,16 @@ def same_types(a: PyTree, b: PyTree) -> bool:
     return jtu.tree_structure(a) == jtu.tree_structure(b) and _types(a) == _types(b)
 
 
-def cast_like(first: PyTree, value: PyTree) -> PyTree:
+def cast_like(template: PyTree, value: PyTree) -> PyTree:
     # Only some times of the field were traced before.
-    if not same_types(first, value):
+    if not same_types(template, value):
         raise TypeError(
             "The field must return frozen fields of one structure, shape and dtype at all stages "
-            f"of a step, got {describe(first)} and {describe(value)}. With unroll=True the solver "
-            "accepts other fields too."
+            f"of a step, got {describe(template)} and {describe(value)}. With unroll=True the "
+            "solver accepts other fields too."
         )
     # Only a weak type may differ.
-    return jtu.tree_map(lambda v, f: jnp.asarray(v, f.dtype), value, first)
+    return jtu.tree_map(lambda v, f: jnp.asarray(v, f.dtype), value, template)
 
 
 def stack_with_zeros(tree: PyTree, n: int) -> PyTree:

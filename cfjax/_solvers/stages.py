@@ -59,8 +59,8 @@ def _fits(room: Any, chart: Chart, field: Any) -> bool:
 
 def is_uniform(chart: Chart) -> bool:
     """Whether the field has one structure, and its arrays one shape and dtype, at all stages."""
-    second = jax.eval_shape(lambda: chart.field(jnp.zeros(()), chart.start, [chart.first]))
-    return same_types(chart.first, second)
+    second = jax.eval_shape(lambda: chart.field(jnp.zeros(()), chart.start, [chart.first_field]))
+    return same_types(chart.first_field, second)
 
 
 class _Flow(NamedTuple):
@@ -110,7 +110,7 @@ def rolled(
     the end; `times` are the times of the stages. None where the field allows no loop, where
     `unroll` asks for none, and where it does not pay.
     """
-    first, num_stages = chart.first, len(times)
+    first, num_stages = chart.first_field, len(times)
     fields: Any = None
     # One more for the flows that lead to no stage.
     if can_roll(unroll, first, chart.start) and is_uniform(chart):

@@ -58,7 +58,7 @@ class Chart(NamedTuple):
     sums: Sums
     # The first evaluation, and its point.
     first_value: PyTree
-    first: PyTree
+    first_field: PyTree
     start: PyTree
 
     @classmethod
@@ -70,12 +70,12 @@ class Chart(NamedTuple):
         first_value: PyTree,
     ) -> "Chart":
         """With the first field, from whose point all flows start. It may correct a drift."""
-        first, start = sums.to_chart(product(first_value), sums.start)
-        return cls(value, product, sums, first_value, first, start)
+        first_field, start = sums.to_chart(product(first_value), sums.start)
+        return cls(value, product, sums, first_value, first_field, start)
 
     def value_at(self, c: Time, point: PyTree) -> PyTree:
         """The value of the field at a point."""
-        return self.value(c, from_chart(self.first, self.sums.state(point)))
+        return self.value(c, from_chart(self.first_field, self.sums.state(point)))
 
     def frozen(self, value: PyTree, point: PyTree, earlier: Sequence[PyTree]) -> PyTree:
         """The field with this value at a point, after `earlier` ones, in the same coordinates."""
@@ -91,7 +91,7 @@ class Chart(NamedTuple):
 
     def end(self, point: PyTree) -> PyTree:
         """The state at a point, or its increment from the start where it is a compensated sum."""
-        return from_chart(self.first, point)
+        return from_chart(self.first_field, point)
 
     def state(self, point: PyTree) -> PyTree:
         """The state at a point."""
@@ -116,7 +116,7 @@ class Chart(NamedTuple):
         def part(f: Any, p: PyTree) -> PyTree:
             return materialised_in_rows(p, alone=True) if is_field(f) and f.is_entrywise else p
 
-        return jtu.tree_map(part, self.first, point, is_leaf=is_field)
+        return jtu.tree_map(part, self.first_field, point, is_leaf=is_field)
 
 
 class AbstractChartSolver(AbstractLieSolver):
@@ -129,7 +129,7 @@ class AbstractChartSolver(AbstractLieSolver):
 
     @abc.abstractmethod
     def step_in(self, chart: Chart) -> Step:
-        """A step from `chart.start`, where the field is `chart.first`."""
+        """A step from `chart.start`, where the field is `chart.first_field`."""
 
     @property
     def first_time(self) -> float:
