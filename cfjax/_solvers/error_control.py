@@ -111,13 +111,13 @@ def starting_step(
     y0 = as_state(y0)
     dtype = time_dtype(y0)
     times = {"t0": t0, "t1": t1, "atol": atol}
-    t0, t1, atol = (time_scalar(name, x, dtype) for name, x in times.items())
-    atol = eqx.error_if(atol, ~(atol > 0), "atol must be positive.")
+    t0, t1, tolerance = (time_scalar(name, x, dtype) for name, x in times.items())
+    tolerance = eqx.error_if(tolerance, ~(tolerance > 0), "atol must be positive.")
     length = jnp.abs(t1 - t0)
     sign = jnp.sign(t1 - t0)
 
     def scaled_norm(y):
-        return norm(jtu.tree_map(lambda leaf: leaf / atol.astype(leaf.dtype), y))
+        return norm(jtu.tree_map(lambda leaf: leaf / tolerance.astype(leaf.dtype), y))
 
     f0 = term.vf(t0, y0, args)
     v0 = tangent(f0, y0)
