@@ -14,11 +14,11 @@ from .matmul import matmul
 from .transforms import DTYPES, AbstractTransform, checked
 
 
-def _most(dtype: Any) -> float:
-    """Below which condition number eigenvectors are taken, for points of this precision.
+def _max_condition(dtype: Any) -> float:
+    """The bound of the condition number of the eigenvectors, for points of this precision.
 
-    A transform there and back may lose that factor of precision, and mostly loses a tenth of it. So
-    half of the digits are left in float32, and ten digits in float64.
+    A forward and an inverse transform may lose this factor of precision, and mostly lose a tenth of
+    it. So half of the digits are left in float32, and ten digits in float64.
     """
     return min(1e6, float(np.finfo(dtype).eps) ** -0.5)
 
@@ -79,22 +79,22 @@ def diagonalised(
 
     Source: Golub & Van Loan, Matrix Computations (4th ed., 2013), Sections 7.1, 7.2 and 8.1.
     """
-    a = _known(matrix)
+    a = _checked_matrix(matrix)
     precision = np.finfo(a.dtype).dtype
     wide = a.astype(np.result_type(a.dtype, np.float64))
-    found = _by_symmetry(wide, precision) or _by_eig(wide, precision)
-    eigenvalues, vectors, inverse, condition = found
+    eigensystem = _by_symmetry(wide, precision) or _by_eig(wide, precision)
+    eigenvalues, vectors, inverse, condition = eigensystem
     transform: AbstractTransform
     if np.iscomplexobj(a):
         to, back = _parts(inverse), _parts(vectors)
         transform = ComplexEigenvectors(_Matrix(to), _Matrix(back), condition)
     elif np.iscomplexobj(vectors):
-        # Of a pair of conjugate eigenvalues the first. The sum of both is twice its real part.
-        kept = np.imag(eigenvalues) >= 0
-        eigenvalues = eigenvalues[kept]
-        back = np.where(np.imag(eigenvalues) > 0, 2, 1) * vectors[:, kept]
+        # One of each conjugate pair. The sum over a pair is twice the real part of one term.
+        is_first = np.imag(eigenvalues) >= 0
+        eigenvalues = eigenvalues[is_first]
+        back = np.where(np.imag(eigenvalues) > 0, 2, 1) * vectors[:, is_first]
         real_back = np.concatenate([np.real(back), -np.imag(back)], axis=1)
-        to = _parts(inverse[kept])
+        to = _parts(inverse[is_first])
         transform = ConjugateEigenvectors(_Matrix(to), _Matrix(real_back), condition)
     else:
         transform = RealEigenvectors(_Matrix(inverse), _Matrix(vectors), condition)
@@ -103,9 +103,9 @@ def diagonalised(
 
 
 class _Matrix:
-    """A real matrix as a constant of programs, which compares by its entries.
+    """A real matrix as a constant of programs, compared by its entries.
 
-    Were it an array of the transform, output within a step would keep it for every step.
+    As an array of the transform it would be stored for every step by output within a step.
     """
 
     def __init__(self, entries: Float[np.ndarray, "rows columns"]):
@@ -127,14 +127,14 @@ class _Matrix:
         if jnp.iscomplexobj(x):
             # Two real products take a third of the time of a complex one.
             return lax.complex(self @ x.real, self @ x.imag)
-        # One object for all products, so that a program has the constant once.
+        # One object for all products, so that a program contains the constant once.
         (first, *_) = self._in_dtype.values()
         entries = self._in_dtype.setdefault(x.dtype, first.astype(x.dtype))
         return matmul(entries, x.reshape(len(x), -1)).reshape(-1, *x.shape[1:])
 
 
 class AbstractEigenvectors(AbstractTransform):
-    """What `diagonalised` returns. Real and imaginary parts of complex matrices are stacked."""
+    """A transform of `diagonalised`. Real and imaginary parts of complex matrices are stacked."""
 
     to: _Matrix = eqx.field(static=True)
     back: _Matrix = eqx.field(static=True)
@@ -142,7 +142,7 @@ class AbstractEigenvectors(AbstractTransform):
 
     def _checked(self, x: Array, matrix: _Matrix) -> Array:
         x, length = checked(self, x), matrix.shape[1]
-        # That of the points may be lower than that of the matrix.
+        # The precision of the points may be lower than that of the matrix.
         _check_condition("The matrix of cfjax.diagonalised", self.condition, x.dtype)
         if len(x) != length:
             raise ValueError(
@@ -153,7 +153,7 @@ class AbstractEigenvectors(AbstractTransform):
 
 
 class RealEigenvectors(AbstractEigenvectors):
-    """Those of a real matrix with real eigenvalues."""
+    """The transform of a real matrix with real eigenvalues."""
 
     def forward(self, point: Inexact[Array, "n *k"]) -> Inexact[Array, "n *k"]:
         return self.to @ self._checked(point, self.to)
@@ -163,7 +163,7 @@ class RealEigenvectors(AbstractEigenvectors):
 
 
 class ConjugateEigenvectors(AbstractEigenvectors):
-    """Those of a real matrix with complex eigenvalues, one of each pair, for real points."""
+    """The transform of a real matrix with complex eigenvalues, to one of each conjugate pair."""
 
     _rank: ClassVar[int] = 1
 
@@ -188,7 +188,7 @@ class ConjugateEigenvectors(AbstractEigenvectors):
 
 
 class ComplexEigenvectors(AbstractEigenvectors):
-    """Those of a complex matrix."""
+    """The transform of a complex matrix."""
 
     _rank: ClassVar[int] = 2
 
@@ -209,7 +209,7 @@ class ComplexEigenvectors(AbstractEigenvectors):
         return lax.complex(p.real - q.imag, p.imag + q.real)
 
 
-def _known(matrix: Any) -> np.ndarray:
+def _checked_matrix(matrix: Any) -> np.ndarray:
     if isinstance(matrix, Tracer):
         raise TypeError(
             "matrix must be known before the program is traced, got a traced array, "
@@ -229,52 +229,52 @@ def _known(matrix: Any) -> np.ndarray:
 
 
 def _check_condition(what: str, condition: float, dtype: Any) -> None:
-    if not condition < _most(dtype):
+    if not condition < _max_condition(dtype):
         raise ValueError(
-            f"{what} must have eigenvectors of a condition number below {_most(dtype):.0e}, got "
-            f"{condition:.1e}, for points in {np.dtype(dtype)}. Use cfjax.LinearAffine(a, b), "
-            "which takes any matrix."
+            f"{what} must have eigenvectors of a condition number below "
+            f"{_max_condition(dtype):.0e}, got {condition:.1e}, for points in {np.dtype(dtype)}. "
+            "Use cfjax.LinearAffine(a, b), which takes any matrix."
         )
 
 
 # The eigenvalues, the eigenvectors, their inverse and their condition number.
-_Found = tuple[np.ndarray, np.ndarray, np.ndarray, float]
+_Eigensystem = tuple[np.ndarray, np.ndarray, np.ndarray, float]
 
 
-def _by_symmetry(a: np.ndarray, precision: Any) -> _Found | None:
-    """Those if D a D^-1 is Hermitian but for rounding in this precision."""
+def _by_symmetry(a: np.ndarray, precision: Any) -> _Eigensystem | None:
+    """The eigensystem if D a D^-1 is Hermitian but for rounding in this precision."""
     eps = np.finfo(precision).eps
     for scale in (np.ones(len(a)), _symmetrising(a)):
         with np.errstate(over="ignore", invalid="ignore", divide="ignore"):
             s = scale[:, None] * a / scale
             is_hermitian = np.abs(s - s.conj().T).max() <= 16 * eps * np.abs(s).max()
             condition = float(scale.max() / scale.min())
-        if is_hermitian and condition < _most(precision):
+        if is_hermitian and condition < _max_condition(precision):
             eigenvalues, q = np.linalg.eigh((s + s.conj().T) / 2)
             return eigenvalues, q / scale[:, None], q.conj().T * scale, condition
     return None
 
 
 def _symmetrising(a: np.ndarray) -> Float[np.ndarray, " n"]:
-    """The diagonal of D, if there is one: its ratios, from each index to the next along entries."""
+    """The diagonal of D, if there is one. Entries a_ij and a_ji give the ratio of d_i and d_j."""
     size, scale = np.abs(a), np.zeros(len(a))
     both = (size > 0) & (size.T > 0)
     with np.errstate(over="ignore", under="ignore"):
         for root in range(len(a)):
             if scale[root] == 0:
-                scale[root], reached = 1, [root]
-                while reached:
-                    i = reached.pop()
+                scale[root], stack = 1, [root]
+                while stack:
+                    i = stack.pop()
                     new = np.flatnonzero(both[i] & (scale == 0))
                     scale[new] = scale[i] * np.sqrt(size[i, new] / size[new, i])
-                    reached.extend(new)
+                    stack.extend(new)
     return scale
 
 
-def _by_eig(a: np.ndarray, precision: Any) -> _Found:
+def _by_eig(a: np.ndarray, precision: Any) -> _Eigensystem:
     eigenvalues, vectors = np.linalg.eig(a)
     if not (np.iscomplexobj(a) or np.imag(eigenvalues).any()):
-        # Some versions of NumPy return complex arrays of them too.
+        # Some versions of NumPy return complex arrays for real eigenvalues too.
         eigenvalues, vectors = np.real(eigenvalues), np.real(vectors)
     with np.errstate(divide="ignore"):
         condition = float(np.linalg.cond(vectors))

@@ -20,7 +20,7 @@ T = TypeVar("T", bound=PyTree)
 class Scheme(NamedTuple):
     """A Taylor polynomial and the largest scaled norm it may be used for.
 
-    `rows` are weights over the growing list A, .., Aᵐ, Y₀, Y₁ of what is known when a row is read:
+    `rows` are weights over the terms computed so far, of the list A, .., Aᵐ, Y₀, Y₁ with
     Y₀ = Aᵐ·(row 0), Y₁ = (row 1)·(row 2) + (row 3), exp ≈ I + A + (row 4)·(row 5) + (row 6).
     """
 
@@ -29,12 +29,13 @@ class Scheme(NamedTuple):
     rows: tuple[tuple[float, ...], ...]
 
 
-# The rows solve "the product has the coefficients 1/k!" for k = 2..15 and k = 2..21. Both systems
-# have many solutions; these are the ones with the least cancellation among those found by Newton's
-# method from random starts, refined in 60 digits and rounded to double so that 1/2! to 1/6! come
-# out within 1e-17: an error of 1/2! is one of exp(a)ᵀ exp(a), the same in every step. theta is
-# where the backward error of the rest of the series reaches half a unit in the last place.
-# tests/numerics/test_expm.py derives both again.
+# The rows solve the equations "the coefficient of A^k is 1/k!" for k = 2..15 and k = 2..21. Both
+# systems have many solutions. These have the least cancellation among those that Newton's method
+# reached from random starts. They were refined in 60 digits and rounded to double so that 1/2! to
+# 1/6! are correct within 1e-17: an error of 1/2! is an error of exp(a)ᵀ exp(a), the same in every
+# step. theta is where the backward error of the remainder of the series reaches half a unit in the
+# last place. It is not the one of `TAYLOR_THETA`, as the product also has terms of higher degree.
+# tests/numerics/test_expm.py derives both.
 _DEGREE_15 = Scheme(
     powers=2,
     theta=2.346,
@@ -61,9 +62,9 @@ _DEGREE_21 = Scheme(
         (0.0, 0.5366262717221202, 0.08269931189354755, 15.1637651638964, -2.1467488541806707),
     ),
 )
-# A unit in the last place of double precision allows a smaller norm, and saves a product there.
+# For double precision the norm must be smaller; up to there it saves a product.
 _DEGREE_15_DOUBLE = _DEGREE_15._replace(theta=0.6764)
-# From the cheapest to the one that may be scaled and squared.
+# From the cheapest to the one that is used with scaling and squaring.
 TAYLOR_SCHEMES = {
     "float32": (_DEGREE_15,),
     "complex64": (_DEGREE_15,),
@@ -84,21 +85,21 @@ def _plus(*terms: T) -> T:
 def taylor_from_second(
     scheme: Scheme, a: T, a2: T, product: Callable[[T, T], T] = small_product
 ) -> T:
-    """`exp(a) - I - a`, for a matrix or anything else that has a product."""
-    known = [a, a2]
+    """`exp(a) - I - a`, for a matrix or a pytree with a product, from a and a^2."""
+    terms = [a, a2]
     if scheme.powers == 3:
-        known.append(product(a2, a))
+        terms.append(product(a2, a))
 
     row = scheme.rows
-    known.append(product(known[-1], weighted_sum(row[0], known)))
-    y1 = product(weighted_sum(row[1], known), weighted_sum(row[2], known))
-    known.append(_plus(y1, weighted_sum(row[3], known)))
-    y2 = product(weighted_sum(row[4], known), weighted_sum(row[5], known))
-    return _plus(y2, weighted_sum(row[6], known))
+    terms.append(product(terms[-1], weighted_sum(row[0], terms)))
+    y1 = product(weighted_sum(row[1], terms), weighted_sum(row[2], terms))
+    terms.append(_plus(y1, weighted_sum(row[3], terms)))
+    y2 = product(weighted_sum(row[4], terms), weighted_sum(row[5], terms))
+    return _plus(y2, weighted_sum(row[6], terms))
 
 
 def one_norm(a: Array) -> Array:
-    """The 1-norm, with the magnitude for the absolute value: consistent too."""
+    """The 1-norm, with `magnitude` for the absolute value, which is a consistent norm too."""
     return jnp.max(jnp.sum(magnitude(a), axis=0))
 
 
@@ -130,19 +131,19 @@ def expm(a: Inexact[Array | np.ndarray, "n n"]) -> Inexact[Array, "n n"]:
     backward error by powers of a is from Al-Mohy & Higham, SIAM J. Matrix Anal. Appl. 31 (2009).
     """
     a = jnp.asarray(a)
-    weight, rest = expm_parts(a)
-    return weight * (jnp.eye(a.shape[0], dtype=a.dtype) + a) + rest
+    weight, remainder = expm_parts(a)
+    return weight * (jnp.eye(a.shape[0], dtype=a.dtype) + a) + remainder
 
 
 def expm_parts(
     a: Inexact[Array, "n n"],
 ) -> tuple[Inexact[Array, ""], Inexact[Array, "n n"]]:
-    """`expm(a)` as `weight * (I + a) + rest`, with `weight` 0 if squaring is needed, otherwise 1.
+    """`expm(a)` as `weight * (I + a) + remainder`, with weight 0 if it was squared, otherwise 1.
 
-    To apply an exponential near I, as a step of an integrator does, add up what each part does:
-    `weight * (x + a @ x) + rest @ x`. The rounding of the rest is as small as the rest is, of the
-    size of a^2, and the same in every step with one a. So what exp(a) conserves drifts more slowly.
-    Otherwise as `expm`.
+    A step of an integrator applies an exponential near I as
+    `weight * (x + a @ x) + remainder @ x`. The rounding error of the remainder is relative to it,
+    of the size of a^2, and is the same in every step with the same a. So the invariants of exp(a)
+    drift more slowly than with a product with exp(a). Otherwise as `expm`.
     """
     if a.ndim != 2 or a.shape[0] != a.shape[1]:
         raise ValueError(f"expm: `a` must be a square matrix, shape (n, n), got shape {a.shape}.")
@@ -160,20 +161,20 @@ def expm_parts(
     n = a.shape[0]
     a = in_full_register(a)
     thetas = [scheme.theta for scheme in schemes]
-    weight, rest = by_norm(
+    weight, remainder = by_norm(
         thetas,
         a,
         small_product(a, a),
         lambda k, a, a2: taylor_from_second(schemes[k], a, a2),
-        lambda a, rest: plus_identity(rest + a),
+        lambda a, remainder: plus_identity(remainder + a),
     )
-    return weight, rest[:n, :n]
+    return weight, remainder[:n, :n]
 
 
 def in_full_register(a: Array) -> Array:
-    """With zeros up to the size of a vector register, for real matrices a little smaller.
+    """Pads a real matrix that is a little smaller than a vector register with zeros.
 
-    Two to three times faster in a batch than the product of size n.
+    In a batch its products are two to three times faster than those of size n.
     """
     n = a.shape[0]
     return jnp.pad(a, (0, 8 - n)) if 4 < n < 8 and not jnp.iscomplexobj(a) else a
@@ -187,38 +188,40 @@ def by_norm(
     start: Callable[[PyTree, T], T],
     double: Callable[[T], T] | None = None,
 ) -> tuple[Array, T]:
-    """What suits the norm of a, in the end by squarings; and first, 0 if some are needed or 1.
+    """An approximation chosen by the norm of a, with scaling and squaring for large norms.
 
     **Arguments:**
 
-    - `thetas`: for each k the largest norm that `approximate` may be used for. What is longer is
-      scaled to the last.
+    - `thetas`: for each k the largest norm that `approximate` may be used for. A matrix of a larger
+      norm is scaled to the last.
     - `first`, `second`: a and a^2, or pytrees whose first leaf they are.
-    - `approximate`: the result, from k, `first / 2^s` and `second / 4^s`, if s is 0.
-    - `start`, `double`: what is doubled otherwise, made of `first / 2^s` and this result, and how.
+    - `approximate`: a function of k, `first / 2^s` and `second / 4^s`. If s is 0, its value is the
+      result.
+    - `start`, `double`: otherwise the result is `start(first / 2^s, value)`, doubled s times as
+      `squared` does.
+
+    **Returns:** a weight, 1 if s is 0 and otherwise 0, and the result.
     """
     *cheaper, theta = thetas
-    # ‖a²‖ bounds every even power, and an odd one up to a factor ‖a‖, which is what a backward
-    # error relative to ‖a‖ asks. It is at most ‖a‖² and often far below: fewer squarings.
+    # ‖a²‖ bounds every even power, and an odd one up to a factor ‖a‖, which is enough for a
+    # backward error relative to ‖a‖. It is often far below ‖a‖², which saves squarings.
     a2 = jtu.tree_leaves(second)[0]
     size = one_norm(lax.stop_gradient(a2))
 
     def scaled(first: PyTree, second: PyTree) -> tuple[Array, T]:
-        s = jnp.maximum((exponent(size / theta**2) + 1) // 2, 0)
-        # The power of two is locally constant, so its derivative is zero.
-        s, scale = squarings(s, size.dtype)
+        s, scale = squarings(exponent(size / theta**2, degree=2), size.dtype)
         first, second = (
             jtu.tree_map(lambda x: x * factor.astype(x.dtype), blocks)  # noqa: B023
             for blocks, factor in [(first, scale), (second, scale * scale)]
         )
-        small = approximate(len(cheaper), first, second)
-        return (s == 0).astype(a2.dtype), squared(small, lambda x: start(first, x), s, double)
+        value = approximate(len(cheaper), first, second)
+        return (s == 0).astype(a2.dtype), squared(value, lambda x: start(first, x), s, double)
 
-    # Up to size 4 products fuse with what is around them, and a branch costs more than one saves.
+    # Up to size 4 products fuse with their neighbours, and a branch costs more than a product.
     if not cheaper or a2.shape[0] <= 4:
         return scaled(first, second)
 
-    # A size of NaN is scaled, and stays NaN.
+    # NaN takes the branch that scales, and stays NaN.
     return lax.cond(
         max_over_batch(size) <= cheaper[0] ** 2,
         lambda first, second: (jnp.ones((), a2.dtype), approximate(0, first, second)),

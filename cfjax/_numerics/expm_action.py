@@ -2,7 +2,6 @@
 
 import functools
 from collections.abc import Callable
-from fractions import Fraction
 from itertools import zip_longest
 from math import factorial, floor
 
@@ -12,12 +11,13 @@ import numpy as np
 from jax import lax
 from jaxtyping import Array, Float
 
+from .expm_series import powers_of_phi_2, row_for
 from .matmul import matmul, plus_identity
 from .squaring import exponent, max_over_batch, squarings
 
-# On shorter intervals the error of the second derivative at zero, `eps / length^2`, would show.
+# On a shorter interval the error of the second derivative at zero, `eps / length^2`, is too large.
 _SHORTEST = 0.1
-# On longer ones the powers cancel and the rounding shows.
+# On a longer one the powers cancel, and the rounding error is too large.
 _LONGEST = 2.5
 
 
@@ -29,8 +29,8 @@ def phi_1_action(
 ) -> Float[Array, "m k"]:
     """`phi_1(A) b = b + A b / 2! + A^2 b / 3! + ...`, so that `exp(A) z = z + phi_1(A) A z`.
 
-    For an A that is similar to a skew matrix, as every matrix of a skew field on a span is. Added
-    to the whole, the result rounds less than a product with exp(A).
+    A is similar to a skew matrix, as every matrix of a skew field on a span is. The sum
+    `z + phi_1(A) A z` has a smaller rounding error than a product with exp(A).
 
     **Arguments:**
 
@@ -54,10 +54,10 @@ def phi_1_action(
     # The value depends on the bound by less than rounding, so the derivative is zero.
     bound = max_over_batch(lax.stop_gradient(bound))
     intervals, table = _polynomials(float(jnp.finfo(b.dtype).eps))
-    choice = jnp.sum(bound > intervals[:-1].astype(b.dtype))
-    coefficients = jnp.asarray(table, b.dtype)[choice]
+    row = row_for(bound, intervals)
+    coefficients = jnp.asarray(table, b.dtype)[row]
 
-    # In a loop: unrolled, every product would be compiled by itself.
+    # A loop, so that the product is compiled once.
     def step(carry: tuple[Array, Array], coefficient: Array) -> tuple[tuple[Array, Array], None]:
 
         def add(carry: tuple[Array, Array]) -> tuple[Array, Array]:
@@ -77,39 +77,20 @@ def phi_1_action(
 
 @functools.cache
 def _polynomials(eps: float) -> tuple[np.ndarray, np.ndarray]:
-    """Half lengths of intervals, in growing order, and one row for each with the coefficients.
+    """Half lengths of intervals, in growing order, and a row of coefficients for each.
 
-    A row has those of z^2, z^3, .. of a polynomial that is `1 + z + .. = exp(z)` to `eps / 2` for
-    imaginary z in the interval. All are positive, with zeros behind.
+    A row has the coefficients of z^2, z^3, .. of a polynomial `1 + z + ..` that is exp(z) to
+    `eps / 2` for imaginary z in the interval. They are positive, and padded with zeros.
     """
     intervals, rows = [], []
     for degree in range(4, 30):
         # The first term left out is below z^2 2 (x / 2)^(degree - 1) / (degree + 1)!.
         power = degree + 1
-        length = Fraction(floor(2000 * (eps / 16 * factorial(power)) ** (1 / power)), 1000)
+        length = floor(2000 * (eps / 16 * factorial(power)) ** (1 / power)) / 1000
         if _SHORTEST < length < _LONGEST:
-            intervals.append(float(length))
-            rows.append(_chebyshev(degree - 2, length))
-    table = np.zeros((len(rows), len(rows[-1])))
-    for i, row in enumerate(rows):
-        table[i, : len(row)] = [float(a) for a in row]
-    return np.array(intervals), table
-
-
-def _chebyshev(degree: int, length: Fraction) -> list[Fraction]:
-    """The powers of z in the Chebyshev series of `(exp(z) - 1 - z) / z^2`, truncated."""
-    # R_k(z) = i^k T_k(-i z / length), so that R_{k+1} = 2 z / length R_k + R_{k-1}.
-    basis = [[Fraction(1)], [Fraction(0), 1 / length]]
-    while len(basis) < 2 * degree:
-        shifted = [Fraction(0), *(2 * a / length for a in basis[-1])]
-        basis.append([a + b for a, b in zip_longest(shifted, basis[-2], fillvalue=Fraction(0))])
-    powers = [Fraction(1, factorial(k + 2)) for k in range(len(basis))]
-    # From the top: what is left after every R_k above the degree is taken out.
-    for r in basis[:degree:-1]:
-        weight = powers.pop() / r[-1]
-        for i, a in enumerate(r[:-1]):
-            powers[i] -= weight * a
-    return powers
+            intervals.append(length)
+            rows.append(powers_of_phi_2(length, degree - 2))
+    return np.array(intervals), np.array([*zip_longest(*rows, fillvalue=0.0)]).T
 
 
 def _by_squaring(
@@ -117,9 +98,9 @@ def _by_squaring(
 ) -> Array:
     """`phi_1(a) b` from `exp [[a, b], [0, 0]]`, in a shorter program than `phi_1_times`."""
     m, k = b.shape
-    # The result does not depend on the scales.
+    # The exact result does not depend on the scales.
     scale = lax.stop_gradient(scale)[:, None]
-    s, power = squarings(jnp.maximum(exponent(bound), 0), b.dtype)
+    s, power = squarings(exponent(bound), b.dtype)
     top = jnp.concatenate([a * scale.T / scale, b / scale], axis=1) * power
     x = jnp.pad(top, ((0, k), (0, 0)))
 
@@ -130,7 +111,7 @@ def _by_squaring(
     def square(x: Array, n: Array) -> tuple[Array, None]:
         return lax.cond(n < s, lambda x: matmul(x, x), lambda x: x, x), None
 
-    # The norm is 1 at most, and 1 / 20! is below rounding.
+    # The norm is at most 1, and 1 / 20! is below rounding.
     (_, e), _ = lax.scan(add, (x, plus_identity(x)), jnp.arange(2, 20, dtype=b.dtype))
     e, _ = lax.scan(square, e, jnp.arange(jnp.finfo(b.dtype).nmant, dtype=s.dtype))
     return scale * e[:m, m:]

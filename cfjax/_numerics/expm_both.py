@@ -1,4 +1,4 @@
-"""The exponentials of a small dense matrix and of its negative, at the cost of one and a half."""
+"""The exponentials of a small dense matrix and of its negative, for 1.5 times the cost of one."""
 
 import math
 
@@ -11,12 +11,10 @@ from .matmul import plus_identity, small_product
 
 # `Z^4 + 120 Z^3`, which both polynomials contain, as Z² times these weights of Z and Z².
 _SHARED = (120.0, 1.0)
-
-
 # Polynomials for `cosh(a) - I` and for `sinh(a)/a - I` in Z = a², (row 0)·(row 1) + (row 2), with
-# weights over Z, Z² and what is shared. For k = 1..7 they solve "the sum has the coefficient
-# 1/(2k)!" and "1/(2k + 1)!", without rounding up to the divisions. All are positive, so nothing
-# cancels. The 120 above makes the coefficient of Z⁸ 1/16! in the one, and 1.13/17! in the other.
+# weights over Z, Z² and the shared polynomial. For k = 1..7 the coefficient of Z^k is 1/(2k)! and
+# 1/(2k + 1)!, up to the rounding of the divisions. All weights are positive, so nothing cancels. With
+# the 120 above the coefficient of Z⁸ is 1/16! in the first and 1.13/17! in the second.
 _EVEN = (
     (122880.0, 8000.0, 1.0),
     tuple(w / math.factorial(16) for w in (2129280, 21280, 1)),
@@ -45,14 +43,13 @@ def expm_both_parts(
     The even and the odd part of exp are polynomials in a², evaluated in the form of Sastre, Linear
     Algebra Appl. 539 (2018), doi:10.1016/j.laa.2017.11.010.
     """
-
     if a.shape[0] in (2, 3):
         return cayley_hamilton.expm_both_parts(a)
 
     def approximate(_: int, a: Array, z: Array) -> tuple[Array, Array]:
         z2 = small_product(z, z)
-        known = [z, z2, small_product(z2, weighted_sum(_SHARED, [z, z2]))]
-        even, odd = _evaluated(_EVEN, known), small_product(a, _evaluated(_ODD, known))
+        terms = [z, z2, small_product(z2, weighted_sum(_SHARED, [z, z2]))]
+        even, odd = _evaluated(_EVEN, terms), small_product(a, _evaluated(_ODD, terms))
         return even + odd, even - odd
 
     def start(a: Array, both: tuple[Array, Array]) -> tuple[Array, Array]:
@@ -65,6 +62,6 @@ def expm_both_parts(
     return weight, plus[:n, :n], minus[:n, :n]
 
 
-def _evaluated(rows: tuple[tuple[float, ...], ...], known: list[Array]) -> Array:
-    left, right, rest = (weighted_sum(row, known) for row in rows)
-    return small_product(left, right) + rest
+def _evaluated(rows: tuple[tuple[float, ...], ...], terms: list[Array]) -> Array:
+    left, right, linear = (weighted_sum(row, terms) for row in rows)
+    return small_product(left, right) + linear

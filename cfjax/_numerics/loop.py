@@ -1,4 +1,4 @@
-"""A loop as long as the program finds at run time, with derivatives of every order."""
+"""A loop whose length is computed at run time, with derivatives of every order."""
 
 from collections.abc import Callable
 from typing import TypeVar
@@ -25,18 +25,18 @@ def loop(
     `step` may close over traced values. Under `jax.vmap` the length must be one for the whole
     batch, as `max_over_batch` gives it.
 
-    **Cost:** that of `length` steps. Derivatives go through a loop of `root` steps within one.
-    Reverse mode keeps a carry for each of `2 root`, and computes every step twice again. If there
-    are no more than `mostly`, it keeps what they compute, in a larger program.
+    **Cost:** that of `length` steps. Derivatives use two nested loops of `root` steps each. Reverse
+    mode stores `2 root` carries, and computes every step twice more. If there are at most `mostly`
+    steps, it stores their residuals instead, in a larger program.
     """
-    # What is closed over must be seen by what follows.
+    # Derivatives need the closed-over values as arguments.
     step = eqx.filter_closure_convert(step, length, carry)
     return _loop((step, carry), length=length, root=root, mostly=mostly)
 
 
 @eqx.filter_custom_jvp
-def _loop(moving: PyTree, *, length: Array, root: int, mostly: int) -> PyTree:
-    step, carry = moving
+def _loop(differentiable: PyTree, *, length: Array, root: int, mostly: int) -> PyTree:
+    step, carry = differentiable
 
     def body(k: Array, carry: PyTree) -> PyTree:
         return step(jnp.asarray(k, length.dtype), carry)
@@ -48,21 +48,21 @@ def _loop(moving: PyTree, *, length: Array, root: int, mostly: int) -> PyTree:
 @_loop.def_jvp
 def _(primals, tangents, *, length, root, mostly):
     def some(run: Callable, carry: PyTree, ks: Array) -> PyTree:
-        """`run(carry, k)` for those of the numbers that are in the loop."""
+        """`run(carry, k)` for each k below the length."""
 
         def body(carry: PyTree, k: Array) -> tuple[PyTree, None]:
             return lax.cond(k < length, run, lambda carry, k: carry, carry, k), None
 
         return lax.scan(body, carry, ks)[0]
 
-    def run(moving: PyTree) -> PyTree:
-        step, carry = moving
+    def run(differentiable: PyTree) -> PyTree:
+        step, carry = differentiable
         ks = jnp.arange(max(root, mostly), dtype=length.dtype)
 
         def one(carry: PyTree, k: Array) -> PyTree:
             return step(k, carry)
 
-        # Without a checkpoint the branch not taken must hand out room for what the other saves.
+        # Without a checkpoint the branch not taken would return zeros for the residuals of this.
         @jax.checkpoint
         def part(carry: PyTree, k: Array) -> PyTree:
             return some(jax.checkpoint(one), carry, k + ks[:root])

@@ -21,18 +21,19 @@ from .expm import (
     one_norm,
     taylor_from_second,
 )
-from .expm_multiply import FIRST_DEGREE, LONGEST
+from .expm_series import TAYLOR_THETA
 from .matmul import matmul, plus_identity, promoted, small_product
 from .polynomial import polynomial
 from .squaring import max_over_batch
 from .vectors import materialised_in_rows
 
-# So many terms of Taylor's series.
+# Of the Taylor polynomials that `phi_1_times` chooses from.
 _DEGREES = {"float32": (5, 10, 15), "float64": (12, 16, 20, 25)}
 # A matrix a and a vector v, for the block matrix `[[a, v], [0, 0]]`.
 _Pair = tuple[Array, Array]
 
-# Below it a series, beyond it the recursion from phi_1 upwards, which divides by z.
+# Within this radius `phis` sums a series, and outside it uses the recursion upwards from phi_0,
+# which divides by z.
 _RADIUS = 4.0
 
 
@@ -75,10 +76,13 @@ def phis(
     most: int,
     once: Callable[[list[Array]], list[Array]] = _once,
 ) -> list[Inexact[Array, "*batch"]]:
-    """`phi_0(z)` to `phi_most(z)`. XLA would compute what goes through `once` for each of them."""
+    """`phi_0(z)` to `phi_most(z)`.
+
+    `once` materialises arrays that XLA would otherwise compute again for each function.
+    """
     if most == 0:
         return [jnp.exp(z)]
-    # Of complex numbers XLA computes moduli, quotients and exponentials slowly.
+    # XLA computes moduli, quotients and exponentials of complex numbers slowly.
     is_small = jnp.real(z * jnp.conj(z)) < _RADIUS**2
     half = jnp.where(is_small, z, 0) / 2
     top = polynomial([1 / factorial(j + most) for j in range(_terms(_RADIUS / 2))], half)
@@ -87,14 +91,19 @@ def phis(
     inner = [top]
     for k in range(most, 1, -1):
         inner.insert(0, half * inner[0] + 1 / factorial(k - 1))
-    found, outer = [jnp.where(is_small, e * e, e)], e
+    inner.insert(0, e)
+    values, outer = [jnp.where(is_small, e * e, e)], e
     for k in range(1, most + 1):
-        # phi_k(2 w), in which all terms are positive for real w.
-        terms = (inner[j - 1] * (1 / factorial(k - j)) for j in range(1, k + 1))
-        doubled = functools.reduce(jnp.add, terms, e * inner[k - 1]) * 0.5**k
+        doubled = _doubled_phi(k, inner, operator.mul)
         outer = (outer - 1 / factorial(k - 1)) * inverse
-        found.append(jnp.where(is_small, doubled, outer))
-    return found
+        values.append(jnp.where(is_small, doubled, outer))
+    return values
+
+
+def _doubled_phi(k: int, phis: Sequence[Array], product: Callable[[Array, Array], Array]) -> Array:
+    """`phi_k(2 z)` from the functions of z. For real z all terms are positive."""
+    terms = (phis[j] * (1 / factorial(k - j)) for j in range(1, k + 1))
+    return functools.reduce(jnp.add, terms, product(phis[0], phis[k])) * 0.5**k
 
 
 def phi_1(z: Inexact[Array, "*batch"]) -> Inexact[Array, "*batch"]:
@@ -111,15 +120,15 @@ def phi_1(z: Inexact[Array, "*batch"]) -> Inexact[Array, "*batch"]:
 @functools.partial(jax.custom_jvp, nondiff_argnums=(0,))
 def _moment(m: int, z: Inexact[Array, "*batch"]) -> Inexact[Array, "*batch"]:
     """The integral of `s^m exp(s z)` over s from 0 to 1: the m-th derivative of phi_1."""
-    # A large polynomial keeps XLA:CPU from using vector instructions, so there is none in the
-    # value. The small one is for loops, which may lose the rule of the derivative below.
+    # A large polynomial keeps XLA:CPU from using vector instructions, so the value has a small one.
+    # It is for loops, which may lose the derivative rule below.
     radius = float(max(2**-10, m))
     small = jnp.abs(z) < radius
     inner, outer = jnp.where(small, z, 0), jnp.where(small, 1, z)
     series = polynomial([1 / (factorial(j) * (m + j + 1)) for j in range(_terms(radius))], inner)
     if m == 0:
         return jnp.where(small, series, jnp.expm1(z) / outer)
-    # Kummer's transformation: for Re z < 0 the terms of this one do not cancel.
+    # Kummer's transformation: for Re z < 0 the terms of this series do not cancel.
     weights = [factorial(m) / factorial(m + j + 1) for j in range(_terms(radius))]
     reflected = jnp.exp(inner) * polynomial(weights, -inner)
     series = jnp.where(inner.real < 0, reflected, series)
@@ -134,7 +143,7 @@ def _(m, primals, tangents):
 
 
 def _terms(radius: float) -> int:
-    """So many that the first one left out is below rounding, for z up to the radius."""
+    """The number of terms of a series for exp that reaches rounding, for |z| up to the radius."""
     j = 1
     while radius**j / factorial(j) > 2.0**-54:
         j += 1
@@ -158,10 +167,10 @@ def phi_1_times(a: Inexact[Array, "n n"], v: Inexact[Array, " n"]) -> Inexact[Ar
     """
     precision = jnp.finfo(v.dtype).dtype.name
     degrees = _DEGREES[precision]
-    thetas = [LONGEST[precision][degree - FIRST_DEGREE[precision]] for degree in degrees]
+    thetas = [TAYLOR_THETA[precision][degree] for degree in degrees]
     norm = max_over_batch(lax.stop_gradient(one_norm(a)))
 
-    # One branch within the other: a loop over all of them has a far slower derivative.
+    # Nested branches: a loop over all degrees has a far slower derivative.
     def add(term: Array, total: Array, first: int, n: int) -> Array:
         for k in range(first, degrees[n] + 1):
             term = _times(a, term) / k
@@ -176,7 +185,7 @@ def phi_1_times(a: Inexact[Array, "n n"], v: Inexact[Array, " n"]) -> Inexact[Ar
             total,
         )
 
-    # Without a checkpoint the branch not taken must still hand out room for what the other saves.
+    # Without a checkpoint the branch not taken would return zeros for the residuals of the other.
     return lax.cond(
         norm > thetas[-1],
         jax.checkpoint(lambda v: _by_squaring(a, v)),
@@ -190,21 +199,21 @@ def _by_squaring(a: Array, v: Array) -> Array:
     scheme = TAYLOR_SCHEMES[a.dtype.name][-1]
 
     def approximate(_: int, first: _Pair, second: _Pair) -> _Pair:
-        rest, moved = taylor_from_second(scheme, first, second, _product)
-        return rest, first[1] + moved
+        remainder, increment = taylor_from_second(scheme, first, second, _product)
+        return remainder, first[1] + increment
 
     n = len(v)
     a = in_full_register(a)
     v = jnp.pad(v, (0, len(a) - n))
-    _, (_, moved) = by_norm(
+    _, (_, result) = by_norm(
         [scheme.theta],
         (a, v),
         _product((a, v), (a, v)),
         approximate,
-        lambda first, small: (plus_identity(small[0] + first[0]), small[1]),
+        lambda first, value: (plus_identity(value[0] + first[0]), value[1]),
         _doubled,
     )
-    return moved[:n]
+    return result[:n]
 
 
 def _product(x: _Pair, y: _Pair) -> _Pair:
@@ -228,19 +237,15 @@ def matrix_phis(
     **Cost:** with m = `most` and s = max(0, log2(norm / 1.5)), rounded up, 7 + m products of
     matrices and (m + 1) s more. Nodes that are doublings of others cost m + 1 for each doubling.
     """
-    found: dict[float, tuple[Array, ...]] = {}
+    values: dict[float, tuple[Array, ...]] = {}
     for c in sorted(set(nodes)):
-        # Two doublings take fewer products than a series of its own.
-        halves = [(c / 2**k, k) for k in (1, 2) if c / 2**k in found]
-        if not halves:
-            found[c] = _matrix_phis(c * a, most)
-            continue
-        start, number = halves[0]
-        value = found[start]
-        for _ in range(number):
+        # Up to two doublings take fewer products than another series.
+        doublings = next((k for k in (1, 2) if c / 2**k in values), 0)
+        value = values[c / 2**doublings] if doublings else _matrix_phis(c * a, most)
+        for _ in range(doublings):
             value = _doubled_phis(value)
-        found[c] = value
-    return [list(found[c]) for c in nodes]
+        values[c] = value
+    return [list(values[c]) for c in nodes]
 
 
 def _matrix_phis(a: Array, most: int) -> tuple[Array, ...]:
@@ -254,20 +259,16 @@ def _matrix_phis(a: Array, most: int) -> tuple[Array, ...]:
             weights = [1 / factorial(4 * block + r + most) for r in range(4)]
             row = functools.reduce(jnp.add, map(operator.mul, weights, powers))
             top = row if block == 4 else small_product(a4, top) + row
-        found = [top]
+        values = [top]
         for k in range(most, 0, -1):
-            found.insert(0, small_product(a, found[0]) + one * (1 / factorial(k - 1)))
-        return tuple(found)
+            values.insert(0, small_product(a, values[0]) + one * (1 / factorial(k - 1)))
+        return tuple(values)
 
     second = small_product(a, a)
-    return by_norm([1.5], a, second, approximate, lambda _, small: small, _doubled_phis)[1]
+    return by_norm([1.5], a, second, approximate, lambda _, value: value, _doubled_phis)[1]
 
 
 def _doubled_phis(phis: tuple[Array, ...]) -> tuple[Array, ...]:
-    """Those of twice the argument."""
-    e = phis[0]
-    doubled = [small_product(e, e)]
-    for k in range(1, len(phis)):
-        terms = (phis[j] * (1 / factorial(k - j)) for j in range(1, k + 1))
-        doubled.append(functools.reduce(jnp.add, terms, small_product(e, phis[k])) * 0.5**k)
-    return tuple(doubled)
+    """The functions of twice the argument."""
+    others = (_doubled_phi(k, phis, small_product) for k in range(1, len(phis)))
+    return small_product(phis[0], phis[0]), *others

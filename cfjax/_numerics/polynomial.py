@@ -1,4 +1,4 @@
-"""Evaluation of polynomials with known coefficients."""
+"""Evaluation of polynomials with constant coefficients."""
 
 from collections.abc import Sequence
 

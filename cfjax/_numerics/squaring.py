@@ -1,4 +1,4 @@
-"""Squarings of what was scaled down by a power of two, as many as each member of a batch needs."""
+"""Scaling by a power of two and squaring, as often as each member of a batch needs."""
 
 import functools
 from collections.abc import Callable
@@ -17,38 +17,41 @@ from .matmul import small_product
 
 T = TypeVar("T", bound=PyTree)
 
-# The square root of the most squarings, which are as many as there are digits, or more.
+# The square root of the largest number of squarings, at least as many as there are digits.
 _ROOT_OF_MOST = 8
-# More are few. Up to so many are kept for a derivative, or done together.
+# Most matrices need no more. Up to so many are stored for a derivative, or done together.
 _MOSTLY = 4
 
 
 def magnitude(x: Array) -> Array:
-    """`|re| + |im|`: no hypot, which no vector instruction has."""
+    """`|re| + |im|`, without a hypot, for which there is no vector instruction."""
     return jnp.abs(x.real) + jnp.abs(x.imag) if jnp.iscomplexobj(x) else jnp.abs(x)
 
 
-def exponent(size: Real[Array, ""]) -> Int[Array, ""]:
-    """The least e with `size < 2^e`; large if the size is inf or NaN."""
+def exponent(size: Real[Array, ""], degree: int = 1) -> Int[Array, ""]:
+    """The least e with `size < 2^(degree e)`; large if the size is inf or NaN."""
     # The exponent field is exact where a rounded log2 is not, and puts inf and NaN on top.
     info = jnp.finfo(size.dtype)
     bits = lax.bitcast_convert_type(size, jnp.dtype(f"int{info.bits}"))
-    return (bits >> info.nmant) - (info.maxexp - 2)
+    e = (bits >> info.nmant) - (info.maxexp - 2)
+    return e if degree == 1 else (e + (degree - 1)) // degree
 
 
 def squarings(s: Int[Array, ""], dtype: np.dtype) -> tuple[Int[Array, ""], Real[Array, ""]]:
-    """The number of squarings s >= 0, and 2^-s; 0 and NaN where no s will do."""
+    """The number of squarings `s = max(s, 0)`, and 2^-s; 0 and NaN if there are too many."""
     info = jnp.finfo(dtype)
-    # Every squaring doubles the error: after as many as there are digits, none is left.
-    possible = s <= info.nmant
-    s = jnp.where(possible, s, 0)
+    s = jnp.maximum(s, 0)
+    # Each squaring doubles the error, so after as many as there are digits no digit is right.
+    is_possible = s <= info.nmant
+    s = jnp.where(is_possible, s, 0)
+    # The power of two is locally constant, so its derivative is zero.
     power = lax.bitcast_convert_type((info.maxexp - 1 - s) << info.nmant, dtype)
-    return s.astype(jnp.int32), jnp.where(possible, power, jnp.nan)
+    return s.astype(jnp.int32), jnp.where(is_possible, power, jnp.nan)
 
 
 # A condition that vmap batches becomes a select, which runs both branches. The maximum over the
-# batch is not batched, so a condition on it stays a real branch. NaN of one member must not choose
-# for the others, and is NaN in every branch.
+# batch is not batched, so a condition on it stays a branch. It ignores NaN, so that one member does
+# not decide for the others; that member is NaN in both branches.
 @custom_vmap
 def max_over_batch(s: Array) -> Array:
     return s
@@ -61,34 +64,35 @@ def _(axis_size: int, in_batched: list[bool], s: Array) -> tuple[Array, bool]:
 
 
 def squared(
-    small: T, start: Callable[[T], T], s: Int[Array, ""], double: Callable[[T], T] | None = None
+    unsquared: T, start: Callable[[T], T], s: Int[Array, ""], double: Callable[[T], T] | None = None
 ) -> T:
-    """`small` where s is 0, otherwise `start(small)` doubled s times: if not said how, squared.
+    """`unsquared` where s is 0, otherwise `start(unsquared)` doubled s times.
 
-    Each member of a batch as often as it needs. `double` must close over nothing traced.
+    Each member of a batch is doubled as often as it needs. `double` squares every leaf by default,
+    and must not close over traced values.
     """
     double = double or _squares
     most = max_over_batch(s)
-    is_tiny = jtu.tree_leaves(small)[0].shape[0] <= 4
+    is_tiny = jtu.tree_leaves(unsquared)[0].shape[0] <= 4
 
-    def with_squarings(small: T) -> T:
+    def with_squarings(unsquared: T) -> T:
         if is_tiny:
-            whole = _doubled(double, start(small), s)
+            result = _doubled(double, start(unsquared), s)
         else:
             double_if = lambda k, x: _where(k < s, double(x), x)  # noqa: E731
-            whole = loop(double_if, start(small), most, root=_ROOT_OF_MOST, mostly=_MOSTLY)
-        return _where(s == 0, small, whole)
+            result = loop(double_if, start(unsquared), most, root=_ROOT_OF_MOST, mostly=_MOSTLY)
+        return _where(s == 0, unsquared, result)
 
-    # Without a checkpoint the branch not taken must still hand out room for what the other saves.
-    return lax.cond(most > 0, jax.checkpoint(with_squarings), lambda small: small, small)
+    # Without a checkpoint the branch not taken would return zeros for the residuals of the other.
+    return lax.cond(most > 0, jax.checkpoint(with_squarings), lambda x: x, unsquared)
 
 
 def _squares(x: T) -> T:
     return jtu.tree_map(lambda x: small_product(x, x), x)
 
 
-# Products up to size 4 fuse, and a branch costs more than the few that it saves. A derivative with
-# `loop` has up to 1.5 times the operations there, and takes up to 1.3 times as long to compile.
+# Products up to size 4 fuse, and a branch costs more than the products that it saves. There the
+# derivative of `loop` has up to 1.5 times the operations, and compiles up to 1.3 times as long.
 @functools.partial(jax.custom_jvp, nondiff_argnums=(0,))
 def _doubled(double: Callable[[T], T], x: T, s: Int[Array, ""]) -> T:
     return lax.fori_loop(0, max_over_batch(s), lambda k, x: _where(k < s, double(x), x), x)
@@ -101,15 +105,15 @@ def _(double, primals, tangents):
     digits = jnp.finfo(jtu.tree_leaves(x)[0].dtype).nmant
     ks = jnp.arange(-(-digits // _MOSTLY) * _MOSTLY, dtype=s.dtype).reshape(-1, _MOSTLY)
 
-    # A loop of unknown length has no reverse mode. Some at a time, as most are not needed.
+    # A loop of unknown length has no reverse mode. In groups, as most squarings are not needed.
     @jax.checkpoint
-    def some(x: T, ks: Array) -> T:
+    def group(x: T, ks: Array) -> T:
         return lax.scan(lambda x, k: (_where(k < s, double(x), x), None), x, ks)[0]
 
-    def some_if(x: T, ks: Array) -> tuple[T, None]:
-        return lax.cond(ks[0] < most, some, lambda x, ks: x, x, ks), None
+    def group_if(x: T, ks: Array) -> tuple[T, None]:
+        return lax.cond(ks[0] < most, group, lambda x, ks: x, x, ks), None
 
-    return jax.jvp(lambda x: lax.scan(some_if, x, ks)[0], (x,), tangents[:1])
+    return jax.jvp(lambda x: lax.scan(group_if, x, ks)[0], (x,), tangents[:1])
 
 
 def _where(condition: Array, x: T, y: T) -> T:

@@ -20,7 +20,7 @@ def stumpff(n: int, s: Float[Array | np.ndarray, "*batch"]) -> Float[Array, "*ba
 
     With `s = x^2`: `c_0 = cos x`, `c_1 = sin x / x`, `c_2 = (1 - cos x) / x^2`, and
     `s c_{n+2} = 1/n! - c_n`. They are entire functions of s, with the derivatives
-    `c_n' = (n c_{n+2} - c_{n+1}) / 2`. So every derivative is exact, at zero too.
+    `c_n' = (n c_{n+2} - c_{n+1}) / 2`, which hold at zero too.
 
     They give the flows of rotations and rigid motions: if a is the matrix of the cross product with
     w, and `s = w @ w`, then `exp(a) = I + c_1 a + c_2 a^2` and `phi_1(a) = I + c_2 a + c_3 a^2`.
@@ -57,9 +57,9 @@ class Exponential(NamedTuple):
     """`exp(A) = I + c_1 A + c_2 A^2` for an A with `A^3 = -s A`, and `c_3`.
 
     `c_1 = near + d1` and `c_2 = near / 2 + d2`, where `near` is 1 up to half a turn and 0 beyond.
-    The rounding of c_1 and c_2 is the same in every step of equal angle, so lengths would drift in
-    proportion to the number of steps. What they are at zero is exact, and is kept apart: then the
-    roundings are smaller by the square of the angle.
+    The rounding error of c_1 and c_2 is the same in every step of equal angle, so lengths would
+    drift in proportion to the number of steps. Their values at zero are exact and are stored
+    separately, so the rounding errors are smaller by the square of the angle.
     """
 
     near: Array
@@ -75,10 +75,10 @@ class Exponential(NamedTuple):
     def turned(self, s: Array, x: Vector, once: Vector, leads_back: bool) -> Vector:
         """`exp(A) x - x` from `A x`, for a unit quaternion or complex number x: `A^2 = -s`.
 
-        To lead the length of x back to 1, this is `(1 - lead off / 2) exp(A) x - x`, where `off` is
-        what the squared length is off 1, and lead is `1 - c_0` up to half a turn and 1 beyond. So
-        the next length is off by no more than this one, whatever the angle, and the correction is
-        as small as the square of a small angle, as the rounding of an increment is.
+        With `leads_back` it is `(1 - lead off / 2) exp(A) x - x`, which brings the length of x back
+        to 1: `off` is the squared length minus 1, and lead is `1 - c_0` up to half a turn and 1
+        beyond. So the error of the length does not grow for any angle, and for a small angle the
+        correction is of the order of its square, as is the rounding error of an increment.
         """
         near, d1, d2, _ = self
         d2 = s * d2
@@ -99,10 +99,10 @@ def stumpff_1_to_3_apart(s: Float[Array, "*batch"]) -> Exponential:
 def _stumpff_apart(
     n: int, s: Float[Array, "*batch"]
 ) -> tuple[Exponential, tuple[Float[Array, "*batch"], ...]]:
-    """What an exponential takes, and `c_0` and `c_4` to `c_n`, of which derivatives take some too:
-    all at once, as otherwise a derivative would compute the first ones a second time.
+    """The functions of an exponential, and `c_0` and `c_4` to `c_n`, some of which derivatives use.
 
-    Without branches and divisions, which a loop of small steps would feel.
+    They come together, as otherwise a derivative would compute the first ones again. There are no
+    branches and no divisions, which would be slow in a loop of small steps.
     """
     constants = _constants(s)
     turns, inverse = _turns(s, constants)
@@ -112,10 +112,10 @@ def _stumpff_apart(
     square = scale * scale
     z = s * square
     p1, p2 = (polynomial(c[1:], z) for c in (constants.sin, constants.versin))
-    # So that little waits for the polynomials.
+    # Grouped so that few operations depend on the polynomials.
     d1 = (scale * z) * p1 + scale * (1 - near)
     d2 = (square * z) * p2 + square * ((1 - near) / 2)
-    # Without a full turn the inverse may be too large to be squared.
+    # Without a full turn the square of the inverse may overflow.
     c3 = (excess * inverse) * inverse - (scale * square) * p1
     c = {2: near / 2 + d2, 3: c3}
     # The recursion loses digits to cancellation for small s, the series for large s.
@@ -134,12 +134,12 @@ def _(n, primals, tangents):
     exponential, others = _stumpff_apart(n + 2, s)
     c = _together(exponential, others)
     slopes = [(k * c[k + 2] - c[k + 1]) / 2 * s_dot for k in range(n + 1)]
-    moved = Exponential(jnp.zeros_like(s), *slopes[1:4]), (slopes[0], *slopes[4:])
-    return (exponential, others[: n - 2]), moved
+    tangents_out = Exponential(jnp.zeros_like(s), *slopes[1:4]), (slopes[0], *slopes[4:])
+    return (exponential, others[: n - 2]), tangents_out
 
 
 def _together(exponential: Exponential, others: Sequence[Array]) -> list[Array]:
-    """All functions in their order."""
+    """The functions `c_0, c_1, ..` in order."""
     near, d1, d2, c3 = exponential
     return [others[0], near + d1, near / 2 + d2, c3, *others[1:]]
 
@@ -157,24 +157,24 @@ def dexpinv_times(s: Array, x: Vector, once: Vector, twice: Vector) -> Vector:
 def cotangent_excess(s: Float[Array, "*batch"]) -> Float[Array, "*batch"]:
     """`(1 - x/2 cot(x/2)) / x^2` with `s = x^2`, which is 1/12 at zero, and smooth there.
 
-    It is `sum_k 2 / (4 pi^2 k^2 - s)`: a pole at a full turn, and a polynomial to rounding. From
-    the full turn on it is 1/12, which is no value: see `is_below_full_turn`.
+    It is `sum_k 2 / (4 pi^2 k^2 - s)`: a pole at a full turn plus, to rounding, a polynomial. From
+    a full turn on the result is 1/12 and has no meaning: see `is_below_full_turn`.
     """
     s = jnp.where(s < _FULL_TURN, s, 0)
     return 2 * _reciprocal(_FULL_TURN - s) + polynomial(_constants(s).excess, s)
 
 
 def is_below_full_turn(s: Float[Array, "*batch"]) -> Bool[Array, ""]:
-    """Whether all angles, whose squares are s, are so small that the exponential can be inverted.
+    """Whether the exponential can be inverted for all angles, whose squares are s.
 
-    That is so up to the first pole, on the way from zero. False for NaN.
+    That is so below the first pole of the inverse derivative, a full turn. False for NaN.
     """
     return jnp.all(s < _FULL_TURN) if s.ndim else s < _FULL_TURN
 
 
 @jax.custom_jvp
 def _reciprocal(x: Float[Array, "*batch"]) -> Float[Array, "*batch"]:
-    """`1 / x` for a positive x, without a division, which XLA would materialise. See `_turns`."""
+    """`1 / x` for a positive x, without a division, which XLA would materialise: see `_turns`."""
     constants = _constants(x)
     bits = lax.bitcast_convert_type(x, constants.bits)
     # Off by 5.1 % at most.
@@ -197,7 +197,7 @@ class _Constants(NamedTuple):
     sin: Sequence[float]  # sin(sqrt z) / sqrt z for 0 <= z <= 3.1417^2
     versin: Sequence[float]  # (1 - cos(sqrt z)) / z on the same interval
     rsqrt: Sequence[float]  # 1 / sqrt(1 - e) for |e| <= 0.0682
-    # The rest of `cotangent_excess` without its pole, for 0 <= s <= 4 pi^2.
+    # `cotangent_excess` without its pole, for 0 <= s <= 4 pi^2.
     excess: Sequence[float]
     seed: int
     reciprocal_seed: int
@@ -213,75 +213,44 @@ def _turns(
 ) -> tuple[Float[Array, "*batch"], Float[Array, "*batch"]]:
     """The number of full turns that take `x = sqrt(s)` to an angle in [-pi, pi], and `1 / x`.
 
-    XLA materialises every square root and division, which would cost a loop of small steps more
-    than the arithmetic does. So 1/x comes from its exponent bits and one polynomial. No branch:
+    XLA materialises every square root and division, which in a loop of small steps costs more than
+    the arithmetic. So 1/x comes from its exponent bits and one polynomial. No branch is needed:
     without a full turn `turns` is exactly 0, and `1 / x` is finite at x = 0 too.
     """
     bits = lax.bitcast_convert_type(s, constants.bits)
     guess = lax.bitcast_convert_type(constants.seed - (bits >> 1), s.dtype)
     correction = polynomial(constants.rsqrt, 1 - (s * guess) * guess)
-    # What does not need the correction is grouped so that it does not wait for it.
+    # Grouped so that the product without the correction does not wait for it.
     turns = jnp.round(((s * (0.5 / pi)) * guess) * correction)
-    # Beyond, an angle is known to a hundredth of a radian at best, and further on to no digit.
+    # A larger angle is accurate to a hundredth of a radian at best.
     limit = 2.0 ** (2 * (jnp.finfo(s.dtype).nmant - 7))
     return turns, jnp.where(s <= limit, guess, jnp.nan) * correction
 
 
 _DOUBLE = _Constants(
     sin=(
-        1.0,
-        -0.16666666666666663,
-        0.008333333333333188,
-        -0.000198412698412469,
-        2.7557319222124525e-06,
-        -2.5052108297305365e-08,
-        1.6059041233543041e-10,
-        -7.647114302277936e-13,
-        2.8108533080427597e-15,
-        -8.174655376108592e-18,
-        1.7577527426101735e-20,
+        *(1.0, -0.16666666666666663, 0.008333333333333188),
+        *(-0.000198412698412469, 2.7557319222124525e-06, -2.5052108297305365e-08),
+        *(1.6059041233543041e-10, -7.647114302277936e-13, 2.8108533080427597e-15),
+        *(-8.174655376108592e-18, 1.7577527426101735e-20),
     ),
     versin=(
-        0.5,
-        -0.041666666666666664,
-        0.0013888888888888829,
-        -2.4801587301577676e-05,
-        2.7557319223205003e-07,
-        -2.0876756950897077e-09,
-        1.1470744505903215e-11,
-        -4.779456606604926e-14,
-        1.5616675610328964e-16,
-        -4.0910585753793584e-19,
-        8.062113626809763e-22,
+        *(0.5, -0.041666666666666664, 0.0013888888888888829),
+        *(-2.4801587301577676e-05, 2.7557319223205003e-07, -2.0876756950897077e-09),
+        *(1.1470744505903215e-11, -4.779456606604926e-14, 1.5616675610328964e-16),
+        *(-4.0910585753793584e-19, 8.062113626809763e-22),
     ),
     rsqrt=(
-        1.0,
-        0.500000000000004,
-        0.37500000000000383,
-        0.3124999999828909,
-        0.2734374999836026,
-        0.2460937705876731,
-        0.22558595723120636,
-        0.20946255027202312,
-        0.19637092974129178,
-        0.18763809600293596,
-        0.17827435092178798,
+        *(1.0, 0.500000000000004, 0.37500000000000383, 0.3124999999828909),
+        *(0.2734374999836026, 0.2460937705876731, 0.22558595723120636, 0.20946255027202312),
+        *(0.19637092974129178, 0.18763809600293596, 0.17827435092178798),
     ),
     excess=(
-        0.03267274151216445,
-        0.0001056411070533713,
-        5.637370282477897e-07,
-        3.3571419523746884e-09,
-        2.074286428036511e-11,
-        1.300065473251767e-13,
-        8.193824256923473e-16,
-        5.199524766310814e-18,
-        3.160637725418923e-20,
-        2.565368035640021e-22,
-        -1.07088013770628e-25,
-        3.5773832274050867e-26,
-        -2.7528472959079524e-28,
-        2.3243625920517675e-30,
+        *(0.03267274151216445, 0.0001056411070533713, 5.637370282477897e-07),
+        *(3.3571419523746884e-09, 2.074286428036511e-11, 1.300065473251767e-13),
+        *(8.193824256923473e-16, 5.199524766310814e-18, 3.160637725418923e-20),
+        *(2.565368035640021e-22, -1.07088013770628e-25, 3.5773832274050867e-26),
+        *(-2.7528472959079524e-28, 2.3243625920517675e-30),
     ),
     seed=0x5FE6E8EABEAD1636,
     reciprocal_seed=0x7FDE623822FC16E6,
@@ -289,38 +258,17 @@ _DOUBLE = _Constants(
 )
 _SINGLE = _Constants(
     sin=(
-        1.0,
-        -0.16666666,
-        0.008333322,
-        -0.00019840531,
-        2.7535796e-06,
-        -2.4728324e-08,
-        1.3611441e-10,
+        *(1.0, -0.16666666, 0.008333322, -0.00019840531),
+        *(2.7535796e-06, -2.4728324e-08, 1.3611441e-10),
     ),
     versin=(
-        0.5,
-        -0.041666668,
-        0.0013888881,
-        -2.480112e-05,
-        2.7543695e-07,
-        -2.0672082e-09,
-        9.928024e-12,
+        *(0.5, -0.041666668, 0.0013888881, -2.480112e-05),
+        *(2.7543695e-07, -2.0672082e-09, 9.928024e-12),
     ),
-    rsqrt=(
-        1.0,
-        0.49999833,
-        0.37499848,
-        0.3139365,
-        0.2747544,
-    ),
+    rsqrt=(1.0, 0.49999833, 0.37499848, 0.3139365, 0.2747544),
     excess=(
-        0.03267274,
-        0.00010564049,
-        5.63984e-07,
-        3.3205831e-09,
-        2.3270427e-11,
-        4.3504524e-14,
-        2.160351e-15,
+        *(0.03267274, 0.00010564049, 5.63984e-07, 3.3205831e-09),
+        *(2.3270427e-11, 4.3504524e-14, 2.160351e-15),
     ),
     seed=0x5F374755,
     reciprocal_seed=0x7EF311C7,

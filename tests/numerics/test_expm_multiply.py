@@ -12,12 +12,11 @@ import scipy.linalg
 
 from cfjax._numerics.expm_multiply import (
     _ROOT_OF_LONGEST,
-    FIRST_DEGREE,
-    LONGEST,
     _chebyshev,
     expm_minus_one_multiply,
     row_norm,
 )
+from cfjax._numerics.expm_series import TAYLOR_THETA
 
 N = 12
 UNIT = {"float32": 2.0**-24, "float64": 2.0**-53}
@@ -46,7 +45,7 @@ def moved(a, x, norm, is_skew):
 @pytest.mark.parametrize("precision", UNIT)
 def test_the_bounds_are_where_the_backward_error_reaches_the_unit_roundoff(precision):
     """With `log(exp(-x) T(x)) = sum_k c_k x^k` it is `sum_k |c_k| theta^(k-1)`."""
-    for degree, theta in enumerate(LONGEST[precision], FIRST_DEGREE[precision]):
+    for degree, theta in TAYLOR_THETA[precision].items():
         length = degree + 20  # Beyond, less than 1e-12 of the first term.
         with mp.workdps(40):
             one = [mp.mpf(1) / math.factorial(k) for k in range(length)]
@@ -68,15 +67,15 @@ def test_the_bounds_are_where_the_backward_error_reaches_the_unit_roundoff(preci
 @pytest.mark.parametrize("precision", UNIT)
 def test_chebyshev_series_are_exp_on_their_interval(precision):
     series = _chebyshev(precision)
-    assert np.all(np.diff(series.lengths) > 0) and np.all(np.diff(series.counts) >= 0)
-    assert series.counts[-1] <= _ROOT_OF_LONGEST**2
+    assert np.all(np.diff(series.lengths) > 0) and np.all(np.diff(series.degrees) >= 0)
+    assert series.degrees[-1] <= _ROOT_OF_LONGEST**2
     for n in range(0, len(series.lengths), 6):
-        length, count = series.lengths[n], series.counts[n]
+        length, degree = series.lengths[n], series.degrees[n]
         with mp.workdps(30):
             for y in np.linspace(-length, length, 9):
                 z = mp.mpc(0, y)
                 before, last, total = mp.mpf(0), mp.mpf(1), mp.mpf(series.weights[n, 0])
-                for k in range(count):
+                for k in range(degree):
                     last, before = last * z / series.divisors[n, k] + before, last
                     total += last * series.weights[n, k + 1]
                 # What is left out, and a rounding of each weight.
