@@ -13,8 +13,8 @@ from .matmul import plus_identity, small_product
 _SHARED = (120.0, 1.0)
 # Polynomials for `cosh(a) - I` and for `sinh(a)/a - I` in Z = a², (row 0)·(row 1) + (row 2), with
 # weights over Z, Z² and the shared polynomial. For k = 1..7 the coefficient of Z^k is 1/(2k)! and
-# 1/(2k + 1)!, up to the rounding of the divisions. All weights are positive, so nothing cancels. With
-# the 120 above the coefficient of Z⁸ is 1/16! in the first and 1.13/17! in the second.
+# 1/(2k + 1)!, up to the rounding of divisions. With the 120 above the coefficient of Z⁸ is 1/16!
+# in the first and 1.13/17! in the second. All weights are positive, so nothing cancels.
 _EVEN = (
     (122880.0, 8000.0, 1.0),
     tuple(w / math.factorial(16) for w in (2129280, 21280, 1)),
