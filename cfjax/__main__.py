@@ -13,11 +13,12 @@ import jax
 
 from . import scenes
 from ._measure.extra import paper_extra
+from .scenes._scene import Scene
 
 _SCENES = {
     name: module
     for name, module in vars(scenes).items()
-    if isinstance(module, types.ModuleType) and module.__name__ == f"{scenes.__name__}.{name}"
+    if isinstance(module, Scene) and isinstance(module, types.ModuleType)
 }
 # A scene may have several charts: `scenes.stiefel.chart_first` is that of stiefel_first.
 _CHARTS = {

@@ -142,7 +142,8 @@ def test_every_block_of_code_is_seen():
 def test_every_public_name_is_in_the_api():
     pages = "\n".join(page.read_text() for page in (ROOT / "docs" / "api").glob("*.md"))
     named = re.findall(r"^::: cfjax\.(.+)$", pages, flags=re.MULTILINE)
-    scenes = {f"scenes.{module.name}" for module in pkgutil.iter_modules(cfjax.scenes.__path__)}
+    modules = [module.name for module in pkgutil.iter_modules(cfjax.scenes.__path__)]
+    scenes = {f"scenes.{name}" for name in modules if not name.startswith("_")}
     assert len(named) == len(set(named))
     assert set(named) == {*PUBLIC, *scenes}
 

@@ -36,8 +36,8 @@ def short(monkeypatch):
         methods = dict(list(options.pop("methods").items())[-2:])
         return original(*args, methods=methods, **(options | dict(num_steps=[500, 1000])))
 
-    original = scenes.rigid_body.work_precision
-    monkeypatch.setattr(scenes.rigid_body, "work_precision", work_precision)
+    original = cfjax.work_precision
+    monkeypatch.setattr(cfjax, "work_precision", work_precision)
 
 
 @pytest.fixture
@@ -105,8 +105,7 @@ def test_every_chart_says_what_it_shows(capsys):
 @pytest.mark.slow
 @pytest.mark.parametrize("name", [name for name in CHARTS if name != "rigid_body"])
 def test_charts_of_the_other_scenes(name, monkeypatch):
-    module = sys.modules[CHARTS[name].__module__]
-    original = module.work_precision
+    original = cfjax.work_precision
 
     def work_precision(*args, methods, num_steps=None, tolerances=None, **options):
         some = {"CF4": methods["CF4"]}
@@ -115,7 +114,7 @@ def test_charts_of_the_other_scenes(name, monkeypatch):
         settings = dict(num_steps=num_steps, tolerances=tolerances)
         return original(*args, methods=some, **(options | settings))
 
-    monkeypatch.setattr(module, "work_precision", work_precision)
+    monkeypatch.setattr(cfjax, "work_precision", work_precision)
     work = CHARTS[name](budget=0.1)
     # One halving of the step divides the error by 16 at order 4. With tolerances the estimate is of
     # order 3, so the step goes with their third root and the error with their power 4/3: divided by

@@ -24,34 +24,20 @@ antiphase domain coarsening, Acta Metall. 27 (1979), doi:10.1016/0001-6160(79)90
 """
 
 import functools
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import diffrax
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
-from .. import (
-    CF4,
-    CF43,
-    ETD43,
-    ETD54,
-    ETDRK4,
-    Affine,
-    CosineTransform,
-    LieTerm,
-    TensorTransform,
-    WorkPrecision,
-    integrate,
-    tangent,
-    work_precision,
-)
+import cfjax
 
-if TYPE_CHECKING:
-    from matplotlib.figure import Figure
+from . import _figures as figures
+from ._scene import by_name, in_plain_space, solve
 
 t0, t1 = 0.0, 6.0
-solver = ETD54()
+solver = cfjax.ETD54()
 
 # One, two or three axes.
 Phases = Float[Array | np.ndarray, "*cells"]
@@ -72,21 +58,23 @@ def drop(n: int = 128) -> Float[np.ndarray, "n n"]:
     return np.tanh((0.28 + 0.1 * np.cos(5 * angle) - radius) / (2**0.5 * 0.02))
 
 
-def field(t: Any, y: Phases, args: float | Float[Array | np.ndarray, ""]) -> Affine:
+def field(t: Any, y: Phases, args: float | Float[Array | np.ndarray, ""]) -> cfjax.Affine:
     """The frozen field, with the width w of a front as `args`."""
-    transform = TensorTransform([CosineTransform()] * y.ndim)
-    return Affine(1.0, y - y**3, args**2 * jnp.asarray(_laplacian(y.shape), y.dtype), transform)
+    transform = cfjax.TensorTransform([cfjax.CosineTransform()] * y.ndim)
+    return cfjax.Affine(
+        1.0, y - y**3, args**2 * jnp.asarray(_laplacian(y.shape), y.dtype), transform
+    )
 
 
 def velocity(t: Any, y: Phases, args: float | Float[Array | np.ndarray, ""]) -> Phases:
     """The same field in plain space, where diffusion limits the steps."""
-    return tangent(field(t, y, args), y)
+    return cfjax.tangent(field(t, y, args), y)
 
 
 def energy(y: Phases, args: float | Float[Array | np.ndarray, ""]) -> Float[Array, ""]:
     """The energy. A front of length one has `w 8^(1/2) / 3`."""
     y = jnp.asarray(y)
-    transform = TensorTransform([CosineTransform()] * y.ndim)
+    transform = cfjax.TensorTransform([cfjax.CosineTransform()] * y.ndim)
     laplacian = jnp.asarray(_laplacian(y.shape), y.dtype)
     # The transform keeps the sum of squares.
     slopes = -laplacian * transform.forward(y) ** 2
@@ -105,7 +93,7 @@ def reference(t: float, n: int = 256, width: float = WIDTH) -> Float[np.ndarray,
 
 def problem() -> dict[str, Any]:
     """What is solved, as arguments of `cfjax.integrate` and `cfjax.work_precision`."""
-    return dict(term=LieTerm(field), t0=t0, t1=t1, y0=y0(), args=WIDTH)
+    return dict(term=cfjax.LieTerm(field), t0=t0, t1=t1, y0=y0(), args=WIDTH)
 
 
 def invariants(y: Phases, args: Any = WIDTH) -> dict[str, Array]:
@@ -113,53 +101,42 @@ def invariants(y: Phases, args: Any = WIDTH) -> dict[str, Array]:
     return {"energy (falls)": energy(y, args)}
 
 
-def chart(**options: Any) -> WorkPrecision:
+def chart(**options: Any) -> cfjax.WorkPrecision:
     """The Allen-Cahn equation, 256 cells, to t = 6, 5 to 320 equal steps; Tsit5 in plain space.
 
     Kvaerno5 is not in it: its matrices are dense, and a step takes some hundred times as long.
     """
-    return work_precision(
+    return cfjax.work_precision(
         **problem(),
-        methods={
-            "CF4": CF4(),
-            "CF43": CF43(),
-            "ETDRK4": ETDRK4(),
-            "ETD43": ETD43(),
-            "ETD54": ETD54(),
-            "Tsit5": (diffrax.ODETerm(velocity), diffrax.Tsit5()),
-        },
+        methods=by_name(cfjax.CF4(), cfjax.CF43(), cfjax.ETDRK4(), cfjax.ETD43(), cfjax.ETD54())
+        | in_plain_space(velocity, diffrax.Tsit5()),
         reference=reference(t1),
         num_steps=[5 * 2**k for k in range(7)],
         **options,
     )
 
 
-def picture(n: int = 128) -> "Figure":
+def picture(n: int = 128) -> figures.Figure:
     """Fronts on a line that meet, and a drop that shrinks, with its area."""
-    from matplotlib.figure import Figure
-
-    figure = Figure((12.5, 3.2), layout="constrained")
+    figure = figures.new(12.5, 3.2)
     left, *squares, right = figure.subplots(1, 5, width_ratios=(1.4, 1, 1, 1, 1.4))
-    options: Any = dict(num_steps=15, save_every=5)
-    line: Any = integrate(solver=solver, **problem() | options).ys
+    _, line = solve(problem(), solver, num_steps=15, save_every=5, save_initial=True)
     x = (np.arange(256) + 0.5) / 256
-    colours = "#999999", "#E69F00", "#D55E00", "#0072B2"
+    colours = "#999999", figures.ORANGE, figures.VERMILION, figures.BLUE
     for k, (t, colour) in enumerate(zip((0.0, 2.0, 4.0, 6.0), colours, strict=True)):
-        left.plot(x, y0() if k == 0 else line[k - 1], color=colour, label=f"t = {t:g}")
+        left.plot(x, line[k], color=colour, label=f"t = {t:g}")
         left.plot(x[::4], reference(t)[::4], ".", color=colour, markersize=4)
     left.set(title="Fronts on a line; dots: exact", xlim=(0.3, 0.7), xlabel="x", ylabel="u")
     left.legend(frameon=False)
 
-    start, width, end = drop(n), 0.02, 110.0
-    options = dict(num_steps=110, save_every=1)
-    found: Any = integrate(LieTerm(field), solver, 0.0, end, start, width, **options)
-    ys, times = np.concatenate([start[None], found.ys]), np.append(0.0, found.ts)
+    width, steps = 0.02, dict(num_steps=110, save_every=1, save_initial=True)
+    times, ys = solve(problem(), solver, t1=110.0, y0=drop(n), args=width, **steps)
     for ax, t in zip(squares, (0, 10, 90), strict=True):
         ax.imshow(ys[t].T, origin="lower", cmap="RdBu_r", vmin=-1, vmax=1)
         ax.set(xticks=[], yticks=[], title=f"A drop, t = {t}")
     figure.colorbar(squares[0].images[0], ax=squares, label="u", shrink=0.7)
     area = np.mean((1 + ys) / 2, axis=(1, 2))
-    right.plot(times, area, color="#0072B2", label="area of the drop")
+    right.plot(times, area, color=figures.BLUE, label="area of the drop")
     law = area[0] - 2 * np.pi * width**2 * times
     right.plot(times, np.maximum(law, 0), ":", color="0.3", label="thin fronts")
     right.set(ylim=(0, None), xlabel="t", title="Area")

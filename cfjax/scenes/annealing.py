@@ -15,7 +15,7 @@ Source: Kadowaki & Nishimori, Quantum annealing in the transverse Ising model, P
 """
 
 import functools
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import diffrax
 import jax
@@ -24,24 +24,13 @@ import lineax as lx
 import numpy as np
 from jaxtyping import Array, Complex, Float
 
-from .. import (
-    CF4,
-    CF54,
-    LieTerm,
-    Magnus4,
-    Magnus6,
-    Magnus8,
-    OperatorSum,
-    WorkPrecision,
-    tangent,
-    work_precision,
-)
+import cfjax
 
-if TYPE_CHECKING:
-    from matplotlib.figure import Figure
+from . import _figures as figures
+from ._scene import by_dop853, by_name, in_plain_space
 
 t0, t1 = 0.0, 20.0
-solver = Magnus6()
+solver = cfjax.Magnus6()
 
 State = Complex[Array | np.ndarray, " size"]
 
@@ -81,16 +70,16 @@ def _operators(num_spins: int, precision: str) -> list[Any]:
     return [(turn, num_spins), (1j * couplings(num_spins)).astype(dtype)]
 
 
-def field(t: Any, y: State, args: Any = None) -> OperatorSum:
+def field(t: Any, y: State, args: Any = None) -> cfjax.OperatorSum:
     """The frozen field `-i H(t)`; `args` is the duration of the ramp, or None for `t1`."""
     s = ramp(t, t1 if args is None else args)
     operators = _operators(_num_spins(y), jnp.finfo(y.dtype).dtype.name)
-    return OperatorSum([1 - s, s], operators, is_skew=True)
+    return cfjax.OperatorSum([1 - s, s], operators, is_skew=True)
 
 
 def velocity(t: Any, y: State, args: Any = None) -> Complex[Array, " size"]:
     """The same field in plain space, where no method keeps the norm."""
-    return tangent(field(t, y, args), y)
+    return cfjax.tangent(field(t, y, args), y)
 
 
 def energy(t: Any, y: State, args: Any = None) -> Float[Array, ""]:
@@ -110,7 +99,6 @@ def reference(t: float, num_spins: int = 8) -> Complex[np.ndarray, " size"]:
     With sparse matrices made of Kronecker products. The error is about 1e-11.
     """
     import scipy.sparse as sparse
-    from scipy.integrate import solve_ivp
 
     def at(j: int, pauli: Any) -> Any:
         left, right = sparse.identity(2**j), sparse.identity(2 ** (num_spins - j - 1))
@@ -125,13 +113,12 @@ def reference(t: float, num_spins: int = 8) -> Complex[np.ndarray, " size"]:
         s = np.sin(np.pi / 2 * t / t1) ** 2
         return 1j * ((1 - s) * (x @ y) + s * (z @ y))
 
-    found = solve_ivp(rate, (0.0, t), y0(num_spins), "DOP853", rtol=1e-13, atol=1e-15)
-    return found.y[:, -1]
+    return by_dop853(rate, y0(num_spins), t, atol=1e-15)
 
 
 def problem(num_spins: int = 8) -> dict[str, Any]:
     """What is solved, as arguments of `cfjax.integrate` and `cfjax.work_precision`."""
-    return dict(term=LieTerm(field), t0=t0, t1=t1, y0=y0(num_spins))
+    return dict(term=cfjax.LieTerm(field), t0=t0, t1=t1, y0=y0(num_spins))
 
 
 def invariants(y: State, args: Any = None) -> dict[str, Array]:
@@ -139,20 +126,14 @@ def invariants(y: State, args: Any = None) -> dict[str, Array]:
     return {"norm": jnp.linalg.norm(y)}
 
 
-def chart(num_spins: int = 10, **options: Any) -> WorkPrecision:
+def chart(num_spins: int = 10, **options: Any) -> cfjax.WorkPrecision:
     """Ten spins, 80 to 1280 equal steps; Tsit5 and Dopri8 in plain space with equal operators."""
-    space = diffrax.ODETerm(velocity)
-    return work_precision(
+    return cfjax.work_precision(
         **problem(num_spins),
-        methods={
-            "CF4": CF4(),
-            "CF54": CF54(),
-            "Magnus4": Magnus4(),
-            "Magnus6": Magnus6(),
-            "Magnus8": Magnus8(),
-            "Tsit5": (space, diffrax.Tsit5()),
-            "Dopri8": (space, diffrax.Dopri8()),
-        },
+        methods=by_name(
+            cfjax.CF4(), cfjax.CF54(), cfjax.Magnus4(), cfjax.Magnus6(), cfjax.Magnus8()
+        )
+        | in_plain_space(velocity, diffrax.Tsit5(), diffrax.Dopri8()),
         reference=reference(t1, num_spins),
         # With fewer, methods in plain space are not stable.
         num_steps=[80 * 2**k for k in range(5)],
@@ -160,50 +141,38 @@ def chart(num_spins: int = 10, **options: Any) -> WorkPrecision:
     )
 
 
-def picture(num_spins: int = 8) -> "Figure":
+def picture(num_spins: int = 8) -> figures.Figure:
     """The levels with the energy of the state, how spins order, and what a slower ramp gains."""
-    from matplotlib.figure import Figure
-
-    from .. import integrate
-
-    n = 50
-    term = LieTerm(field)
 
     def solve(duration: Any) -> Any:
-        start = y0(num_spins)
-        return integrate(term, solver, 0.0, duration, start, duration, num_steps=n, save_every=1)
+        arguments: Any = problem(num_spins) | dict(t1=duration, args=duration)
+        return cfjax.integrate(**arguments, solver=solver, num_steps=50, save_every=1)
 
     durations = np.geomspace(1.0, 100.0, 25)
     ends = jax.lax.map(lambda duration: solve(duration).ys[-1], jnp.asarray(durations))
-    found = solve(jnp.asarray(t1))
-    times, ys = np.asarray(found.ts), np.asarray(found.ys)
+    sol = solve(jnp.asarray(t1))
+    times, ys = np.asarray(sol.ts), np.asarray(sol.ys)
     eye = jnp.eye(2**num_spins, dtype=complex)
     # One after the other, in one program.
     h, energies = jax.lax.map(
-        lambda pair: (1j * tangent(field(pair[0], eye[0]), eye), energy(*pair)),
+        lambda pair: (1j * cfjax.tangent(field(pair[0], eye[0]), eye), energy(*pair)),
         (jnp.asarray(times), jnp.asarray(ys)),
     )
     lowest = np.linalg.eigvalsh(h)[:, :12]
 
-    figure = Figure((10.5, 3.4), layout="constrained")
+    figure = figures.new(10.5, 3.4)
     levels, spins, slow = figure.subplots(1, 3)
     levels.plot(times, np.asarray(lowest), color="0.75", linewidth=1)
-    levels.plot(times, energies, color="#D55E00", label="the state")
+    levels.plot(times, energies, color=figures.VERMILION, label="the state")
     levels.set(title="Lowest levels, and the energy", xlabel="t", ylabel="energy")
     levels.legend(frameon=False)
     up = 1 - (np.arange(2**num_spins)[:, None] >> np.arange(num_spins)[::-1] & 1)
     means = 2 * (np.abs(ys) ** 2) @ up - 1
-    image = spins.imshow(
-        means.T,
-        aspect="auto",
-        extent=(times[0], times[-1], num_spins + 0.5, 0.5),
-        cmap="RdBu_r",
-        vmin=-1,
-        vmax=1,
-    )
+    box = (times[0], times[-1], num_spins + 0.5, 0.5)
+    image = spins.imshow(means.T, aspect="auto", extent=box, cmap="RdBu_r", vmin=-1, vmax=1)
     figure.colorbar(image, ax=spins)
     spins.set(title="Mean of each Z", xlabel="t", ylabel="spin")
-    slow.semilogx(durations, np.asarray(fidelity(ends)), "o-", markersize=3, color="#0072B2")
+    slow.semilogx(durations, np.asarray(fidelity(ends)), "o-", markersize=3, color=figures.BLUE)
     slow.set(title="Fidelity at the end", xlabel="duration of the ramp", ylim=(0, 1.02))
     return figure
 

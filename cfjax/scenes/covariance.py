@@ -27,7 +27,7 @@ Source: Kalman & Bucy, New results in linear filtering and prediction theory, J.
 (1961), doi:10.1115/1.3658902.
 """
 
-from typing import TYPE_CHECKING, Any, NamedTuple
+from typing import Any, NamedTuple
 
 import diffrax
 import jax
@@ -35,14 +35,14 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
-from .. import CF3, CF4, Congruence, LieTerm, WorkPrecision, integrate, work_precision
+import cfjax
 
-if TYPE_CHECKING:
-    from matplotlib.figure import Figure
+from . import _figures as figures
+from ._scene import by_name, in_plain_space
 
 t0, t1 = 0.0, 5.0
 # Adaptive steps too: CF54 does not keep covariances positive.
-solver = CF4()
+solver = cfjax.CF4()
 
 Covariance = Float[Array | np.ndarray, "4 4"]
 
@@ -68,10 +68,10 @@ def y0(deviation: float = 0.5) -> Float[np.ndarray, "4 4"]:
     return np.diag([deviation**2, deviation**2, 0.01, 0.01])
 
 
-def field(t: Any, y: Covariance, args: Track) -> Congruence:
+def field(t: Any, y: Covariance, args: Track) -> cfjax.Congruence:
     """The frozen field. At times `args.lost` and `args.found` it jumps: give these as `jump_ts`."""
     a, q, s = _coefficients(t, y, args)
-    return Congruence(a - y @ s / 2, q)
+    return cfjax.Congruence(a - y @ s / 2, q)
 
 
 def velocity(t: Any, y: Covariance, args: Track) -> Float[Array, "4 4"]:
@@ -103,7 +103,7 @@ def reference(
     )
     q = np.diag([0.0, 0.0, args.noise, args.noise])
     s = np.diag([1 / args.range, 1 / args.bearing, 0.0, 0.0])
-    found, now, p = {}, t0, np.asarray(start)
+    covariances, now, p = {}, t0, np.asarray(start)
     jumps = np.clip([args.lost, args.found], t0, np.max(times))
     for then in np.unique([*times.flat, *jumps]):
         sees = not args.lost <= now < args.found
@@ -115,13 +115,13 @@ def reference(
             p = np.linalg.solve(x.T, y.T)
             p = (p + p.T) / 2
         turn = expm(spin * then)
-        now, found[then] = then, turn @ p @ turn.T
-    return np.stack([found[t] for t in times.flat]).reshape(*times.shape, 4, 4)
+        now, covariances[then] = then, turn @ p @ turn.T
+    return np.stack([covariances[t] for t in times.flat]).reshape(*times.shape, 4, 4)
 
 
 def problem() -> dict[str, Any]:
     """What is solved, as arguments of `cfjax.integrate` and `cfjax.work_precision`."""
-    return dict(term=LieTerm(field), t0=t0, t1=t1, y0=y0(1.0), args=Track())
+    return dict(term=cfjax.LieTerm(field), t0=t0, t1=t1, y0=y0(1.0), args=Track())
 
 
 def invariants(y: Covariance, args: Any = None) -> dict[str, Array]:
@@ -132,66 +132,56 @@ def invariants(y: Covariance, args: Any = None) -> dict[str, Array]:
     }
 
 
-def chart(**options: Any) -> WorkPrecision:
+def chart(**options: Any) -> cfjax.WorkPrecision:
     """A ship comes in sight, 20 to 1280 equal steps; Tsit5, Dopri5 and RK4 in plain space."""
-    space = diffrax.ODETerm(velocity)
-    given = problem()
-    return work_precision(
-        **given,
-        methods={
-            "CF3": CF3(),
-            "CF4": CF4(),
-            # On arrays CF4 is the classical method of order 4.
-            "RK4": (LieTerm(velocity), CF4()),
-            "Tsit5": (space, diffrax.Tsit5()),
-            "Dopri5": (space, diffrax.Dopri5()),
-        },
-        reference=reference(t1, given["y0"], given["args"]),
+    # On arrays CF4 is the classical method of order 4.
+    rk4 = cfjax.LieTerm(velocity), cfjax.CF4()
+    return cfjax.work_precision(
+        **problem(),
+        methods=by_name(cfjax.CF3(), cfjax.CF4())
+        | {"RK4": rk4}
+        | in_plain_space(velocity, diffrax.Tsit5(), diffrax.Dopri5()),
+        reference=reference(t1, y0(1.0), Track()),
         num_steps=[20 * 2**k for k in range(7)],
         **options,
     )
 
 
-def picture() -> "Figure":
+def picture() -> figures.Figure:
     """Once around the radar, to t = 60: what is known of the position; the smallest eigenvalue."""
-    from matplotlib.figure import Figure
     from matplotlib.patches import Ellipse, Wedge
 
     args, end, radius = Track(), 60.0, 10.0
     methods = {
-        "RK4 in plain space": (LieTerm(velocity), CF4(), dict(color="#D55E00")),
-        "Tsit5 in plain space": (
-            diffrax.ODETerm(velocity),
-            diffrax.Tsit5(),
-            dict(color="#009E73", linestyle="--"),
-        ),
-        "CF4": (LieTerm(field), CF4(), dict(color="#0072B2")),
+        "RK4 in plain space": (cfjax.LieTerm(velocity), cfjax.CF4()),
+        "Tsit5 in plain space": (diffrax.ODETerm(velocity), diffrax.Tsit5()),
+        "CF4": (cfjax.LieTerm(field), cfjax.CF4()),
     }
+    colours, lines = (figures.VERMILION, figures.GREEN, figures.BLUE), ("-", "--", "-")
     # The jumps are ends of steps: three pieces of one length, each with or without the island.
     pieces = [(t0, args.lost, False), (args.lost, args.found, True), (args.found, end, False)]
     ts, ys = np.linspace(t0, end, 961), {}
-    for name, (term, solver, _) in methods.items():
+    options: Any = dict(num_steps=320, save_every=1, throw=False)
+    for name, (term, solver) in methods.items():
         y = [y0()[None]]
         for start, stop, is_hidden in pieces:
             here = args._replace(lost=-np.inf if is_hidden else np.inf, found=np.inf)
-            sol = integrate(
-                term, solver, start, stop, y[-1][-1], here, num_steps=320, save_every=1, throw=False
-            )
+            sol = cfjax.integrate(term, solver, start, stop, y[-1][-1], here, **options)
             y.append(np.asarray(sol.ys))
         ys[name] = np.concatenate(y)
 
-    figure = Figure((10.0, 4.6), layout="constrained")
+    figure = figures.new(10.0, 4.6)
     sea, curves = figure.subplots(1, 2, width_ratios=(1, 1.1))
-    lost, found = (np.degrees(args.rate * t) for t in (args.lost, args.found))
-    sea.add_patch(Wedge((0, 0), 20.0, lost, found, width=15.5, color="0.94"))
-    sea.add_patch(Wedge((0, 0), 4.5, lost, found, width=1.2, color="0.6"))
+    lost, seen = (np.degrees(args.rate * t) for t in (args.lost, args.found))
+    sea.add_patch(Wedge((0, 0), 20.0, lost, seen, width=15.5, color="0.94"))
+    sea.add_patch(Wedge((0, 0), 4.5, lost, seen, width=1.2, color="0.6"))
     for t, p in zip(ts[:-1:32], ys["CF4"][:-1:32], strict=True):
         place = radius * np.cos(args.rate * t), radius * np.sin(args.rate * t)
         squares, axes = np.linalg.eigh(p[:2, :2])
         angle = np.degrees(np.arctan2(axes[1, 1], axes[0, 1]))
         # Two standard deviations to either side.
         wide, long = 4 * np.sqrt(squares)
-        colour = "#E69F00" if args.lost < t <= args.found else "#0072B2"
+        colour = figures.ORANGE if args.lost < t <= args.found else figures.BLUE
         sea.add_patch(Ellipse(place, long, wide, angle=angle, color=colour, alpha=0.4, lw=0))
         sea.plot(*place, ".", color=colour, markersize=4)
     sea.plot(0, 0, "k^")
@@ -201,14 +191,14 @@ def picture() -> "Figure":
     sea.set(aspect="equal", xlim=(-13.5, 13.5), ylim=(-13.5, 13.5))
 
     curves.axvspan(args.lost, args.found, color="0.94")
-    curves.axhspan(-1, 0, color="#D55E00", alpha=0.12, linewidth=0)
+    curves.axhspan(-1, 0, color=figures.VERMILION, alpha=0.12, linewidth=0)
     curves.text(48.5, -0.0002, "no covariance", ha="right", va="top")
     curves.text(40.2, -0.0007, "RK4 and Tsit5, as soon as\nthe ship is seen again", va="center")
     near = np.linspace(34.0, 49.0, 301)
     exact = np.asarray(smallest(reference(near, y0(), args)))
     curves.plot(near, exact, color="0.7", linewidth=5, label="exact")
-    for name, (_, _, style) in methods.items():
-        curves.plot(ts, np.asarray(smallest(ys[name])), label=name, **style)
+    for (name, y), colour, line in zip(ys.items(), colours, lines, strict=True):
+        curves.plot(ts, np.asarray(smallest(y)), line, color=colour, label=name)
     curves.set(title="Smallest eigenvalue, steps of 1/16", xlabel="t")
     curves.set(xlim=(34.0, 49.0), ylim=(-0.001, 0.0025))
     curves.legend(frameon=False, loc="center right")

@@ -22,34 +22,20 @@ doi:10.1126/science.261.5118.189, for the diffusivities and the distance of the 
 took 256 x 256.
 """
 
-from typing import TYPE_CHECKING, Any, NamedTuple
+from typing import Any, NamedTuple
 
 import diffrax
-import jax
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
-from .. import (
-    CF4,
-    ETD43,
-    ETD54,
-    Affine,
-    FourierTransform,
-    LieTerm,
-    RealFourierTransform,
-    TensorTransform,
-    WorkPrecision,
-    integrate,
-    tangent,
-    work_precision,
-)
+import cfjax
 
-if TYPE_CHECKING:
-    from matplotlib.figure import Figure
+from . import _figures as figures
+from ._scene import by_dop853, by_name, in_plain_space, solve
 
 t0, t1 = 0.0, 100.0
-solver = ETD54()
+solver = cfjax.ETD54()
 
 # Of u and v, with the keys "u" and "v".
 State = dict[str, Float[Array | np.ndarray, "n n"]]
@@ -73,15 +59,15 @@ def y0(n: int = 64) -> dict[str, Float[np.ndarray, "n n"]]:
     return {"u": 1 - spots / 2, "v": spots / 4}
 
 
-def field(t: Any, y: State, args: Reactor) -> dict[str, Affine]:
+def field(t: Any, y: State, args: Reactor) -> dict[str, cfjax.Affine]:
     """The frozen fields of u and v."""
     n = len(y["u"])
-    transform = TensorTransform((FourierTransform(), RealFourierTransform(n)))
+    transform = cfjax.TensorTransform((cfjax.FourierTransform(), cfjax.RealFourierTransform(n)))
     k = np.fft.fftfreq(n, 1 / n), np.arange(n // 2 + 1.0)
     turns = jnp.asarray(np.add.outer(k[0] ** 2, k[1] ** 2), y["u"].dtype)
     laplacian = -((2 * np.pi / args.side) ** 2) * turns
     return {
-        name: Affine(1.0, rate, diffusivity * laplacian, transform)
+        name: cfjax.Affine(1.0, rate, diffusivity * laplacian, transform)
         for (name, rate), diffusivity in zip(
             reaction(y, args).items(), args.diffusivities, strict=True
         )
@@ -97,7 +83,7 @@ def reaction(y: Any, args: Reactor) -> dict[str, Any]:
 
 def velocity(t: Any, y: State, args: Reactor) -> dict[str, Float[Array, "n n"]]:
     """The same field in plain space, where diffusion limits the steps."""
-    return tangent(field(t, y, args), y)
+    return cfjax.tangent(field(t, y, args), y)
 
 
 def reference(
@@ -108,30 +94,28 @@ def reference(
     It solves the same system for the points, so its error is that of time alone: about 1e-13 in
     each value of the default start at 100. With n = 128 values differ by 4e-5.
     """
-    from scipy.integrate import solve_ivp
-
     shape = start["u"].shape
     k = 2 * np.pi / args.side * np.fft.fftfreq(shape[0], 1 / shape[0])
     laplacian = -np.add.outer(k**2, k[: shape[0] // 2 + 1] ** 2)
 
-    def rate(t: float, flat: np.ndarray) -> np.ndarray:
-        u, v = flat.reshape(2, *shape)
-        spread = [
+    def rate(t: float, y: dict[str, np.ndarray]) -> dict[str, np.ndarray]:
+        u, v = y["u"], y["v"]
+        u_spread, v_spread = (
             d * np.fft.irfft2(laplacian * np.fft.rfft2(x), shape)
             for d, x in zip(args.diffusivities, (u, v), strict=True)
-        ]
-        made = u * v**2
-        u_rate = spread[0] - made + args.feed * (1 - u)
-        return np.ravel([u_rate, spread[1] + made - (args.feed + args.kill) * v])
+        )
+        conversion = u * v**2
+        return {
+            "u": u_spread - conversion + args.feed * (1 - u),
+            "v": v_spread + conversion - (args.feed + args.kill) * v,
+        }
 
-    flat = np.ravel([start["u"], start["v"]])
-    found = solve_ivp(rate, (0.0, t), flat, "DOP853", rtol=1e-13, atol=1e-13)
-    return dict(zip("uv", found.y[:, -1].reshape(2, *shape), strict=True))
+    return by_dop853(rate, start, t)
 
 
 def problem() -> dict[str, Any]:
     """What is solved, as arguments of `cfjax.integrate` and `cfjax.work_precision`."""
-    return dict(term=LieTerm(field), t0=t0, t1=t1, y0=y0(), args=Reactor())
+    return dict(term=cfjax.LieTerm(field), t0=t0, t1=t1, y0=y0(), args=Reactor())
 
 
 def invariants(y: State, args: Any = None) -> dict[str, Array]:
@@ -139,38 +123,29 @@ def invariants(y: State, args: Any = None) -> dict[str, Array]:
     return {"lowest u (stays positive)": jnp.min(jnp.asarray(y["u"]))}
 
 
-def chart(**options: Any) -> WorkPrecision:
+def chart(**options: Any) -> cfjax.WorkPrecision:
     """Gray and Scott's reaction, 64 x 64 points, to t = 100, 10 to 320 equal steps."""
-    given = problem()
-    return work_precision(
-        **given,
-        methods={
-            "CF4": CF4(),
-            "ETD43": ETD43(),
-            "ETD54": ETD54(),
-            "Tsit5": (diffrax.ODETerm(velocity), diffrax.Tsit5()),
-        },
-        reference=reference(t1, given["y0"], given["args"]),
+    return cfjax.work_precision(
+        **problem(),
+        methods=by_name(cfjax.CF4(), cfjax.ETD43(), cfjax.ETD54())
+        | in_plain_space(velocity, diffrax.Tsit5()),
+        reference=reference(t1, y0(), Reactor()),
         num_steps=[10 * 2**k for k in range(6)],
         **options,
     )
 
 
-def picture(n: int = 64) -> "Figure":
+def picture(n: int = 64) -> figures.Figure:
     """The substance v at six times, to t = 6000."""
-    from matplotlib.figure import Figure
-
-    start = jax.tree.map(jnp.asarray, y0(n))
-    options: Any = dict(num_steps=600, save_every=50)
-    ys: Any = integrate(LieTerm(field), solver, 0.0, 6000.0, start, Reactor(), **options).ys
+    steps = dict(num_steps=600, save_every=50, save_initial=True)
+    _, ys = solve(problem(), solver, t1=6000.0, y0=y0(n), **steps)
     times = (0, 500, 1000, 1500, 2500, 6000)
-    figure = Figure((12.0, 2.2), layout="constrained")
+    figure = figures.new(12.0, 2.2)
     side = Reactor().side
     axes = figure.subplots(1, len(times))
     for ax, t in zip(axes, times, strict=True):
-        v = start["v"] if t == 0 else ys["v"][t // 500 - 1]
-        options = dict(origin="lower", extent=(0, side, 0, side), cmap="magma")
-        ax.imshow(np.asarray(v).T, vmin=0, vmax=0.4, **options)
+        options: Any = dict(origin="lower", extent=(0, side, 0, side), cmap="magma")
+        ax.imshow(ys["v"][t // 500].T, vmin=0, vmax=0.4, **options)
         ax.set(xticks=[], yticks=[], title=f"t = {t}")
     figure.colorbar(axes[0].images[0], ax=axes, label="v")
     return figure

@@ -10,7 +10,7 @@ Source: Celledoni, Marthinsen & Owren, Commutator-free Lie group methods, FGCS 1
 Section 3.3, doi:10.1016/S0167-739X(02)00161-9.
 """
 
-from typing import TYPE_CHECKING, Any, NamedTuple
+from typing import Any, NamedTuple
 
 import diffrax
 import jax
@@ -18,28 +18,15 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
-from .. import (
-    CF4,
-    CF43,
-    RKMK4,
-    Affine,
-    LieTerm,
-    Richardson,
-    SineTransform,
-    WorkPrecision,
-    integrate,
-    work_precision,
-)
+import cfjax
 
-if TYPE_CHECKING:
-    from matplotlib.figure import Figure
+from . import _figures as figures
+from ._scene import in_plain_space, solve
 
 t0, t1 = 0.0, 0.5
 # Not ETD54: a third of the largest diffusivity is outside of the exact part, as in the paper, and
 # ETD54 then blows up with fewer than 400 steps.
-solver = CF4()
-
-_COLOURS = "#D55E00", "#E69F00", "#009E73", "#0072B2"
+solver = cfjax.CF4()
 
 
 class Diffusivity(NamedTuple):
@@ -63,14 +50,14 @@ def y0(num_intervals: int = 100) -> Float[np.ndarray, " n"]:
     return np.asarray(dst(1 - np.abs(_points(num_intervals)), type=1, norm="ortho"))
 
 
-def field(t: Any, y: Float[Array, " n"], args: Diffusivity) -> Affine:
+def field(t: Any, y: Float[Array, " n"], args: Diffusivity) -> cfjax.Affine:
     """The frozen field at sine coefficients `y`. Costs two sine transforms."""
     n = len(y)
     k = np.arange(1, n + 1)
     second_difference = -(((n + 1) * np.sin(k * np.pi / (2 * (n + 1)))) ** 2)
     mu, constant = jnp.asarray(args.mu), jnp.asarray(args.constant)
     b = _operator(mu - constant, to_grid(y))
-    return Affine(1.0, from_grid(b), constant * jnp.asarray(second_difference, y.dtype))
+    return cfjax.Affine(1.0, from_grid(b), constant * jnp.asarray(second_difference, y.dtype))
 
 
 def grid_field(t: Any, u: Float[Array, " n"], args: Diffusivity) -> Float[Array, " n"]:
@@ -83,12 +70,12 @@ def grid_field(t: Any, u: Float[Array, " n"], args: Diffusivity) -> Float[Array,
 
 def to_grid(y: Float[Array, " n"]) -> Float[Array, " n"]:
     """The grid values of sine coefficients."""
-    return SineTransform().inverse(y)
+    return cfjax.SineTransform().inverse(y)
 
 
 def from_grid(u: Float[Array, " n"]) -> Float[Array, " n"]:
     """The sine coefficients of grid values."""
-    return SineTransform().forward(u)
+    return cfjax.SineTransform().forward(u)
 
 
 def reference(
@@ -109,7 +96,7 @@ def reference(
 
 def problem() -> dict[str, Any]:
     """What is solved, as arguments of `cfjax.integrate` and `cfjax.work_precision`."""
-    return dict(term=LieTerm(field), t0=t0, t1=t1, y0=y0(), args=diffusivity())
+    return dict(term=cfjax.LieTerm(field), t0=t0, t1=t1, y0=y0(), args=diffusivity())
 
 
 def invariants(y: Float[Array, " n"], args: Any = None) -> dict[str, Array]:
@@ -122,34 +109,30 @@ def invariants(y: Float[Array, " n"], args: Any = None) -> dict[str, Array]:
     }
 
 
-def chart(**options: Any) -> WorkPrecision:
+def chart(**options: Any) -> cfjax.WorkPrecision:
     """Heat conduction, N = 100, tolerances 1e-2 to 1e-7. CF4, RKMK4 and RK4 double steps."""
-    given = problem()
 
     def velocity(t, y, args):
         return from_grid(grid_field(t, to_grid(y), args))
 
-    return work_precision(
-        **given,
+    return cfjax.work_precision(
+        **problem(),
         methods={
-            "CF4": Richardson(CF4()),
-            "CF43": CF43(),
-            "RKMK4": Richardson(RKMK4()),
+            "CF4": cfjax.Richardson(cfjax.CF4()),
+            "CF43": cfjax.CF43(),
+            "RKMK4": cfjax.Richardson(cfjax.RKMK4()),
             # On translations CF4 is the classical Runge-Kutta method.
-            "RK4": (LieTerm(velocity), Richardson(CF4())),
-            "Tsit5": (diffrax.ODETerm(velocity), diffrax.Tsit5()),
-            "Kvaerno5": (diffrax.ODETerm(velocity), diffrax.Kvaerno5()),
-        },
-        reference=np.asarray(from_grid(jnp.asarray(reference(t1, given["args"].mu)))),
+            "RK4": (cfjax.LieTerm(velocity), cfjax.Richardson(cfjax.CF4())),
+        }
+        | in_plain_space(velocity, diffrax.Tsit5(), diffrax.Kvaerno5()),
+        reference=np.asarray(from_grid(jnp.asarray(reference(t1, np.asarray(diffusivity().mu))))),
         tolerances=[10.0**-k for k in range(2, 8)],
         **options,
     )
 
 
-def picture(num_intervals: int = 100) -> "Figure":
+def picture(num_intervals: int = 100) -> figures.Figure:
     """The temperature as it falls, and the errors of CF4 and of RKMK4, which is not stable here."""
-    from matplotlib.figure import Figure
-
     n, args = 200, diffusivity(num_intervals)
     points = np.concatenate([[-1.0], _points(num_intervals), [1.0]])
 
@@ -157,38 +140,29 @@ def picture(num_intervals: int = 100) -> "Figure":
         u = np.asarray(jax.vmap(to_grid)(jnp.asarray(ys)))
         return np.pad(u, ((0, 0), (1, 1)))
 
-    found = {
-        name: integrate(
-            LieTerm(field),
-            solver,
-            t0,
-            t1,
-            y0(num_intervals),
-            args,
-            num_steps=n,
-            save_every=1,
-            throw=False,
-        )
-        for name, solver in {"CF4": CF4(), "RKMK4": RKMK4()}.items()
-    }
-    times, ys = np.asarray(found["CF4"].ts), temperatures(found["CF4"].ys)
+    us, steps = {}, dict(num_steps=n, save_every=1, throw=False)
+    for method in cfjax.CF4(), cfjax.RKMK4():
+        times, ys = solve(problem(), method, y0=y0(num_intervals), args=args, **steps)
+        us[type(method).__name__] = temperatures(ys)
+    times = t1 * np.arange(1, n + 1) / n
     start = temperatures(y0(num_intervals)[None])
-    figure = Figure((10.0, 3.6), layout="constrained")
+    figure = figures.new(10.0, 3.6)
     curves, image, errors = figure.subplots(1, 3)
     curves.plot(points, start[0], color="0.6", linestyle=":", label="t = 0")
-    for t, colour in zip((0.025, 0.1, 0.25, 0.5), _COLOURS, strict=True):
+    colours = figures.VERMILION, figures.ORANGE, figures.GREEN, figures.BLUE
+    for t, colour in zip((0.025, 0.1, 0.25, 0.5), colours, strict=True):
         k = round(n * t / t1) - 1
-        curves.plot(points, ys[k], color=colour, label=f"t = {times[k]:g}")
+        curves.plot(points, us["CF4"][k], color=colour, label=f"t = {times[k]:g}")
     curves.set(title="Temperature", xlabel="x")
     curves.legend(frameon=False)
     box = (-1.0, 1.0, t1, t0)
-    rows = np.concatenate([start, ys])
+    rows = np.concatenate([start, us["CF4"]])
     shown = image.imshow(rows, extent=box, aspect="auto", cmap="inferno", vmin=0, vmax=1)
     figure.colorbar(shown, ax=image)
     image.set(title="Temperature", xlabel="x", ylabel="t")
     exact = reference(times, np.asarray(args.mu))
-    for name, colour in (("CF4", "#0072B2"), ("RKMK4", "#D55E00")):
-        off = np.abs(temperatures(found[name].ys)[:, 1:-1] - exact).max(axis=1)
+    for (name, u), colour in zip(us.items(), (figures.BLUE, figures.VERMILION), strict=True):
+        off = np.abs(u[:, 1:-1] - exact).max(axis=1)
         errors.semilogy(times, np.where(off < 1, off, np.nan), color=colour, label=name)
     errors.set(title=f"Error, steps of {t1 / n:g}", xlabel="t")
     errors.legend(frameon=False)

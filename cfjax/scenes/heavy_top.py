@@ -18,35 +18,21 @@ Source: Brüls & Cardona, On the use of Lie group time integrators in multibody 
 Nonlinear Dyn. 5 (2010), doi:10.1115/1.4001370.
 """
 
-from typing import TYPE_CHECKING, Any, NamedTuple
+from typing import Any, NamedTuple
 
 import diffrax
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
-from .. import (
-    CF3,
-    CF4,
-    CF43,
-    CF54,
-    RKMK4,
-    RKMK8,
-    LieTerm,
-    RigidMotion,
-    WorkPrecision,
-    integrate,
-    quaternion_rotate,
-    quaternion_to_matrix,
-    work_precision,
-)
+import cfjax
 
-if TYPE_CHECKING:
-    from matplotlib.figure import Figure
+from . import _figures as figures
+from ._scene import by_dop853, by_name, in_plain_space, solve
 
 t0, t1 = 0.0, 2.0
 # Over long times a splitting, see the page on them.
-solver = RKMK8()
+solver = cfjax.RKMK8()
 
 # `pose`, shape `(*times, 7)`, and `m`, shape `(*times, 3)`.
 State = dict[str, Float[Array | np.ndarray, "..."]]
@@ -93,7 +79,7 @@ def field(t: Any, y: State, args: Top) -> dict[str, Any]:
     omega = angular_velocity(y, args)
     v = jnp.cross(omega, jnp.asarray(args.center, q.dtype))
     return {
-        "pose": RigidMotion(omega=omega, v=v, frame="body", layout="wxyz_xyz"),
+        "pose": cfjax.RigidMotion(omega=omega, v=v, frame="body", layout="wxyz_xyz"),
         "m": jnp.cross(x, _weight(args, q.dtype)),
     }
 
@@ -115,7 +101,7 @@ def velocity(t: Any, y: State, args: Top) -> dict[str, Any]:
 def angular_velocity(y: State, args: Top) -> Float[Array, "*times 3"]:
     """The angular velocity omega, in the body."""
     q = y["pose"][..., :4]
-    momentum = quaternion_rotate(_conjugate(q), y["m"], layout="wxyz")
+    momentum = cfjax.quaternion_rotate(_conjugate(q), y["m"], layout="wxyz")
     return momentum / jnp.broadcast_to(jnp.asarray(args.inertia, q.dtype), momentum.shape)
 
 
@@ -136,7 +122,7 @@ def pivot(y: State, args: Top) -> Float[Array | np.ndarray, "*times 3"]:
     """Where the pose puts the point of the body that should stay at zero."""
     q, x = y["pose"][..., :4], y["pose"][..., 4:]
     center = jnp.broadcast_to(jnp.asarray(args.center, q.dtype), x.shape)
-    return x - quaternion_rotate(q, center, layout="wxyz")
+    return x - cfjax.quaternion_rotate(q, center, layout="wxyz")
 
 
 def reference(t: float, start: State | None = None, args: Top = benchmark) -> State:
@@ -145,23 +131,22 @@ def reference(t: float, start: State | None = None, args: Top = benchmark) -> St
     The reference uses the momentum in the body's frame, where `m' = cross(m, omega) + torque`, and
     takes the centre of mass from the attitude. The error for the benchmark is about 2e-12.
     """
-    from scipy.integrate import solve_ivp
-
     start = y0() if start is None else start
     inertia, center = np.asarray(args.inertia), np.asarray(args.center)
     weight = np.array([0.0, 0.0, -args.mass * args.gravity])
 
-    def rate(t: float, y: np.ndarray) -> np.ndarray:
-        q, m = y[:4], y[4:]
+    def rate(t: float, y: State) -> State:
+        q, m = y["q"], y["m"]
         omega = m / inertia
         torque = np.cross(center, _rotate_np(_conjugate(q), weight))
         vector = q[0] * omega + np.cross(q[1:], omega)
-        return np.concatenate([[-(q[1:] @ omega) / 2], vector / 2, np.cross(m, omega) + torque])
+        scalar = -(q[1:] @ omega)
+        return {"q": np.append(scalar, vector) / 2, "m": np.cross(m, omega) + torque}
 
     q = np.asarray(start["pose"])[:4]
-    flat = np.concatenate([q, _rotate_np(_conjugate(q), np.asarray(start["m"]))])
-    found = solve_ivp(rate, (0.0, t), flat, "DOP853", rtol=1e-13, atol=1e-13).y[:, -1]
-    q, m = found[:4] / np.linalg.norm(found[:4]), found[4:]
+    m = _rotate_np(_conjugate(q), np.asarray(start["m"]))
+    end = by_dop853(rate, {"q": q, "m": m}, t)
+    q, m = end["q"] / np.linalg.norm(end["q"]), end["m"]
     return {"pose": np.concatenate([q, _rotate_np(q, center)]), "m": _rotate_np(q, m)}
 
 
@@ -179,7 +164,7 @@ def error(y: State, exact: State) -> float:
 
 def problem() -> dict[str, Any]:
     """What is solved, as arguments of `cfjax.integrate` and `cfjax.work_precision`."""
-    return dict(term=LieTerm(field), t0=t0, t1=t1, y0=y0(), args=benchmark)
+    return dict(term=cfjax.LieTerm(field), t0=t0, t1=t1, y0=y0(), args=benchmark)
 
 
 def invariants(y: State, args: Any = None) -> dict[str, Array]:
@@ -192,21 +177,14 @@ def invariants(y: State, args: Any = None) -> dict[str, Array]:
     }
 
 
-def chart(**options: Any) -> WorkPrecision:
+def chart(**options: Any) -> cfjax.WorkPrecision:
     """The heavy top to t = 2, 125 to 8000 equal steps; Tsit5 and Dopri8 in plain space."""
-    space = diffrax.ODETerm(velocity)
-    return work_precision(
+    return cfjax.work_precision(
         **problem(),
-        methods={
-            "CF3": CF3(),
-            "CF4": CF4(),
-            "RKMK4": RKMK4(),
-            "CF43": CF43(),
-            "CF54": CF54(),
-            "RKMK8": RKMK8(),
-            "Tsit5": (space, diffrax.Tsit5()),
-            "Dopri8": (space, diffrax.Dopri8()),
-        },
+        methods=by_name(
+            cfjax.CF3(), cfjax.CF4(), cfjax.RKMK4(), cfjax.CF43(), cfjax.CF54(), cfjax.RKMK8()
+        )
+        | in_plain_space(velocity, diffrax.Tsit5(), diffrax.Dopri8()),
         reference=reference(t1),
         error=error,
         num_steps=[125 * 2**k for k in range(7)],
@@ -214,16 +192,14 @@ def chart(**options: Any) -> WorkPrecision:
     )
 
 
-def picture() -> "Figure":
+def picture() -> figures.Figure:
     """Three tops to t = 5.6, and the paths of their axes on the sphere, from dark to bright.
 
     The path of an axis that starts backwards has loops, from rest it has cusps, and forwards it is
     a wave.
     """
-    from matplotlib.figure import Figure
     from mpl_toolkits.mplot3d.art3d import Line3DCollection, Poly3DCollection
 
-    term = LieTerm(field)
     starts = {"Started backwards": -1.2, "From rest": 0.0, "Started forwards": 0.8}
     longitude, latitude = np.mgrid[0 : 2 * np.pi : 37j, 0 : np.pi / 2 : 10j]
     ring = np.sin(latitude)
@@ -236,16 +212,15 @@ def picture() -> "Figure":
     sector = np.arange(48) // 8 % 2
     parts = (
         (cone, np.where(sector, "#A34800", "#C2B41F")),
-        (base, np.where(sector, "#D55E00", "#F0E442")),
+        (base, np.where(sector, figures.VERMILION, "#F0E442")),
     )
 
-    figure = Figure((10.5, 3.6), layout="constrained")
+    figure = figures.new(10.5, 3.6)
     for k, (title, precession) in enumerate(starts.items(), 1):
-        start = y0(1.0, 320.0, precession)
-        found = integrate(term, solver, 0.0, 5.6, start, benchmark, num_steps=5600, save_every=10)
-        poses = np.asarray(found.ys["pose"])  # type: ignore
+        start, steps = y0(1.0, 320.0, precession), dict(num_steps=5600, save_every=10)
+        poses = solve(problem(), solver, t1=5.6, y0=start, **steps)[1]["pose"]
         path, end = poses[:, 4:], poses[-1, 4:]
-        rotation = np.asarray(quaternion_to_matrix(poses[-1, :4], layout="wxyz"))
+        rotation = np.asarray(cfjax.quaternion_to_matrix(poses[-1, :4], layout="wxyz"))
         ax: Any = figure.add_subplot(1, 3, k, projection="3d", computed_zorder=False)
         ax.plot_wireframe(*dome, color="0.88", linewidth=0.5, zorder=0)
         for part, colours in parts:

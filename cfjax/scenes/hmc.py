@@ -19,7 +19,7 @@ Phys. Rev. D 38 (1988), doi:10.1103/PhysRevD.38.1228.
 
 import functools
 from itertools import accumulate
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import diffrax
 import jax
@@ -28,24 +28,12 @@ import numpy as np
 from jax import lax
 from jaxtyping import Array, Complex, Float, Key
 
-from .. import (
-    CF4,
-    BlanesMoan4,
-    BlanesMoan6,
-    LeftMatrix,
-    LieTerm,
-    Splitting,
-    Strang,
-    WorkPrecision,
-    integrate,
-    work_precision,
-)
+import cfjax
 
-if TYPE_CHECKING:
-    from matplotlib.figure import Figure
+from . import _figures as figures
 
 t0, t1 = 0.0, 1.0
-solver = BlanesMoan4()
+solver = cfjax.BlanesMoan4()
 
 Links = Complex[Array | np.ndarray, "chains 2 rows columns n n"]
 State = dict[str, Links]
@@ -64,11 +52,11 @@ _L = 0.1931833275037836
 # doi:10.1016/S0010-4655(02)00754-3; Blanes & Moan, J. Comput. Appl. Math. 142 (2002),
 # doi:10.1016/S0377-0427(01)00492-7. SRKN11b has order 6 where H is quadratic in the momenta.
 METHODS: dict[str, tuple[Any, int]] = {
-    "Strang": (Strang(), 1),
-    "Omelyan": (Splitting((_L, 0.5 - _L, 0.5 - _L, _L)), 2),
-    "BlanesMoan4": (BlanesMoan4(), 6),
-    "BlanesMoan6": (BlanesMoan6(), 10),
-    "SRKN11b": (Splitting((*_STAGES, *reversed(_STAGES))), 11),
+    "Strang": (cfjax.Strang(), 1),
+    "Omelyan": (cfjax.Splitting((_L, 0.5 - _L, 0.5 - _L, _L)), 2),
+    "BlanesMoan4": (cfjax.BlanesMoan4(), 6),
+    "BlanesMoan6": (cfjax.BlanesMoan6(), 10),
+    "SRKN11b": (cfjax.Splitting((*_STAGES, *reversed(_STAGES))), 11),
 }
 
 
@@ -113,10 +101,10 @@ def kick(t: Any, y: State, beta: Any) -> dict[str, Any]:
 
 def drift(t: Any, y: State, beta: Any) -> dict[str, Any]:
     """The links move with constant momenta."""
-    return {"U": LeftMatrix(y["P"]), "P": None}
+    return {"U": cfjax.LeftMatrix(y["P"]), "P": None}
 
 
-term = diffrax.MultiTerm(LieTerm(kick), LieTerm(drift))
+term = diffrax.MultiTerm(cfjax.LieTerm(kick), cfjax.LieTerm(drift))
 
 
 @functools.partial(jax.jit, static_argnums=(0, 1), static_argnames=("n",))
@@ -126,7 +114,7 @@ def y0(chains: int = 64, side: int = 4, *, beta: Any = 2.0, n: int = 2, seed: An
     first, second = jax.random.split(jax.random.key(seed))
     spread = momenta(first, shape)
     spread = spread / jnp.sqrt(jnp.asarray(beta, spread.dtype))
-    return {"U": LeftMatrix(spread).flow(_identity(spread)), "P": momenta(second, shape)}
+    return {"U": cfjax.LeftMatrix(spread).flow(_identity(spread)), "P": momenta(second, shape)}
 
 
 @functools.partial(jax.jit, static_argnums=(2, 3), static_argnames=("num_steps",))
@@ -149,7 +137,7 @@ def samples(
         first, second = jax.random.split(key)
         begin = {"U": links, "P": momenta(first, links.shape)}
         options: Any = dict(num_steps=num_steps, throw=False)
-        ys = integrate(term, solver, t0, t1, begin, beta, **options).ys
+        ys = cfjax.integrate(term, solver, t0, t1, begin, beta, **options).ys
         end: Any = jax.tree.map(lambda y: y[-1], ys)
         dh = energy(end, beta) - energy(begin, beta)
         is_accepted = jax.random.uniform(second, dh.shape) < jnp.exp(-dh)
@@ -201,21 +189,19 @@ def invariants(y: State, args: Any = 2.0) -> dict[str, Array]:
     }
 
 
-def chart(**options: Any) -> WorkPrecision:
+def chart(**options: Any) -> cfjax.WorkPrecision:
     """The root mean square of dH of 64 trajectories of 4 x 4 plaquettes of SU(2), beta 2."""
 
     def error(end: State, start: State) -> float:
         return float(jnp.sqrt(jnp.mean((energy(end, 2.0) - energy(start, 2.0)) ** 2)))
 
-    methods = {name: solver for name, (solver, _) in METHODS.items()} | {"CF4": CF4()}
-    given: Any = dict(methods=methods, reference=y0(), num_steps=[2**k for k in range(7)])
-    return work_precision(**problem(), error=error, **(given | options))
+    methods = {name: solver for name, (solver, _) in METHODS.items()} | {"CF4": cfjax.CF4()}
+    settings: Any = dict(methods=methods, reference=y0(), num_steps=[2**k for k in range(7)])
+    return cfjax.work_precision(**problem(), error=error, **(settings | options))
 
 
-def picture(num_trajectories: int = 150, most_steps: int = 64) -> "Figure":
+def picture(num_trajectories: int = 150, most_steps: int = 64) -> figures.Figure:
     """dH against its cost, with slopes 2, 4 and 6, and the plaquette on its exact curve."""
-    from matplotlib.figure import Figure
-
     num_steps = [2**k for k in range(most_steps.bit_length())]
     work = chart(num_steps=num_steps, repeats=1, progress=False)
     betas = np.array([0.5, 1.0, 2.0, 3.0, 4.0, 5.0, 6.0, 8.0])
@@ -223,14 +209,14 @@ def picture(num_trajectories: int = 150, most_steps: int = 64) -> "Figure":
     for k, beta in enumerate(betas):
         _, values, _ = samples(y0(beta=beta, seed=k)["U"], beta, num_trajectories, seed=k)
         means.append(estimate(np.asarray(values)[num_trajectories // 5 :]))
-    found, deviation = np.transpose(means)
+    mean, deviation = np.transpose(means)
 
-    figure = Figure((9.5, 3.9), layout="constrained")
+    figure = figures.new(9.5, 3.9)
     grid = figure.add_gridspec(2, 2, width_ratios=(1.15, 1), height_ratios=(2, 1))
     left, right = figure.add_subplot(grid[:, 0]), figure.add_subplot(grid[0, 1])
     below = figure.add_subplot(grid[1, 1], sharex=right)
 
-    colours = ("#E69F00", "#D55E00", "#56B4E9", "#0072B2", "#009E73")
+    colours = (figures.ORANGE, figures.VERMILION, "#56B4E9", figures.BLUE, figures.GREEN)
     for (name, (_, forces)), colour, mark in zip(METHODS.items(), colours, "os^vD", strict=True):
         is_this = np.array([method == name for method in work.method])
         error, cost = work.error[is_this], forces * work.num_steps[is_this]
@@ -247,13 +233,13 @@ def picture(num_trajectories: int = 150, most_steps: int = 64) -> "Figure":
 
     often = np.linspace(0.02, 8.6, 200)
     right.plot(often, reference(often), color="0.4", linewidth=1, label="exact")
-    right.plot(betas, found, "o", color="#0072B2", markersize=5, label="sampled")
+    right.plot(betas, mean, "o", color=figures.BLUE, markersize=5, label="sampled")
     right.set(ylabel="plaquette", title="Means of 64 chains, two standard errors", ylim=(0, 0.9))
     right.tick_params(labelbottom=False)
     right.legend(frameon=False)
     below.axhline(0, color="0.4", linewidth=1)
-    off, bars = found - reference(betas), 2 * deviation
-    below.errorbar(betas, 1e3 * off, 1e3 * bars, fmt="o", color="#0072B2", markersize=5)
+    off, bars = mean - reference(betas), 2 * deviation
+    below.errorbar(betas, 1e3 * off, 1e3 * bars, fmt="o", color=figures.BLUE, markersize=5)
     below.set(xlabel="$\\beta$", ylabel="off / $10^{-3}$")
     return figure
 

@@ -13,7 +13,7 @@ and Systems VIII (2012), doi:10.15607/RSS.2012.VIII.034.
 """
 
 import functools
-from typing import TYPE_CHECKING, Any, NamedTuple
+from typing import Any, NamedTuple
 
 import diffrax
 import jax
@@ -21,14 +21,13 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float, Key
 
-from .. import CF3, LieControlTerm, LieTerm, PlanarMotion, WeakOrder2, integrate
+import cfjax
 
-if TYPE_CHECKING:
-    from matplotlib.figure import Figure
+from . import _figures as figures
 
 t0, t1 = 0.0, 60.0
 # Order 3 is enough for fields that do not depend on the state.
-solver = WeakOrder2(CF3())
+solver = cfjax.WeakOrder2(cfjax.CF3())
 
 Pose = Float[Array | np.ndarray, "4"]
 
@@ -51,23 +50,25 @@ def y0() -> Float[np.ndarray, "4"]:
     return np.array([1.0, 0.0, 0.0, 0.0])
 
 
-def field(t: Any, y: Pose, args: Readings) -> PlanarMotion:
+def field(t: Any, y: Pose, args: Readings) -> cfjax.PlanarMotion:
     """The frozen field without noise: constant in the frame of the vehicle."""
     forwards = jnp.asarray([1.0, 0.0], y.dtype)
     turn = jnp.asarray(args.turn, y.dtype)
-    return PlanarMotion(omega=turn, v=args.speed * forwards, frame="body", layout="unit_complex_xy")
+    return cfjax.PlanarMotion(
+        omega=turn, v=args.speed * forwards, frame="body", layout="unit_complex_xy"
+    )
 
 
-def noise(t: Any, y: Pose, args: Readings, increment: Float[Array, "3"]) -> PlanarMotion:
+def noise(t: Any, y: Pose, args: Readings, increment: Float[Array, "3"]) -> cfjax.PlanarMotion:
     """The frozen field that an increment of Brownian motion causes."""
     turn, *v = jnp.asarray([args.turn_noise, args.speed_noise, args.slip], y.dtype) * increment
-    return PlanarMotion(omega=turn, v=jnp.stack(v), frame="body", layout="unit_complex_xy")
+    return cfjax.PlanarMotion(omega=turn, v=jnp.stack(v), frame="body", layout="unit_complex_xy")
 
 
 def term(key: Key[Array, ""]) -> diffrax.MultiTerm:
     """The motion with one sample of the noise."""
     path = diffrax.UnsafeBrownianPath((3,), key, levy_area=diffrax.SpaceTimeLevyArea)
-    return diffrax.MultiTerm(LieTerm(field), LieControlTerm(noise, path))
+    return diffrax.MultiTerm(cfjax.LieTerm(field), cfjax.LieControlTerm(noise, path))
 
 
 def samples(
@@ -114,9 +115,8 @@ def invariants(y: Pose, args: Any = None) -> dict[str, Array]:
     return {"cosine and sine": jnp.hypot(y[0], y[1])}
 
 
-def picture(num_samples: int = 4000) -> "Figure":
+def picture(num_samples: int = 4000) -> figures.Figure:
     """Where the vehicle may be after 20, 40 and 60 s; the end beside a Gaussian in x and y."""
-    from matplotlib.figure import Figure
     from matplotlib.patches import Ellipse
 
     args, n = Readings(), 60
@@ -126,9 +126,9 @@ def picture(num_samples: int = 4000) -> "Figure":
     still = args._replace(turn_noise=0.0, speed_noise=0.0, slip=0.0)
     path, means = (reference(np.append(t0, times), x)[:, 2:] for x in (still, args))
 
-    figure = Figure((10.5, 4.6), layout="constrained")
+    figure = figures.new(10.5, 4.6)
     ways, ends = figure.subplots(1, 2)
-    colours = {20: "#0072B2", 40: "#009E73", 60: "#D55E00"}
+    colours = {20: figures.BLUE, 40: figures.GREEN, 60: figures.VERMILION}
     ways.plot(*places[:40].T, color="0.8", linewidth=0.5, zorder=0)
     for k, colour in colours.items():
         for ax in (ways, ends) if k == n else (ways,):
@@ -145,7 +145,7 @@ def picture(num_samples: int = 4000) -> "Figure":
     angle = np.degrees(np.arctan2(axes[1, 1], axes[0, 1]))
     # Of a Gaussian in the plane 95 % is within sqrt(-2 log 0.05) standard deviations.
     short, long = 2 * np.sqrt(-2 * np.log(0.05) * squares)
-    style = dict(fill=False, color="#CC79A7", linewidth=1.5, label="Gaussian in x and y, 95 %")
+    style = dict(fill=False, color=figures.PURPLE, linewidth=1.5, label="Gaussian in x and y, 95 %")
     ends.add_patch(Ellipse(means[-1], long, short, angle=angle, **style))
     ways.set_title("Where the vehicle may be")
     ends.set_title("After 60 s")
@@ -181,4 +181,6 @@ def _mean(t: Any, matrices: list[np.ndarray]) -> np.ndarray:
 @functools.partial(jax.vmap, in_axes=(0, None, None))
 def _samples(key: Any, args: Readings, num_steps: int) -> Any:
     # Order 3 is enough for fields that do not depend on the state.
-    return integrate(term(key), solver, t0, t1, y0(), args, num_steps=num_steps, save_every=1).ys
+    return cfjax.integrate(
+        term(key), solver, t0, t1, y0(), args, num_steps=num_steps, save_every=1
+    ).ys

@@ -20,7 +20,7 @@ Source: Kassam & Trefethen, Fourth-order time-stepping for stiff PDEs, SIAM J. S
 (2005), doi:10.1137/S1064827502410633, for the start, the period and the number of points.
 """
 
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import diffrax
 import jax
@@ -29,25 +29,13 @@ import numpy as np
 from jax import lax
 from jaxtyping import Array, Complex, Float
 
-from .. import (
-    CF4,
-    CF43,
-    ETD43,
-    ETD54,
-    ETDRK4,
-    Affine,
-    LieTerm,
-    WorkPrecision,
-    integrate,
-    tangent,
-    work_precision,
-)
+import cfjax
 
-if TYPE_CHECKING:
-    from matplotlib.figure import Figure
+from . import _figures as figures
+from ._scene import by_dop853, by_name, in_plain_space, solve
 
 t0, t1 = 0.0, 30.0
-solver = ETD54()
+solver = cfjax.ETD54()
 
 Coefficients = Complex[Array | np.ndarray, " m"]
 
@@ -62,20 +50,20 @@ def y0(n: int = 128) -> Complex[np.ndarray, " m"]:
     return np.where(np.arange(len(c)) <= 2, c, 0)
 
 
-def field(t: Any, y: Coefficients, args: float | Float[Array | np.ndarray, ""]) -> Affine:
+def field(t: Any, y: Coefficients, args: float | Float[Array | np.ndarray, ""]) -> cfjax.Affine:
     """The frozen field, with the period as `args`. Costs two real FFTs of length n."""
     k = wave_numbers(y, args)
     square = jnp.fft.rfft(to_grid(y) ** 2, norm="forward")
     is_kept = 3 * np.arange(len(k)) < 2 * (len(k) - 1)
     half = jnp.where(is_kept, k / 2, 0)
-    return Affine(1.0, lax.complex(half * square.imag, -half * square.real), k**2 - k**4)
+    return cfjax.Affine(1.0, lax.complex(half * square.imag, -half * square.real), k**2 - k**4)
 
 
 def velocity(
     t: Any, y: Coefficients, args: float | Float[Array | np.ndarray, ""]
 ) -> Complex[Array, " m"]:
     """The same field in plain space, where the fourth derivative limits the steps."""
-    return tangent(field(t, y, args), y)
+    return cfjax.tangent(field(t, y, args), y)
 
 
 def wave_numbers(
@@ -103,8 +91,6 @@ def reference(
     It solves the same system for the points, so its error is that of time alone, below 1e-12 for
     the default start at 30. With n = 256 that solution differs by 1e-4.
     """
-    from scipy.integrate import solve_ivp
-
     n = 2 * (len(start) - 1)
     k = np.fft.fftfreq(n, 1 / n)
     wave = 2 * np.pi / period * k
@@ -113,14 +99,13 @@ def reference(
         advection = -0.5j * np.where(3 * np.abs(k) < n, wave, 0) * np.fft.fft(u**2)
         return np.fft.ifft((wave**2 - wave**4) * np.fft.fft(u) + advection).real
 
-    u = np.fft.irfft(start, n, norm="forward")
-    found = solve_ivp(rate, (0.0, t), u, "DOP853", rtol=1e-13, atol=1e-13).y[:, -1]
-    return np.fft.rfft(found, norm="forward")
+    u = by_dop853(rate, np.fft.irfft(start, n, norm="forward"), t)
+    return np.fft.rfft(u, norm="forward")
 
 
 def problem() -> dict[str, Any]:
     """What is solved, as arguments of `cfjax.integrate` and `cfjax.work_precision`."""
-    return dict(term=LieTerm(field), t0=t0, t1=t1, y0=y0(), args=PERIOD)
+    return dict(term=cfjax.LieTerm(field), t0=t0, t1=t1, y0=y0(), args=PERIOD)
 
 
 def invariants(y: Coefficients, args: Any = None) -> dict[str, Array]:
@@ -128,35 +113,26 @@ def invariants(y: Coefficients, args: Any = None) -> dict[str, Array]:
     return {"mean": jnp.real(jnp.asarray(y)[0])}
 
 
-def chart(**options: Any) -> WorkPrecision:
+def chart(**options: Any) -> cfjax.WorkPrecision:
     """The Kuramoto-Sivashinsky equation, n = 128, to t = 30, 40 to 2560 equal steps."""
-    given = problem()
-    return work_precision(
-        **given,
-        methods={
-            "CF4": CF4(),
-            "CF43": CF43(),
-            "ETDRK4": ETDRK4(),
-            "ETD43": ETD43(),
-            "ETD54": ETD54(),
-            "Tsit5": (diffrax.ODETerm(velocity), diffrax.Tsit5()),
-        },
-        reference=reference(t1, given["y0"]),
+    return cfjax.work_precision(
+        **problem(),
+        methods=by_name(cfjax.CF4(), cfjax.CF43(), cfjax.ETDRK4(), cfjax.ETD43(), cfjax.ETD54())
+        | in_plain_space(velocity, diffrax.Tsit5()),
+        reference=reference(t1, y0()),
         num_steps=[40 * 2**k for k in range(7)],
         **options,
     )
 
 
-def picture(time: float = 200.0) -> "Figure":
+def picture(time: float = 200.0) -> figures.Figure:
     """The solution to t = 200, and how fast two part that differ in the start or in the steps."""
-    from matplotlib.figure import Figure
-
     start, n = jnp.asarray(y0()), round(2 * time)
 
     def run(y: Any, steps_between: int) -> Any:
-        options: Any = dict(num_steps=n * steps_between, save_every=steps_between)
-        ys: Any = integrate(LieTerm(field), solver, 0.0, time, y, PERIOD, **options).ys
-        return np.asarray(jax.vmap(to_grid)(jnp.concatenate([y[None], ys])))
+        steps = dict(num_steps=n * steps_between, save_every=steps_between, save_initial=True)
+        _, ys = solve(problem(), solver, t1=time, y0=y, **steps)
+        return np.asarray(jax.vmap(to_grid)(ys))
 
     u, times = run(start, 4), np.linspace(0.0, time, n + 1)
     # Not with the symmetry of the start.
@@ -164,12 +140,13 @@ def picture(time: float = 200.0) -> "Figure":
         "start 1e-10 apart": run(start.at[1].add(1e-10j), 4),
         "steps twice as long": run(start, 2),
     }
-    figure = Figure((9.5, 4.0), layout="constrained")
+    figure = figures.new(9.5, 4.0)
     left, right = figure.subplots(1, 2, width_ratios=(1, 1.2))
     options: Any = dict(extent=(0, PERIOD, time, 0), aspect="auto", cmap="RdBu_r", vmin=-3, vmax=3)
     figure.colorbar(left.imshow(u, **options), ax=left)
     left.set(title="u", xlabel="x", ylabel="t")
-    for (name, other), colour in zip(others.items(), ("#0072B2", "#D55E00"), strict=True):
+    colours = figures.BLUE, figures.VERMILION
+    for (name, other), colour in zip(others.items(), colours, strict=True):
         off = np.sqrt(np.mean((other - u) ** 2, axis=1))
         right.semilogy(times, np.where(off > 0, off, np.nan), color=colour, label=name)
     right.semilogy(times, 1e-10 * np.exp(times / 11), ":", color="0.4", label="exp(t / 11)")

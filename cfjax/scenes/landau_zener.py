@@ -13,32 +13,20 @@ Source: Zener, Non-adiabatic crossing of energy levels, Proc. R. Soc. A 137 (193
 doi:10.1098/rspa.1932.0165.
 """
 
-from typing import TYPE_CHECKING, Any, NamedTuple
+from typing import Any, NamedTuple
 
 import diffrax
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Complex, Float
 
-from .. import (
-    CF4,
-    CF54,
-    LeftMatrix,
-    LieTerm,
-    Magnus4,
-    Magnus6,
-    Magnus8,
-    Magnus10,
-    WorkPrecision,
-    integrate,
-    work_precision,
-)
+import cfjax
 
-if TYPE_CHECKING:
-    from matplotlib.figure import Figure
+from . import _figures as figures
+from ._scene import by_name, in_plain_space, solve
 
 t0, t1 = -10.0, 10.0
-solver = Magnus6()
+solver = cfjax.Magnus6()
 
 
 class Sweep(NamedTuple):
@@ -56,9 +44,9 @@ def y0() -> Complex[np.ndarray, "2"]:
     return np.array([1.0 + 0.0j, 0.0])
 
 
-def field(t: Any, y: Complex[Array, "2 *columns"], args: Sweep) -> LeftMatrix:
+def field(t: Any, y: Complex[Array, "2 *columns"], args: Sweep) -> cfjax.LeftMatrix:
     """The frozen field, on a state or on a propagator."""
-    return LeftMatrix(-1j * _hamiltonian(t, args).astype(y.dtype))
+    return cfjax.LeftMatrix(-1j * _hamiltonian(t, args).astype(y.dtype))
 
 
 def velocity(t: Any, y: Complex[Array, "2 *columns"], args: Sweep) -> Complex[Array, "2 *columns"]:
@@ -108,7 +96,7 @@ def reference(
 
 def problem() -> dict[str, Any]:
     """What is solved, as arguments of `cfjax.integrate` and `cfjax.work_precision`."""
-    return dict(term=LieTerm(field), t0=t0, t1=t1, y0=y0(), args=slow)
+    return dict(term=cfjax.LieTerm(field), t0=t0, t1=t1, y0=y0(), args=slow)
 
 
 def invariants(y: Complex[Array, "2"], args: Any = None) -> dict[str, Array]:
@@ -116,43 +104,39 @@ def invariants(y: Complex[Array, "2"], args: Any = None) -> dict[str, Array]:
     return {"norm": jnp.linalg.norm(y)}
 
 
-def chart(**options: Any) -> WorkPrecision:
+def chart(**options: Any) -> cfjax.WorkPrecision:
     """A sweep from t = -10 to 10, 40 to 2560 equal steps; Tsit5 and Dopri8 in plain space."""
-    space = diffrax.ODETerm(velocity)
-    return work_precision(
+    return cfjax.work_precision(
         **problem(),
-        methods={
-            "CF4": CF4(),
-            "CF54": CF54(),
-            "Magnus4": Magnus4(),
-            "Magnus6": Magnus6(),
-            "Magnus8": Magnus8(),
-            "Magnus10": Magnus10(),
-            "Tsit5": (space, diffrax.Tsit5()),
-            "Dopri8": (space, diffrax.Dopri8()),
-        },
+        methods=by_name(
+            cfjax.CF4(),
+            cfjax.CF54(),
+            cfjax.Magnus4(),
+            cfjax.Magnus6(),
+            cfjax.Magnus8(),
+            cfjax.Magnus10(),
+        )
+        | in_plain_space(velocity, diffrax.Tsit5(), diffrax.Dopri8()),
         reference=reference(t1),
         num_steps=[40 * 2**k for k in range(7)],
         **options,
     )
 
 
-def picture() -> "Figure":
+def picture() -> figures.Figure:
     """The levels and how they are filled; sweeps at several rates; the path on the sphere."""
     from matplotlib.collections import LineCollection
-    from matplotlib.figure import Figure
     from mpl_toolkits.mplot3d.art3d import Line3DCollection
 
     n = 1200
     sweeps = {rate: Sweep(rate, 0.5) for rate in (0.3, 1.0, 3.0, 10.0)}
     states = {}
     for rate, args in sweeps.items():
-        sol = integrate(LieTerm(field), solver, t0, t1, y0(), args, num_steps=n, save_every=1)
-        states[rate] = np.asarray(sol.ys)
+        _, states[rate] = solve(problem(), solver, args=args, num_steps=n, save_every=1)
     times = t0 + (t1 - t0) * np.arange(1, n + 1) / n
-    figure = Figure((10.5, 3.6), layout="constrained")
+    figure = figures.new(10.5, 3.6)
     levels, chances = figure.add_subplot(1, 3, 1), figure.add_subplot(1, 3, 2)
-    sphere: Any = figure.add_subplot(1, 3, 3, projection="3d", computed_zorder=False)
+    sphere = figures.sphere(figure, 1, 3, 3, zoom=1.25)
 
     near = np.abs(times) < 4
     t, psi = times[near], states[1.0][near]
@@ -165,12 +149,12 @@ def picture() -> "Figure":
         points = np.stack([t, bands[:, k]], axis=-1)
         pieces = np.stack([points[:-1], points[1:]], axis=1)
         lines = LineCollection(
-            list(pieces), linewidths=1 + 6 * share, capstyle="round", color="#0072B2"
+            list(pieces), linewidths=1 + 6 * share, capstyle="round", color=figures.BLUE
         )
         levels.add_collection(lines)
     levels.set(title="Levels, as wide as they are filled", xlabel="t", ylabel="energy")
 
-    colours = ["#0072B2", "#009E73", "#E69F00", "#D55E00"]
+    colours = [figures.BLUE, figures.GREEN, figures.ORANGE, figures.VERMILION]
     for (rate, y), colour in zip(states.items(), colours, strict=True):
         chances.plot(times, np.asarray(staying(y)), color=colour, label=f"rate {rate:g}")
         end = float(limit(sweeps[rate]))
@@ -178,10 +162,6 @@ def picture() -> "Figure":
     chances.set(title="Probability to stay, and its limit", xlabel="t", ylim=(-0.02, 1.02))
     chances.legend(frameon=False, loc="lower left")
 
-    longitude, latitude = np.mgrid[0 : 2 * np.pi : 37j, 0 : np.pi : 19j]
-    ring = np.sin(latitude)
-    grid = ring * np.cos(longitude), ring * np.sin(longitude), np.cos(latitude)
-    sphere.plot_wireframe(*grid, color="0.88", linewidth=0.5, zorder=0)
     up, down = states[1.0].T
     across = 2 * up.conj() * down
     path = np.stack([across.real, across.imag, abs(up) ** 2 - abs(down) ** 2], axis=-1)
@@ -190,8 +170,6 @@ def picture() -> "Figure":
         Line3DCollection(pieces, array=times[1:], cmap="viridis", linewidth=1.4, zorder=1)
     )
     sphere.set_title("The state at rate 1, late is yellow", y=0.97)
-    sphere.set_axis_off()
-    sphere.set_box_aspect((1, 1, 1), zoom=1.25)
     return figure
 
 

@@ -15,7 +15,7 @@ doi:10.1103/PhysRev.130.1677.
 """
 
 import functools
-from typing import TYPE_CHECKING, Any, NamedTuple
+from typing import Any, NamedTuple
 
 import diffrax
 import jax
@@ -23,13 +23,12 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float, Key
 
-from .. import LieControlTerm, LieTerm, Rotation, WeakOrder2, integrate
+import cfjax
 
-if TYPE_CHECKING:
-    from matplotlib.figure import Figure
+from . import _figures as figures
 
 t0, t1 = 0.0, 20.0
-solver = WeakOrder2()
+solver = cfjax.WeakOrder2()
 
 Direction = Float[Array | np.ndarray, "3"]
 
@@ -47,12 +46,12 @@ def y0() -> Float[np.ndarray, "3"]:
     return np.array([0.0, 0.0, 1.0])
 
 
-def field(t: Any, y: Direction, args: Particle) -> Rotation:
+def field(t: Any, y: Direction, args: Particle) -> cfjax.Rotation:
     """The frozen field without noise."""
     return _turning(args.applied * jnp.asarray([0.0, 0.0, 1.0], y.dtype), y, args)
 
 
-def thermal(t: Any, y: Direction, args: Particle, increment: Float[Array, "3"]) -> Rotation:
+def thermal(t: Any, y: Direction, args: Particle, increment: Float[Array, "3"]) -> cfjax.Rotation:
     """The frozen field that an increment of Brownian motion causes."""
     return _turning(jnp.sqrt(2 * args.damping * args.temperature) * increment, y, args)
 
@@ -60,7 +59,7 @@ def thermal(t: Any, y: Direction, args: Particle, increment: Float[Array, "3"]) 
 def term(key: Key[Array, ""]) -> diffrax.MultiTerm:
     """The field with one sample of the noise."""
     noise = diffrax.UnsafeBrownianPath((3,), key, levy_area=diffrax.SpaceTimeLevyArea)
-    return diffrax.MultiTerm(LieTerm(field), LieControlTerm(thermal, noise))
+    return diffrax.MultiTerm(cfjax.LieTerm(field), cfjax.LieControlTerm(thermal, noise))
 
 
 def samples(
@@ -106,36 +105,29 @@ def invariants(y: Direction, args: Any = None) -> dict[str, Array]:
     return {"length": jnp.linalg.norm(y)}
 
 
-def picture(num_samples: int = 4000) -> "Figure":
+def picture(num_samples: int = 4000) -> figures.Figure:
     """One sample on the sphere; means in time at some temperatures; means in equilibrium."""
-    from matplotlib.figure import Figure
     from mpl_toolkits.mplot3d.art3d import Line3DCollection
 
     n = 160
     times = t0 + (t1 - t0) * np.arange(1, n + 1) / n
     temperatures = [0.05, 0.1, 0.2, 0.3, 0.5, 1.0, 2.0, 5.0]
-    colours = {0.1: "#0072B2", 0.3: "#009E73", 1.0: "#E69F00", 5.0: "#D55E00"}
+    colours = {0.1: figures.BLUE, 0.3: figures.GREEN, 1.0: figures.ORANGE, 5.0: figures.VERMILION}
     ys = {}
     for seed, temperature in enumerate(temperatures):
         args = Particle(temperature=temperature)
         ys[temperature] = np.asarray(samples(num_samples, args, num_steps=n, seed=seed))
 
-    figure = Figure((10.5, 3.6), layout="constrained")
-    sphere: Any = figure.add_subplot(1, 3, 1, projection="3d", computed_zorder=False)
+    figure = figures.new(10.5, 3.6)
+    sphere = figures.sphere(figure, 1, 3, 1, zoom=1.4)
     means, ends = figure.add_subplot(1, 3, 2), figure.add_subplot(1, 3, 3)
 
-    longitude, latitude = np.mgrid[0 : 2 * np.pi : 37j, 0 : np.pi : 19j]
-    ring = np.sin(latitude)
-    grid = ring * np.cos(longitude), ring * np.sin(longitude), np.cos(latitude)
-    sphere.plot_wireframe(*grid, color="0.88", linewidth=0.5, zorder=0)
     path = np.concatenate([y0()[None], ys[0.3][0]])
     pieces = np.stack([path[:-1], path[1:]], axis=1)
     sphere.add_collection3d(
         Line3DCollection(pieces, array=times, cmap="viridis", linewidth=1.2, zorder=1)
     )
     sphere.set_title("Temperature 0.3, late is yellow", y=0.97)
-    sphere.set_axis_off()
-    sphere.set_box_aspect((1, 1, 1), zoom=1.4)
 
     often = t0 + (t1 - t0) * np.linspace(0, 1, 41) ** 2
     for temperature, colour in colours.items():
@@ -164,8 +156,10 @@ def picture(num_samples: int = 4000) -> "Figure":
 @functools.partial(jax.jit, static_argnums=2)
 @functools.partial(jax.vmap, in_axes=(0, None, None))
 def _samples(key: Any, args: Particle, num_steps: int) -> Any:
-    return integrate(term(key), solver, t0, t1, y0(), args, num_steps=num_steps, save_every=1).ys
+    return cfjax.integrate(
+        term(key), solver, t0, t1, y0(), args, num_steps=num_steps, save_every=1
+    ).ys
 
 
-def _turning(b: Float[Array, "3"], y: Direction, args: Particle) -> Rotation:
-    return Rotation((b + args.damping * jnp.cross(y, b)) / (1 + args.damping**2))
+def _turning(b: Float[Array, "3"], y: Direction, args: Particle) -> cfjax.Rotation:
+    return cfjax.Rotation((b + args.damping * jnp.cross(y, b)) / (1 + args.damping**2))

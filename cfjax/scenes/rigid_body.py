@@ -8,7 +8,7 @@ Source: Celledoni, Marthinsen & Owren, Commutator-free Lie group methods, FGCS 1
 Section 3.1, doi:10.1016/S0167-739X(02)00161-9.
 """
 
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import diffrax
 import jax
@@ -16,26 +16,14 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
-from .. import (
-    CF3,
-    CF4,
-    CF43,
-    RKMK3,
-    RKMK4,
-    RKMK8,
-    LieTerm,
-    Rotation,
-    WorkPrecision,
-    integrate,
-    work_precision,
-)
-from .._numerics.matmul import matmul
+import cfjax
 
-if TYPE_CHECKING:
-    from matplotlib.figure import Figure
+from .._numerics.matmul import matmul
+from . import _figures as figures
+from ._scene import by_name, in_plain_space
 
 t0, t1 = 0.0, 100.0
-solver = RKMK8()
+solver = cfjax.RKMK8()
 y0 = np.array([8 / 9, 4 / 9, 1 / 9])
 inertia = np.array([7 / 8, 5 / 8, 1 / 4])
 
@@ -47,9 +35,14 @@ tabulated = {
 }
 
 
-def field(t: Any, y: Float[Array, "3"], args: Float[Array | np.ndarray, "3"]) -> Rotation:
+def field(t: Any, y: Float[Array, "3"], args: Float[Array | np.ndarray, "3"]) -> cfjax.Rotation:
     """The frozen field at angular momentum `y`, with the principal moments `args`."""
-    return Rotation(-y / args)
+    return cfjax.Rotation(-y / args)
+
+
+def velocity(t: Any, y: Float[Array, "3"], args: Any) -> Float[Array, "3"]:
+    """The same field in plain space, where no method keeps the norm."""
+    return jnp.cross(y, y / args)
 
 
 def energy(
@@ -92,7 +85,7 @@ def reference(
 
 def problem() -> dict[str, Any]:
     """What is solved, as arguments of `cfjax.integrate` and `cfjax.work_precision`."""
-    return dict(term=LieTerm(field), t0=t0, t1=t1, y0=y0, args=inertia)
+    return dict(term=cfjax.LieTerm(field), t0=t0, t1=t1, y0=y0, args=inertia)
 
 
 def invariants(y: Float[Array, "3"], args: Any = None) -> dict[str, Array]:
@@ -100,70 +93,54 @@ def invariants(y: Float[Array, "3"], args: Any = None) -> dict[str, Array]:
     return {"energy": energy(y, args), "length of the momentum": jnp.linalg.norm(y)}
 
 
-def chart(**options: Any) -> WorkPrecision:
+def chart(**options: Any) -> cfjax.WorkPrecision:
     """The free rigid body, 500 to 32 000 equal steps to t = 100; Tsit5 and Dopri5 in space."""
-    space = diffrax.ODETerm(lambda t, y, args: jnp.cross(y, y / args))
-    return work_precision(
+    return cfjax.work_precision(
         **problem(),
-        methods={
-            "CF3": CF3(),
-            "RKMK3": RKMK3(),
-            "CF4": CF4(),
-            "RKMK4": RKMK4(),
-            "CF43": CF43(),
-            "Dopri5": (space, diffrax.Dopri5()),
-            "Tsit5": (space, diffrax.Tsit5()),
-        },
+        methods=by_name(cfjax.CF3(), cfjax.RKMK3(), cfjax.CF4(), cfjax.RKMK4(), cfjax.CF43())
+        | in_plain_space(velocity, diffrax.Dopri5(), diffrax.Tsit5()),
         reference=reference(t1),
         num_steps=[500 * 2**k for k in range(7)],
         **options,
     )
 
 
-def picture() -> "Figure":
+def picture() -> figures.Figure:
     """Paths of the momentum to t = 20, and the energy, which methods keep to their order.
 
     The body turns stably about the axes of least and of largest inertia, but not about the middle
     one.
     """
-    from matplotlib.figure import Figure
-
     # Through the axes of largest and of least inertia, on both sides of the one between them.
     angles = np.linspace(0, 2 * np.pi, 24, endpoint=False) + np.pi / 24
     starts = np.stack([np.cos(angles), 0 * angles, np.sin(angles)], axis=-1)
 
-    def solve(start: Any, method: Any, n: int) -> Any:
-        return integrate(
-            LieTerm(field), method, 0.0, 20.0, start, inertia, num_steps=n, save_every=1
-        )
+    def solve(start: Any, solver: Any, n: int) -> Any:
+        arguments: Any = problem() | dict(t1=20.0, y0=start)
+        return cfjax.integrate(**arguments, solver=solver, num_steps=n, save_every=1)
 
     paths = np.asarray(jax.vmap(lambda start: solve(start, solver, 400).ys)(jnp.asarray(starts)))
-    figure = Figure((9.0, 4.2), layout="constrained")
-    sphere: Any = figure.add_subplot(1, 2, 1, projection="3d", computed_zorder=False)
-    longitude, latitude = np.mgrid[0 : 2 * np.pi : 37j, 0 : np.pi : 19j]
-    ring = np.sin(latitude)
-    ball = ring * np.cos(longitude), ring * np.sin(longitude), np.cos(latitude)
-    sphere.plot_wireframe(*ball, color="0.9", linewidth=0.5, zorder=0)
+    figure = figures.new(9.0, 4.2)
+    sphere = figures.sphere(figure, 1, 2, 1, zoom=1.35, color="0.9")
     towards = np.array([1.0, 0.8, 0.7])
     for path in paths:
         # What is behind the sphere is left out.
         seen = np.where((path @ towards > 0)[:, None], path, np.nan)
         is_about_the_first = energy(path[0], inertia) < 0.5 / inertia[1]
-        sphere.plot(*seen.T, color="#0072B2" if is_about_the_first else "#D55E00", linewidth=1.2)
+        colour = figures.BLUE if is_about_the_first else figures.VERMILION
+        sphere.plot(*seen.T, color=colour, linewidth=1.2)
     for name, axis in zip("123", np.eye(3), strict=True):
         sphere.text(*(1.1 * axis), name, ha="center", va="center")
     sphere.view_init(elev=29, azim=39)
     sphere.set(title="The momentum in the body, with its axes")
-    sphere.set_axis_off()
-    sphere.set_box_aspect((1, 1, 1), zoom=1.35)
 
     drift = figure.add_subplot(1, 2, 2)
     n, exact = 80, float(energy(y0, inertia))
-    methods = {"CF3": CF3(), "CF4": CF4(), "RKMK8": solver}
-    for (name, method), colour in zip(methods.items(), ("#009E73", "#0072B2", "k"), strict=True):
-        found = solve(y0, method, n)
-        off = np.abs(np.asarray(energy(found.ys, inertia)) - exact)
-        drift.semilogy(np.asarray(found.ts), np.maximum(off, 1e-17), color=colour, label=name)
+    methods = (cfjax.CF3(), figures.GREEN), (cfjax.CF4(), figures.BLUE), (solver, "k")
+    for method, colour in methods:
+        sol, name = solve(y0, method, n), type(method).__name__
+        off = np.abs(np.asarray(energy(sol.ys, inertia)) - exact)
+        drift.semilogy(np.asarray(sol.ts), np.maximum(off, 1e-17), color=colour, label=name)
     drift.set(title=f"Error of the energy, steps of {20 / n:g}", xlabel="t")
     drift.legend(frameon=False, loc="center right")
     return figure

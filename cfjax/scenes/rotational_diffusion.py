@@ -11,7 +11,7 @@ Source: Perrin, Étude mathématique du mouvement brownien de rotation, Ann. Sci
 """
 
 import functools
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import diffrax
 import jax
@@ -19,14 +19,13 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float, Key
 
-from .. import CF3, LieControlTerm, Rotation, WeakOrder2, integrate
+import cfjax
 
-if TYPE_CHECKING:
-    from matplotlib.figure import Figure
+from . import _figures as figures
 
 t0, t1 = 0.0, 1.5
 # Order 3 is enough for fields that do not depend on the state.
-solver = WeakOrder2(CF3())
+solver = cfjax.WeakOrder2(cfjax.CF3())
 
 Direction = Float[Array | np.ndarray, "3"]
 
@@ -36,15 +35,15 @@ def y0() -> Float[np.ndarray, "3"]:
     return np.array([0.0, 0.0, 1.0])
 
 
-def thermal(t: Any, y: Direction, args: Any, increment: Float[Array, "3"]) -> Rotation:
+def thermal(t: Any, y: Direction, args: Any, increment: Float[Array, "3"]) -> cfjax.Rotation:
     """The frozen field that an increment of Brownian motion causes; `args` is the diffusion."""
-    return Rotation(jnp.sqrt(2 * args) * increment)
+    return cfjax.Rotation(jnp.sqrt(2 * args) * increment)
 
 
-def term(key: Key[Array, ""]) -> LieControlTerm:
+def term(key: Key[Array, ""]) -> cfjax.LieControlTerm:
     """One sample of the noise."""
     noise = diffrax.UnsafeBrownianPath((3,), key, levy_area=diffrax.SpaceTimeLevyArea)
-    return LieControlTerm(thermal, noise)
+    return cfjax.LieControlTerm(thermal, noise)
 
 
 def samples(
@@ -78,37 +77,29 @@ def invariants(y: Direction, args: Any = None) -> dict[str, Array]:
     return {"length": jnp.linalg.norm(y)}
 
 
-def picture(num_samples: int = 50_000) -> "Figure":
+def picture(num_samples: int = 50_000) -> figures.Figure:
     """Axes on the sphere at three times, and how the three means decay."""
-    from matplotlib.figure import Figure
-
     n = 60
     times = t0 + (t1 - t0) * np.arange(1, n + 1) / n
     ys = samples(num_samples, num_steps=n)
-    found = np.asarray(legendre(ys))
-    means, deviations = np.mean(found, axis=0), np.std(found, axis=0)
+    polynomials = np.asarray(legendre(ys))
+    means, deviations = np.mean(polynomials, axis=0), np.std(polynomials, axis=0)
 
-    figure = Figure((10.5, 3.2), layout="constrained")
+    figure = figures.new(10.5, 3.2)
     grid = figure.add_gridspec(1, 4, width_ratios=(1, 1, 1, 1.7))
-    longitude, latitude = np.mgrid[0 : 2 * np.pi : 37j, 0 : np.pi : 19j]
-    ring = np.sin(latitude)
-    ball = ring * np.cos(longitude), ring * np.sin(longitude), np.cos(latitude)
     eye = np.array([np.cos(0.6), 0.0, np.sin(0.6)])
     for k, step in enumerate((2, 8, 40)):
-        sphere: Any = figure.add_subplot(grid[k], projection="3d", computed_zorder=False)
+        sphere = figures.sphere(figure, grid[k], zoom=1.5)
         sphere.view_init(elev=np.degrees(0.6), azim=0)
-        sphere.plot_wireframe(*ball, color="0.88", linewidth=0.5, zorder=0)
         y = np.asarray(ys[:4000, step - 1])
         # What the sphere hides is left out.
         seen = y[y @ eye > 0]
-        sphere.scatter(*seen.T, s=3, color="#0072B2", alpha=0.5, linewidth=0, zorder=1)
+        sphere.scatter(*seen.T, s=3, color=figures.BLUE, alpha=0.5, linewidth=0, zorder=1)
         sphere.set_title(f"t = {times[step - 1]:g}", y=1.0)
-        sphere.set_axis_off()
-        sphere.set_box_aspect((1, 1, 1), zoom=1.5)
 
     curves = figure.add_subplot(grid[3])
     often = np.linspace(t0, t1, 200)
-    for k, colour in enumerate(("#0072B2", "#009E73", "#D55E00")):
+    for k, colour in enumerate((figures.BLUE, figures.GREEN, figures.VERMILION)):
         curves.semilogy(often, reference(often)[:, k], color=colour, linewidth=1)
         # Where a mean is more than noise.
         error = deviations[:, k] / np.sqrt(num_samples)
@@ -133,6 +124,6 @@ def picture(num_samples: int = 50_000) -> "Figure":
 @functools.partial(jax.jit, static_argnums=2)
 @functools.partial(jax.vmap, in_axes=(0, None, None))
 def _samples(key: Any, diffusion: Any, num_steps: int) -> Any:
-    return integrate(
+    return cfjax.integrate(
         term(key), solver, t0, t1, y0(), diffusion, num_steps=num_steps, save_every=1
     ).ys

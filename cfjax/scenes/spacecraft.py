@@ -11,35 +11,21 @@ only the torque changes its length.
 Source: Landau & Lifshitz, Mechanics, Sections 35 to 37.
 """
 
-from typing import TYPE_CHECKING, Any, NamedTuple
+from typing import Any, NamedTuple
 
 import diffrax
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
-from .. import (
-    CF3,
-    CF4,
-    CF43,
-    CF54,
-    RKMK4,
-    RKMK8,
-    LieTerm,
-    QuaternionRotation,
-    RigidMotion,
-    WorkPrecision,
-    integrate,
-    quaternion_rotate,
-    work_precision,
-)
-from . import rigid_body
+import cfjax
 
-if TYPE_CHECKING:
-    from matplotlib.figure import Figure
+from . import _figures as figures
+from . import rigid_body
+from ._scene import by_name, in_plain_space, solve
 
 t0, t1 = 0.0, 40.0
-solver = RKMK8()
+solver = cfjax.RKMK8()
 inertia = np.array([3.0, 2.0, 1.0])
 
 # `q`, shape `(*times, 4)`, and `m`, shape `(*times, 3)`.
@@ -67,8 +53,8 @@ def field(t: Any, y: State, args: Craft) -> dict[str, Any]:
     fires = (t >= args.on) & (t < args.off)
     torque = jnp.where(fires, jnp.asarray(args.torque, omega.dtype), 0)
     return {
-        "q": QuaternionRotation(omega, frame="body", layout="wxyz"),
-        "m": RigidMotion(omega=-omega, v=torque, frame="fixed"),
+        "q": cfjax.QuaternionRotation(omega, frame="body", layout="wxyz"),
+        "m": cfjax.RigidMotion(omega=-omega, v=torque, frame="fixed"),
     }
 
 
@@ -89,7 +75,7 @@ def energy(y: State, args: Craft) -> Float[Array, "*times"]:
 
 def fixed_momentum(y: State) -> Float[Array, "*times 3"]:
     """The angular momentum in the fixed frame."""
-    return quaternion_rotate(jnp.asarray(y["q"]), jnp.asarray(y["m"]), layout="wxyz")
+    return cfjax.quaternion_rotate(jnp.asarray(y["q"]), jnp.asarray(y["m"]), layout="wxyz")
 
 
 def reference(t: float | Float[np.ndarray, "*times"]) -> State:
@@ -138,7 +124,7 @@ def error(y: State, exact: State) -> float:
 
 def problem() -> dict[str, Any]:
     """What is solved, as arguments of `cfjax.integrate` and `cfjax.work_precision`."""
-    return dict(term=LieTerm(field), t0=t0, t1=t1, y0=y0(), args=Craft())
+    return dict(term=cfjax.LieTerm(field), t0=t0, t1=t1, y0=y0(), args=Craft())
 
 
 def invariants(y: State, args: Any = None) -> dict[str, Array]:
@@ -150,21 +136,14 @@ def invariants(y: State, args: Any = None) -> dict[str, Array]:
     }
 
 
-def chart(**options: Any) -> WorkPrecision:
+def chart(**options: Any) -> cfjax.WorkPrecision:
     """A tumbling spacecraft to t = 40, 100 to 6400 equal steps; Tsit5 and Dopri8 in plain space."""
-    space = diffrax.ODETerm(velocity)
-    return work_precision(
+    return cfjax.work_precision(
         **problem(),
-        methods={
-            "CF3": CF3(),
-            "CF4": CF4(),
-            "RKMK4": RKMK4(),
-            "CF43": CF43(),
-            "CF54": CF54(),
-            "RKMK8": RKMK8(),
-            "Tsit5": (space, diffrax.Tsit5()),
-            "Dopri8": (space, diffrax.Dopri8()),
-        },
+        methods=by_name(
+            cfjax.CF3(), cfjax.CF4(), cfjax.RKMK4(), cfjax.CF43(), cfjax.CF54(), cfjax.RKMK8()
+        )
+        | in_plain_space(velocity, diffrax.Tsit5(), diffrax.Dopri8()),
         reference=reference(t1),
         error=error,
         num_steps=[100 * 2**k for k in range(7)],
@@ -172,29 +151,19 @@ def chart(**options: Any) -> WorkPrecision:
     )
 
 
-def picture() -> "Figure":
+def picture() -> figures.Figure:
     """The path of the body's middle axis on the sphere, and the momentum in the body, to t = 40."""
-    from matplotlib.figure import Figure
-
-    term = LieTerm(field)
-    sol = integrate(term, solver, t0, t1, y0(), Craft(), num_steps=800, save_every=1)
-    ys: Any = sol.ys
+    times, ys = solve(problem(), solver, num_steps=800, save_every=1)
     middle = jnp.broadcast_to(jnp.asarray([0.0, 1.0, 0.0], ys["q"].dtype), ys["m"].shape)
-    path = np.asarray(quaternion_rotate(ys["q"], middle, layout="wxyz"))
-    figure = Figure((9.0, 4.2), layout="constrained")
-    sphere: Any = figure.add_subplot(1, 2, 1, projection="3d")
-    longitude, latitude = np.mgrid[0 : 2 * np.pi : 25j, 0 : np.pi : 13j]
-    ring = np.sin(latitude)
-    ball = ring * np.cos(longitude), ring * np.sin(longitude), np.cos(latitude)
-    sphere.plot_wireframe(*ball, color="0.85", linewidth=0.5)
-    sphere.plot(*path.T, color="#0072B2", linewidth=1.2)
-    sphere.scatter(*path[0], color="#D55E00", s=30)
+    path = np.asarray(cfjax.quaternion_rotate(ys["q"], middle, layout="wxyz"))
+    figure = figures.new(9.0, 4.2)
+    sphere = figures.sphere(figure, 1, 2, 1, zoom=1.3, color="0.85", meridians=24)
+    sphere.plot(*path.T, color=figures.BLUE, linewidth=1.2)
+    sphere.scatter(*path[0], color=figures.VERMILION, s=30)
     sphere.set(title="The middle axis, from the dot on")
-    sphere.set_axis_off()
-    sphere.set_box_aspect((1, 1, 1), zoom=1.3)
     body = figure.add_subplot(1, 2, 2)
     for name, values, style in zip("123", ys["m"].T, ("-", "-", ":"), strict=True):
-        body.plot(np.asarray(sol.ts), np.asarray(values), style, label=f"axis {name}")
+        body.plot(times, values, style, label=f"axis {name}")
     body.set(title="Momentum in the body", xlabel="t", ylim=(-1.4, 1.15))
     body.legend(loc="lower right", ncols=3, frameon=False)
     return figure
@@ -209,25 +178,7 @@ def _frame(m: Float[np.ndarray, "*times 3"]) -> Float[np.ndarray, "*times 3 3"]:
 
 
 def _quaternion(r: Float[np.ndarray, "*times 3 3"]) -> Float[np.ndarray, "*times 4"]:
-    """By the eigenvector of the largest eigenvalue, which any angle leaves well conditioned."""
-    x, y, z = (r[..., k, k] for k in range(3))
-    a, b, c = (
-        r[..., 2, 1] - r[..., 1, 2],
-        r[..., 0, 2] - r[..., 2, 0],
-        r[..., 1, 0] - r[..., 0, 1],
-    )
-    d, e, f = (
-        r[..., 1, 0] + r[..., 0, 1],
-        r[..., 2, 0] + r[..., 0, 2],
-        r[..., 2, 1] + r[..., 1, 2],
-    )
-    k = np.stack(
-        [
-            np.stack([x + y + z, a, b, c], axis=-1),
-            np.stack([a, x - y - z, d, e], axis=-1),
-            np.stack([b, d, y - x - z, f], axis=-1),
-            np.stack([c, e, f, z - x - y], axis=-1),
-        ],
-        axis=-2,
-    )
-    return np.linalg.eigh(k)[1][..., -1]
+    from scipy.spatial.transform import Rotation
+
+    q = Rotation.from_matrix(r.reshape(-1, 3, 3)).as_quat(scalar_first=True)
+    return q.reshape(*r.shape[:-2], 4)

@@ -17,7 +17,7 @@ Phys. Commun. 111 (1998), doi:10.1016/S0010-4655(98)00009-5.
 """
 
 import functools
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import diffrax
 import jax
@@ -26,24 +26,14 @@ import numpy as np
 from jax import lax
 from jaxtyping import Array, Complex, Float, Int
 
-from .. import (
-    CF4,
-    CF54,
-    BlanesMoan4,
-    BlanesMoan6,
-    LieTerm,
-    Rotation,
-    Strang,
-    WorkPrecision,
-    work_precision,
-)
-from . import spins
+import cfjax
 
-if TYPE_CHECKING:
-    from matplotlib.figure import Figure
+from . import _figures as figures
+from . import spins
+from ._scene import by_name
 
 t0, t1 = 0.0, 4.0
-solver = Strang()
+solver = cfjax.Strang()
 
 Spins = Float[Array | np.ndarray, "rows columns 3"]
 
@@ -51,16 +41,16 @@ Spins = Float[Array | np.ndarray, "rows columns 3"]
 MAGNET = spins.Magnet(anisotropy=0.0, applied=(0.0, 0.0, 0.0), damping=0.0)
 
 
-def colour(parity: int) -> LieTerm:
+def colour(parity: int) -> cfjax.LieTerm:
     """The term that turns the spins of one colour, about fields that do not change meanwhile."""
 
-    def field(t: Any, y: Spins, args: spins.Magnet) -> Rotation:
+    def field(t: Any, y: Spins, args: spins.Magnet) -> cfjax.Rotation:
         # In NumPy, as a constant of the program. XLA takes minutes to work it out.
         row, column = np.ogrid[: y.shape[0], : y.shape[1]]
         is_mine = ((row + column) % 2 == parity)[..., None]
-        return Rotation(jnp.where(is_mine, spins.effective_field(y, args), 0))
+        return cfjax.Rotation(jnp.where(is_mine, spins.effective_field(y, args), 0))
 
-    return LieTerm(field)
+    return cfjax.LieTerm(field)
 
 
 term = diffrax.MultiTerm(colour(0), colour(1))
@@ -122,8 +112,8 @@ def run(
     saveat = diffrax.SaveAt(steps=True, fn=seen)
     options: Any = dict(saveat=saveat, max_steps=num_steps)
     end = num_steps * step
-    found: Any = diffrax.diffeqsolve(term, solver, 0.0, end, step, start, MAGNET, **options)
-    return found.ys
+    sol: Any = diffrax.diffeqsolve(term, solver, 0.0, end, step, start, MAGNET, **options)
+    return sol.ys
 
 
 def spectrum(
@@ -148,44 +138,36 @@ def invariants(y: Spins, args: spins.Magnet = MAGNET) -> dict[str, Array]:
     return {"energy": spins.energy(y, args), "length of each spin": jnp.linalg.norm(y, axis=-1)}
 
 
-def chart(**options: Any) -> WorkPrecision:
+def chart(**options: Any) -> cfjax.WorkPrecision:
     """A spin wave on 8 x 8 spins to t = 4, 10 to 320 equal steps."""
-    whole = LieTerm(spins.field)
-    return work_precision(
+    return cfjax.work_precision(
         **problem(),
-        methods={
-            "Strang": Strang(),
-            "BlanesMoan4": BlanesMoan4(),
-            "BlanesMoan6": BlanesMoan6(),
-            "CF4": (whole, CF4()),
-            "CF54": (whole, CF54()),
-        },
+        methods=by_name(cfjax.Strang(), cfjax.BlanesMoan4(), cfjax.BlanesMoan6())
+        | by_name(cfjax.CF4(), cfjax.CF54(), term=cfjax.LieTerm(spins.field)),
         reference=wave(t1),
         num_steps=[10 * 2**k for k in range(6)],
         **options,
     )
 
 
-def picture(side: int = 64, time: float = 120.0) -> "Figure":
+def picture(side: int = 64, time: float = 120.0) -> figures.Figure:
     """Spectra for two step sizes on a path of waves, and the energy, against CF4's, to t = 120.
 
     The path leads from long waves, Γ, to those along an axis that alternate, X, to those that
     alternate along both, M, and back.
     """
-    from matplotlib.figure import Figure
-
     half = side // 2
-    up, rest = np.arange(half), np.zeros(half, int)
-    corners = (up, rest), (rest + half, up), (half - up, half - up), ([0], [0])
+    up, zero = np.arange(half), np.zeros(half, int)
+    corners = (up, zero), (zero + half, up), (half - up, half - up), ([0], [0])
     waves = np.concatenate([np.stack(pair, axis=1) for pair in corners])
     kx, ky = 2 * np.pi * waves.T / side
     start = y0(side)
     before = float(spins.energy(start, MAGNET)) / side**2
 
-    figure = Figure((11, 3.4), layout="constrained")
+    figure = figures.new(11, 3.4)
     left, middle, right = figure.subplots(1, 3, width_ratios=(1, 1.15, 1))
-    runs = [(Strang(), 0.1, "#0072B2"), (Strang(), 0.5, "#009E73")]
-    runs += [(CF4(), 0.1, "#D55E00"), (CF4(), 0.5, "#E69F00")]
+    runs = [(cfjax.Strang(), 0.1, figures.BLUE), (cfjax.Strang(), 0.5, figures.GREEN)]
+    runs += [(cfjax.CF4(), 0.1, figures.VERMILION), (cfjax.CF4(), 0.5, figures.ORANGE)]
     for ax, (solver, step, colour) in zip((left, middle, None, None), runs, strict=True):
         signal, energies = run(start, waves, step, round(time / step), solver)
         name = f"{type(solver).__name__}, steps of {step:g}"

@@ -12,21 +12,21 @@ Source: Gilbert, A phenomenological theory of damping in ferromagnetic materials
 40 (2004), doi:10.1109/TMAG.2004.836740.
 """
 
-from typing import TYPE_CHECKING, Any, NamedTuple
+from typing import Any, NamedTuple
 
 import diffrax
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
-from .. import CF3, CF4, CF43, CF54, LieTerm, Rotation, WorkPrecision, work_precision
+import cfjax
 
-if TYPE_CHECKING:
-    from matplotlib.figure import Figure
+from . import _figures as figures
+from ._scene import by_dop853, by_name, in_plain_space, solve
 
 t0, t1 = 0.0, 4.0
 # On a lattice it takes less memory than RKMK8, and for errors above 1e-7 no more time.
-solver = CF4()
+solver = cfjax.CF4()
 
 Spins = Float[Array | np.ndarray, "*sides 3"]
 
@@ -51,11 +51,11 @@ def effective_field(y: Spins, args: Magnet) -> Float[Array, "*sides 3"]:
     return args.exchange * _neighbours(y) + _own(y, args, args.anisotropy)
 
 
-def field(t: Any, y: Spins, args: Magnet) -> Rotation:
+def field(t: Any, y: Spins, args: Magnet) -> cfjax.Rotation:
     """The frozen field: with angular velocity `(B + damping s x B) / (1 + damping^2)`."""
     b = effective_field(y, args)
     turned = b + args.damping * jnp.cross(y, b)
-    return Rotation(turned / (1 + args.damping**2))
+    return cfjax.Rotation(turned / (1 + args.damping**2))
 
 
 def velocity(t: Any, y: Spins, args: Magnet) -> Float[Array, "*sides 3"]:
@@ -91,26 +91,21 @@ def reference(
     t: float, start: Float[np.ndarray, "*sides 3"], args: Magnet
 ) -> Float[np.ndarray, "*sides 3"]:
     """The spins at time `t`, by SciPy's DOP853 in plain space, with a tolerance of 1e-13."""
-    from scipy.integrate import solve_ivp
-
     axes = tuple(range(start.ndim - 1))
 
-    def rate(t: float, flat: np.ndarray) -> np.ndarray:
-        s = flat.reshape(start.shape)
+    def rate(t: float, s: np.ndarray) -> np.ndarray:
         sums = sum((np.roll(s, 1, k) + np.roll(s, -1, k) for k in axes), np.zeros_like(s))
         b = args.exchange * sums + np.asarray(args.applied)
         b[..., 2] += args.anisotropy * s[..., 2]
         precession = np.cross(s, b)
-        rate = -(precession + args.damping * np.cross(s, precession)) / (1 + args.damping**2)
-        return rate.ravel()
+        return -(precession + args.damping * np.cross(s, precession)) / (1 + args.damping**2)
 
-    found = solve_ivp(rate, (0.0, t), start.ravel(), "DOP853", rtol=1e-13, atol=1e-13)
-    return found.y[:, -1].reshape(start.shape)
+    return by_dop853(rate, start, t)
 
 
 def problem() -> dict[str, Any]:
     """What is solved, as arguments of `cfjax.integrate` and `cfjax.work_precision`."""
-    return dict(term=LieTerm(field), t0=t0, t1=t1, y0=y0(8, 8), args=Magnet())
+    return dict(term=cfjax.LieTerm(field), t0=t0, t1=t1, y0=y0(8, 8), args=Magnet())
 
 
 def invariants(y: Spins, args: Any = None) -> dict[str, Array]:
@@ -118,53 +113,36 @@ def invariants(y: Spins, args: Any = None) -> dict[str, Array]:
     return {"energy (falls)": energy(y, args), "length of each spin": jnp.linalg.norm(y, axis=-1)}
 
 
-def chart(**options: Any) -> WorkPrecision:
+def chart(**options: Any) -> cfjax.WorkPrecision:
     """An 8 x 8 ferromagnet to t = 4, 20 to 640 equal steps; Tsit5 and Dopri5 in plain space."""
-    given = problem()
-    space = diffrax.ODETerm(velocity)
-    return work_precision(
-        **given,
-        methods={
-            "CF3": CF3(),
-            "CF4": CF4(),
-            "CF43": CF43(),
-            "CF54": CF54(),
-            "Dopri5": (space, diffrax.Dopri5()),
-            "Tsit5": (space, diffrax.Tsit5()),
-        },
-        reference=reference(t1, given["y0"], given["args"]),
+    return cfjax.work_precision(
+        **problem(),
+        methods=by_name(cfjax.CF3(), cfjax.CF4(), cfjax.CF43(), cfjax.CF54())
+        | in_plain_space(velocity, diffrax.Dopri5(), diffrax.Tsit5()),
+        reference=reference(t1, y0(8, 8), Magnet()),
         num_steps=[20 * 2**k for k in range(6)],
         **options,
     )
 
 
-def picture(side: int = 96) -> "Figure":
+def picture(side: int = 96) -> figures.Figure:
     """A larger magnet, quenched, to t = 160: domains grow, walls move, vortices vanish.
 
     Colour is the direction in the plane, brightness the component along z. The disc has the colours
     of all directions, from upwards in its centre to downwards at its rim.
     """
-    from matplotlib.figure import Figure
     from matplotlib.patches import Circle
 
-    times = np.array([0.0, 2.0, 10.0, 40.0, 160.0])
     # An easy plane, so that there are vortices.
     args = Magnet(anisotropy=-0.3, applied=(0.0, 0.0, 0.0), damping=0.2)
-    found = diffrax.diffeqsolve(
-        LieTerm(field),
-        solver,
-        times[0],
-        times[-1],
-        0.25,
-        y0(side, side),
-        args,
-        saveat=diffrax.SaveAt(ts=jnp.asarray(times)),
-    )
-    figure = Figure((2.2 * len(times) + 1.6, 2.5), layout="constrained")
+    steps = dict(t1=160.0, num_steps=640, save_every=8, save_initial=True)
+    _, ys = solve(problem(), solver, y0=y0(side, side), args=args, **steps)
+    times = (0, 2, 10, 40, 160)
+    figure = figures.new(2.2 * len(times) + 1.6, 2.5)
     *lattices, key = figure.subplots(1, len(times) + 1, width_ratios=(*len(times) * (1,), 0.6))
-    for ax, t, s in zip(lattices, times, np.asarray(found.ys), strict=True):
-        ax.imshow(_colours(s))
-        ax.set(xticks=[], yticks=[], title=f"t = {t:g}")
+    for ax, t in zip(lattices, times, strict=True):
+        ax.imshow(_colours(ys[t // 2]))
+        ax.set(xticks=[], yticks=[], title=f"t = {t}")
     x, y = np.meshgrid(*2 * [np.linspace(-1, 1, 201)])
     polar, azimuth = np.pi * np.minimum(np.hypot(x, y), 1), np.arctan2(y, x)
     across = np.sin(polar)

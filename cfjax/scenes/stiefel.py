@@ -8,32 +8,21 @@ Source: Celledoni, Marthinsen & Owren, Commutator-free Lie group methods, FGCS 1
 Section 3.2, doi:10.1016/S0167-739X(02)00161-9.
 """
 
-from typing import TYPE_CHECKING, Any
+from collections.abc import Callable
+from typing import Any
 
 import diffrax
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
-from .. import (
-    CF3,
-    CF4,
-    RKMK4,
-    BorderedSkew,
-    CayleyRK4,
-    LieTerm,
-    LowRankSkew,
-    WorkPrecision,
-    integrate,
-    tangent,
-    work_precision,
-)
+import cfjax
 
-if TYPE_CHECKING:
-    from matplotlib.figure import Figure
+from . import _figures as figures
+from ._scene import by_dop853, by_name, in_plain_space, solve
 
 t0, t1 = 0.0, 1.0
-solver = CF4()
+solver = cfjax.CF4()
 
 # The first two rows of Y(1) and the sum of its entries for n = 100, p = 4, from an independent
 # program, rounded to 13 decimals.
@@ -74,20 +63,20 @@ def first(
     t: Any,
     y: Float[Array, "n p"],
     args: tuple[Float[Array | np.ndarray, " n"], Float[Array | np.ndarray, " p"]],
-) -> LowRankSkew:
+) -> cfjax.LowRankSkew:
     """The frozen field of the first problem at `y`, with `args = (D, C)` as diagonals."""
     d, c = args
-    return LowRankSkew(d[:, None] * y * c[None, :])
+    return cfjax.LowRankSkew(d[:, None] * y * c[None, :])
 
 
-def second(t: Any, y: Float[Array, "n p"], args: Any = None) -> BorderedSkew:
+def second(t: Any, y: Float[Array, "n p"], args: Any = None) -> cfjax.BorderedSkew:
     """The frozen field of the second problem at `y`; needs n > p."""
     n, p = y.shape
     # G is skew and tridiagonal with G[i, i + 1] = (1 + sum_j Y[j, j]) i, counting from 1.
     rate = (1 + jnp.trace(y[:p])) * np.arange(1, p + 1).astype(y.dtype)
     above = rate[:, None] * y[1 : p + 1]
     below = jnp.pad(rate[: p - 1, None] * y[: p - 1], ((1, 0), (0, 0)))
-    return BorderedSkew(jnp.concatenate([jnp.tril(above - below, -1), y[: n - p]]))
+    return cfjax.BorderedSkew(jnp.concatenate([jnp.tril(above - below, -1), y[: n - p]]))
 
 
 def reference(problem: str, n: int, p: int = 4) -> Float[np.ndarray, "n p"]:
@@ -96,40 +85,29 @@ def reference(problem: str, n: int, p: int = 4) -> Float[np.ndarray, "n p"]:
     It is computed by DOP853 in the space of all matrices, at the tightest tolerance that SciPy
     accepts. The error is about 1e-13. It takes some tenths of a second for n = 1000.
     """
-    # Not at import: few who import the package need it.
-    from scipy.integrate import solve_ivp
-
     d, c = diagonals(n, p)
-    rate = np.arange(1, p + 1)[:, None]
+    index = np.arange(1, p + 1)[:, None]
 
-    def first(y):
+    def first(t, y):
         g = d[:, None] * y * c
         return g @ (y.T @ y) - y @ (g.T @ y)
 
-    def second(y):
-        above = (1 + np.trace(y[:p])) * rate * y[1 : p + 1]
-        below = (1 + np.trace(y[:p])) * (rate - 1) * np.concatenate([y[:1], y[: p - 1]])
+    def second(t, y):
+        above = (1 + np.trace(y[:p])) * index * y[1 : p + 1]
+        below = (1 + np.trace(y[:p])) * (index - 1) * np.concatenate([y[:1], y[: p - 1]])
         lower = np.tril(above - below, -1)
         border = y[: n - p]
         top = (lower - lower.T) @ y[:p] - border.T @ y[p:]
         return np.concatenate([top, border @ y[:p]])
 
-    slope = {"first": first, "second": second}[problem]
-    answer = solve_ivp(
-        lambda t, y: slope(y.reshape(n, p)).ravel(),
-        (t0, t1),
-        y0(n, p).ravel(),
-        method="DOP853",
-        rtol=2.3e-14,
-        atol=1e-16,
-    )
-    return answer.y[:, -1].reshape(n, p)
+    rate = {"first": first, "second": second}[problem]
+    return by_dop853(rate, y0(n, p), t1, rtol=2.3e-14, atol=1e-16)
 
 
 def problem(which: str = "first", n: int = 100) -> dict[str, Any]:
     """What is solved, as arguments of `cfjax.integrate` and `cfjax.work_precision`."""
     field, args = {"first": (first, diagonals(n)), "second": (second, None)}[which]
-    return dict(term=LieTerm(field), t0=t0, t1=t1, y0=y0(n), args=args)
+    return dict(term=cfjax.LieTerm(field), t0=t0, t1=t1, y0=y0(n), args=args)
 
 
 def invariants(y: Float[Array, "n p"], args: Any = None) -> dict[str, Array]:
@@ -138,38 +116,30 @@ def invariants(y: Float[Array, "n p"], args: Any = None) -> dict[str, Array]:
     return {"distance from orthonormal columns": jnp.linalg.norm(defect)}
 
 
-def chart_first(**options: Any) -> WorkPrecision:
+def chart_first(**options: Any) -> cfjax.WorkPrecision:
     """Stiefel manifold, first experiment, n = 1000, p = 4, 4 to 256 equal steps to t = 1."""
     return _chart("first", options)
 
 
-def chart_second(**options: Any) -> WorkPrecision:
+def chart_second(**options: Any) -> cfjax.WorkPrecision:
     """Stiefel manifold, second experiment, n = 1000, p = 4, 4 to 256 equal steps to t = 1."""
     return _chart("second", options)
 
 
-def picture(n: int = 40) -> "Figure":
+def picture(n: int = 40) -> figures.Figure:
     """Columns of the first problem that gather where D is smallest, and two ways to stay there.
 
     The flow climbs `tr(C Y^T D Y) / 2`, whose maximum has the columns on the first p axes.
     """
-    from matplotlib.figure import Figure
-
     end, steps = 40.0, 400
-    given: dict[str, Any] = problem("first", n) | dict(t1=end)
-    d, c = given["args"]
-    space = diffrax.ODETerm(lambda t, y, args: tangent(first(t, y, args), y))
-    options: Any = dict(num_steps=steps, save_every=1)
-    found = {
-        "CF4": integrate(**given, solver=solver, **options),
-        "Tsit5 in plain space": integrate(
-            **(given | dict(term=space)), solver=diffrax.Tsit5(), **options
-        ),
-    }
-    times, ys = np.asarray(found["CF4"].ts), np.asarray(found["CF4"].ys)
-    figure = Figure((10.0, 3.6), layout="constrained")
+    d, c = diagonals(n)
+    plain = diffrax.ODETerm(_velocity(first))
+    options = dict(t1=end, num_steps=steps, save_every=1)
+    times, ys = solve(problem("first", n), solver, **options)
+    _, others = solve(problem("first", n), diffrax.Tsit5(), term=plain, **options)
+    figure = figures.new(10.0, 3.6)
     columns, climb, drift = figure.subplots(1, 3, width_ratios=(1.2, 1, 1))
-    shots = np.concatenate([np.asarray(given["y0"])[None], ys[[19, 99, -1]]])
+    shots = np.concatenate([y0(n)[None], ys[[19, 99, -1]]])
     # One blank column between the matrices.
     board = np.pad(np.abs(shots), ((0, 0), (0, 0), (0, 1)), constant_values=np.nan)
     width = board.shape[2]
@@ -180,11 +150,10 @@ def picture(n: int = 40) -> "Figure":
     columns.set(title="Entries of Y, large ones dark", ylabel="row")
     height = np.einsum("tij,i,j->t", ys**2, d, c) / 2
     top = np.sum(d[: len(c)] * np.sort(c)) / 2
-    climb.plot(times, height, color="#0072B2")
+    climb.plot(times, height, color=figures.BLUE)
     climb.axhline(top, color="0.6", linestyle=":", linewidth=1)
     climb.set(title="tr($C\\,Y^T D\\,Y$) / 2, and its maximum", xlabel="t")
-    for name, sol in found.items():
-        y = np.asarray(sol.ys)
+    for name, y in {"CF4": ys, "Tsit5 in plain space": others}.items():
         off = np.abs(np.swapaxes(y, 1, 2) @ y - np.eye(y.shape[2])).max(axis=(1, 2))
         drift.semilogy(times, np.maximum(off, 1e-17), label=name)
     drift.set(title=f"Off orthonormal, steps of {end / steps:g}", xlabel="t")
@@ -192,18 +161,18 @@ def picture(n: int = 40) -> "Figure":
     return figure
 
 
-def _chart(which: str, options: dict[str, Any]) -> WorkPrecision:
-    given, field = problem(which, 1000), {"first": first, "second": second}[which]
-    space = diffrax.ODETerm(lambda t, y, args: tangent(field(t, y, args), y))
-    return work_precision(
-        **given,
-        methods={
-            "CF3": CF3(),
-            "CF4": CF4(),
-            "RKMK4": RKMK4(),
-            "RKR-C4": CayleyRK4(),
-            "Tsit5": (space, diffrax.Tsit5()),
-        },
+def _velocity(field: Callable[..., Any]) -> Callable[..., Any]:
+    """A field in plain space, where no method keeps columns orthonormal."""
+    return lambda t, y, args: cfjax.tangent(field(t, y, args), y)
+
+
+def _chart(which: str, options: dict[str, Any]) -> cfjax.WorkPrecision:
+    field = {"first": first, "second": second}[which]
+    return cfjax.work_precision(
+        **problem(which, 1000),
+        methods=by_name(cfjax.CF3(), cfjax.CF4(), cfjax.RKMK4())
+        | {"RKR-C4": cfjax.CayleyRK4()}
+        | in_plain_space(_velocity(field), diffrax.Tsit5()),
         reference=reference(which, 1000),
         num_steps=[4 * 2**k for k in range(7)],
         **options,

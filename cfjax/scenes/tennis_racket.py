@@ -17,7 +17,7 @@ doi:10.1007/978-1-4757-2063-1; McLachlan, Explicit Lie-Poisson integration and t
 Phys. Rev. Lett. 71 (1993), doi:10.1103/PhysRevLett.71.3043.
 """
 
-from typing import TYPE_CHECKING, Any, NamedTuple
+from typing import Any, NamedTuple
 
 import diffrax
 import jax
@@ -25,27 +25,14 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
-from .. import (
-    CF4,
-    RKMK8,
-    BlanesMoan4,
-    BlanesMoan6,
-    LieTerm,
-    RigidMotion,
-    Rotation,
-    Strang,
-    WorkPrecision,
-    integrate,
-    tangent,
-    work_precision,
-)
+import cfjax
 
-if TYPE_CHECKING:
-    from matplotlib.figure import Figure
+from . import _figures as figures
+from ._scene import by_dop853, by_name, in_plain_space
 
 t0, t1 = 0.0, 40.0
 # To `t1`. The splitting of the picture pays over longer times.
-solver = RKMK8()
+solver = cfjax.RKMK8()
 
 # `up` and `m`, shapes `(3,)`.
 State = dict[str, Float[Array | np.ndarray, "3"]]
@@ -79,29 +66,29 @@ def kick(t: Any, y: State, args: Racket) -> dict[str, Any]:
     return {"up": None, "m": jnp.cross(y["up"], jnp.asarray(args.weight, y["m"].dtype))}
 
 
-def spin(axis: int) -> LieTerm:
+def spin(axis: int) -> cfjax.LieTerm:
     """The rotation about one principal axis."""
 
     def turning(t: Any, y: State, args: Racket) -> dict[str, Any]:
         omega = jnp.zeros_like(y["m"]).at[axis].set(y["m"][axis] / args.inertia[axis])
-        return {"up": Rotation(-omega), "m": Rotation(-omega)}
+        return {"up": cfjax.Rotation(-omega), "m": cfjax.Rotation(-omega)}
 
-    return LieTerm(turning)
+    return cfjax.LieTerm(turning)
 
 
-terms = diffrax.MultiTerm(LieTerm(kick), spin(0), spin(1), spin(2))
+terms = diffrax.MultiTerm(cfjax.LieTerm(kick), spin(0), spin(1), spin(2))
 
 
 def field(t: Any, y: State, args: Racket) -> dict[str, Any]:
     """The frozen field of all terms at once."""
     omega = y["m"] / jnp.asarray(args.inertia, y["m"].dtype)
-    moved = RigidMotion(omega=-omega, v=kick(t, y, args)["m"], frame="fixed")
-    return {"up": Rotation(-omega), "m": moved}
+    moved = cfjax.RigidMotion(omega=-omega, v=kick(t, y, args)["m"], frame="fixed")
+    return {"up": cfjax.Rotation(-omega), "m": moved}
 
 
 def velocity(t: Any, y: State, args: Racket) -> State:
     """The same field in plain space, where no method keeps the length of `up`."""
-    return tangent(field(t, y, args), y)
+    return cfjax.tangent(field(t, y, args), y)
 
 
 def energy(y: State, args: Racket) -> Float[Array, ""]:
@@ -134,23 +121,19 @@ def reference(t: float) -> State:
 
     The error at 40 is about 1e-12.
     """
-    from scipy.integrate import solve_ivp
+    args = Racket()
 
-    start, args = y0(), Racket()
+    def rate(t: float, y: State) -> State:
+        omega = y["m"] / args.inertia
+        torque = np.cross(y["up"], args.weight)
+        return {"up": np.cross(y["up"], omega), "m": np.cross(y["m"], omega) + torque}
 
-    def rate(t: float, y: np.ndarray) -> np.ndarray:
-        up, m = y.reshape(2, 3)
-        torque = np.cross(m, m / args.inertia) + np.cross(up, args.weight)
-        return np.concatenate([np.cross(up, m / args.inertia), torque])
-
-    flat = np.concatenate([start["up"], start["m"]])
-    found = solve_ivp(rate, (0.0, t), flat, "DOP853", rtol=1e-13, atol=1e-13)
-    return dict(zip(("up", "m"), found.y[:, -1].reshape(2, 3), strict=True))
+    return by_dop853(rate, y0(), t)
 
 
 def problem() -> dict[str, Any]:
     """What is solved, as arguments of `cfjax.integrate` and `cfjax.work_precision`."""
-    return dict(term=LieTerm(field), t0=t0, t1=t1, y0=y0(), args=Racket())
+    return dict(term=cfjax.LieTerm(field), t0=t0, t1=t1, y0=y0(), args=Racket())
 
 
 def invariants(y: State, args: Any = None) -> dict[str, Array]:
@@ -159,40 +142,42 @@ def invariants(y: State, args: Any = None) -> dict[str, Array]:
     return {"energy": energy(y, args), "vertical momentum": vertical, "length of up": length}
 
 
-def chart(**options: Any) -> WorkPrecision:
+def chart(**options: Any) -> cfjax.WorkPrecision:
     """A tennis racket to t = 40, 40 to 2560 equal steps; Tsit5 in plain space."""
-    methods: dict[str, Any] = {"CF4": CF4(), "RKMK8": RKMK8()}
-    methods |= {type(s).__name__: (terms, s) for s in (Strang(), BlanesMoan4(), BlanesMoan6())}
-    methods["Tsit5"] = diffrax.ODETerm(velocity), diffrax.Tsit5()
-    num_steps = [40 * 2**k for k in range(7)]
-    return work_precision(
-        **problem(), methods=methods, reference=reference(t1), num_steps=num_steps, **options
+    return cfjax.work_precision(
+        **problem(),
+        methods=by_name(cfjax.CF4(), cfjax.RKMK8())
+        | by_name(cfjax.Strang(), cfjax.BlanesMoan4(), cfjax.BlanesMoan6(), term=terms)
+        | in_plain_space(velocity, diffrax.Tsit5()),
+        reference=reference(t1),
+        num_steps=[40 * 2**k for k in range(7)],
+        **options,
     )
 
 
-def picture(num_steps: int = 1_000_000) -> "Figure":
+def picture(num_steps: int = 1_000_000) -> figures.Figure:
     """Sections of the same motions by Strang and by CF4, with a million steps of 0.4.
 
     A step of CF4 takes twice the operations of one of Strang, and four times as many torques.
     `num_steps` is a multiple of 20 000, or less than that.
     """
-    from matplotlib.figure import Figure
-
     inside = [(0.0, 0.15), (0.0, 0.35), (0.0, 0.55), (np.pi, 0.25), (np.pi, 0.45), (np.pi, 0.62)]
     outside = [(np.pi / 2, s * x) for s in (1, -1) for x in (0.25, 0.4, 0.6)]
     starts = [y0(), *(y0(*place) for place in inside + outside)]
-    colours = ["#D55E00", *3 * ["#0072B2", "#E69F00", "#009E73", "#CC79A7"]]
+    regular = [figures.BLUE, figures.ORANGE, figures.GREEN, figures.PURPLE]
+    colours = [figures.VERMILION, *3 * regular]
     options: Any = dict(num_steps=min(num_steps, 20_000), save_every=1)
 
-    figure = Figure((10.5, 4.8), layout="constrained")
+    figure = figures.new(10.5, 4.8)
     panels = figure.subplots(1, 2, sharex=True, sharey=True)
-    for ax, term, solver in zip(panels, (terms, LieTerm(field)), (Strang(), CF4()), strict=True):
+    methods = (terms, cfjax.Strang()), (cfjax.LieTerm(field), cfjax.CF4())
+    for ax, (term, solver) in zip(panels, methods, strict=True):
 
         @jax.jit
         @jax.vmap
         def go_on(y: State, term: Any = term, solver: Any = solver) -> Any:
             end = 0.4 * options["num_steps"]
-            return integrate(term, solver, 0.0, end, y, Racket(), **options).ys
+            return cfjax.integrate(term, solver, 0.0, end, y, Racket(), **options).ys
 
         y = jax.tree.map(lambda *leaves: np.stack(leaves), *starts)
         for _ in range(num_steps // options["num_steps"]):

@@ -14,32 +14,20 @@ doi:10.1103/PhysRevB.9.1924; Calvo, Iserles & Zanna, Numerical solution of isosp
 Comp. 66 (1997), doi:10.1090/S0025-5718-97-00902-2.
 """
 
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import diffrax
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
-from .. import (
-    CF3,
-    CF4,
-    CF43,
-    CF54,
-    RKMK4,
-    Conjugation,
-    LieTerm,
-    WorkPrecision,
-    integrate,
-    tangent,
-    work_precision,
-)
+import cfjax
 
-if TYPE_CHECKING:
-    from matplotlib.figure import Figure
+from . import _figures as figures
+from ._scene import by_name, in_plain_space, solve
 
 t0, t1 = 0.0, 10.0
-solver = CF4()
+solver = cfjax.CF4()
 
 # The particles of `y0()`: they run into each other.
 positions = np.array([-10.0, -5.0, -1.0, 4.0, 9.0])
@@ -57,15 +45,15 @@ def matrix(q: Float[np.ndarray, " n"], p: Float[np.ndarray, " n"]) -> Float[np.n
     return np.diag(-p / 2) + np.diag(beside, 1) + np.diag(beside, -1)
 
 
-def field(t: Any, y: Float[Array, "n n"], args: Any = None) -> Conjugation:
+def field(t: Any, y: Float[Array, "n n"], args: Any = None) -> cfjax.Conjugation:
     """The frozen field at any symmetric matrix."""
     # As B is skew, `Congruence` would do it too, for less. Other isospectral flows need this.
-    return Conjugation(jnp.triu(y, 1) - jnp.tril(y, -1))
+    return cfjax.Conjugation(jnp.triu(y, 1) - jnp.tril(y, -1))
 
 
 def velocity(t: Any, y: Float[Array, "n n"], args: Any = None) -> Float[Array, "n n"]:
     """The same field in plain space, where methods lose the eigenvalues."""
-    return tangent(field(t, y), y)
+    return cfjax.tangent(field(t, y), y)
 
 
 def energy(y: Float[Array | np.ndarray, "*times n n"]) -> Float[Array, "*times"]:
@@ -109,7 +97,7 @@ def particles(
 
 def problem() -> dict[str, Any]:
     """What is solved, as arguments of `cfjax.integrate` and `cfjax.work_precision`."""
-    return dict(term=LieTerm(field), t0=t0, t1=t1, y0=y0())
+    return dict(term=cfjax.LieTerm(field), t0=t0, t1=t1, y0=y0())
 
 
 def invariants(y: Float[Array, "n n"], args: Any = None) -> dict[str, Array]:
@@ -117,53 +105,35 @@ def invariants(y: Float[Array, "n n"], args: Any = None) -> dict[str, Array]:
     return {"energy": energy(y), "eigenvalues": jnp.linalg.eigvalsh(y)}
 
 
-def chart(**options: Any) -> WorkPrecision:
+def chart(**options: Any) -> cfjax.WorkPrecision:
     """Five particles of a Toda lattice to t = 10, 20 to 1280 equal steps; Tsit5 in plain space."""
-    space = diffrax.ODETerm(velocity)
-    return work_precision(
+    return cfjax.work_precision(
         **problem(),
-        methods={
-            "CF3": CF3(),
-            "CF4": CF4(),
-            "RKMK4": RKMK4(),
-            "CF43": CF43(),
-            "CF54": CF54(),
-            "Dopri5": (space, diffrax.Dopri5()),
-            "Tsit5": (space, diffrax.Tsit5()),
-        },
+        methods=by_name(cfjax.CF3(), cfjax.CF4(), cfjax.RKMK4(), cfjax.CF43(), cfjax.CF54())
+        | in_plain_space(velocity, diffrax.Dopri5(), diffrax.Tsit5()),
         reference=reference(t1),
         num_steps=[20 * 2**k for k in range(7)],
         **options,
     )
 
 
-def picture() -> "Figure":
+def picture() -> figures.Figure:
     """The paths of particles that collide, to t = 14, and the matrix that becomes diagonal."""
-    from matplotlib.figure import Figure
-
-    n, end = 100, 14.0
-    methods = {
-        "CF4": (LieTerm(field), solver),
-        "Tsit5": (diffrax.ODETerm(velocity), diffrax.Tsit5()),
-    }
-    options: Any = dict(num_steps=n, save_every=1)
-    found = {
-        name: integrate(term, method, t0, end, y0(), **options)
-        for name, (term, method) in methods.items()
-    }
-    times = np.asarray(found["CF4"].ts)
-    ys = {name: np.asarray(sol.ys) for name, sol in found.items()}
-    q = particles(ys["CF4"], positions.mean() + momenta.mean() * times)
+    n, plain = 100, diffrax.ODETerm(velocity)
+    options = dict(t1=14.0, num_steps=n, save_every=1)
+    times, ys = solve(problem(), solver, **options)
+    _, others = solve(problem(), diffrax.Tsit5(), term=plain, **options)
+    q = particles(ys, positions.mean() + momenta.mean() * times)
     values = np.linalg.eigvalsh(y0())
-    figure = Figure((10.5, 3.6), layout="constrained")
+    figure = figures.new(10.5, 3.6)
     lattice, diagonal, drift = figure.subplots(1, 3)
-    colours = ["#0072B2", "#009E73", "#E69F00", "#D55E00", "#CC79A7"]
+    colours = [figures.BLUE, figures.GREEN, figures.ORANGE, figures.VERMILION, figures.PURPLE]
     for k, colour in enumerate(colours):
         lattice.plot(q[:, k], times, color=colour)
-        diagonal.plot(times, ys["CF4"][:, k, k], color=colour)
+        diagonal.plot(times, ys[:, k, k], color=colour)
     for value in values:
         diagonal.axhline(value, color="0.6", linestyle=":", linewidth=1, zorder=0)
-    for name, y in ys.items():
+    for name, y in {"CF4": ys, "Tsit5": others}.items():
         off = np.abs(np.linalg.eigvalsh((y + np.swapaxes(y, 1, 2)) / 2) - values).max(-1)
         drift.semilogy(times, np.maximum(off, 1e-16), label=f"{name}, {n} steps")
     lattice.set(title="Positions", xlabel="q", ylabel="t")

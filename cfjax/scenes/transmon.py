@@ -23,7 +23,7 @@ Source: Motzoi, Gambetta, Rebentrost & Wilhelm, Simple pulses for elimination of
 nonlinear qubits, Phys. Rev. Lett. 103 (2009), doi:10.1103/PhysRevLett.103.110501.
 """
 
-from typing import TYPE_CHECKING, Any, NamedTuple
+from typing import Any, NamedTuple
 
 import diffrax
 import jax
@@ -32,20 +32,10 @@ import numpy as np
 from jax import lax
 from jaxtyping import Array, Complex, Float
 
-from .. import (
-    CF4,
-    LeftMatrix,
-    LieTerm,
-    Magnus4,
-    Magnus6,
-    Magnus8,
-    WorkPrecision,
-    integrate,
-    work_precision,
-)
+import cfjax
 
-if TYPE_CHECKING:
-    from matplotlib.figure import Figure
+from . import _figures as figures
+from ._scene import by_dop853, by_name, in_plain_space, solve
 
 # A propagator, a state, or several states as columns.
 Columns = Complex[Array | np.ndarray, "levels *columns"]
@@ -65,7 +55,7 @@ class Pulse(NamedTuple):
 
 
 t0 = 0.0
-solver = Magnus6()
+solver = cfjax.Magnus6()
 
 
 def plain(duration: float = 8.0) -> Pulse:
@@ -85,9 +75,9 @@ def y0(levels: int = 4) -> Complex[np.ndarray, "levels levels"]:
     return np.eye(levels, dtype=complex)
 
 
-def field(t: Any, y: Columns, args: Pulse) -> LeftMatrix:
+def field(t: Any, y: Columns, args: Pulse) -> cfjax.LeftMatrix:
     """The frozen field, on a propagator, a state or columns."""
-    return LeftMatrix(-1j * _hamiltonian(t, y, args))
+    return cfjax.LeftMatrix(-1j * _hamiltonian(t, y, args))
 
 
 def velocity(t: Any, y: Columns, args: Pulse) -> Complex[Array, "levels *columns"]:
@@ -125,8 +115,8 @@ def infidelity(y: Complex[Array | np.ndarray, "levels levels"], args: Pulse) -> 
     angle = jnp.asarray(args.frequency * args.duration, jnp.finfo(y.dtype).dtype)
     turn = jnp.stack([jnp.ones_like(y[0, 0]), lax.complex(jnp.cos(angle), jnp.sin(angle))])
     swapped = (turn[:, None] * y[:2, :2])[::-1]
-    kept = jnp.sum(jnp.square(jnp.abs(swapped)))
-    return 1 - (kept + jnp.square(jnp.abs(jnp.trace(swapped)))) / 6
+    population = jnp.sum(jnp.square(jnp.abs(swapped)))
+    return 1 - (population + jnp.square(jnp.abs(jnp.trace(swapped)))) / 6
 
 
 def reference(args: Pulse, levels: int = 4) -> Complex[np.ndarray, "levels levels"]:
@@ -135,14 +125,11 @@ def reference(args: Pulse, levels: int = 4) -> Complex[np.ndarray, "levels level
     It is solved in a frame in which the levels rest, so that steps are longer and no code of this
     file is used.
     """
-    from scipy.integrate import solve_ivp
-
     n = np.arange(levels)
     energies = args.frequency * n + args.anharmonicity * n * (n - 1) / 2
     root = np.sqrt(n[1:])
 
     def rate(t, y):
-        y = y.view(complex).reshape(levels, levels)
         angle = 2 * np.pi * t / args.duration
         first = sum(x * (1 - np.cos((k + 1) * angle)) for k, x in enumerate(args.in_phase))
         second = sum(x * np.sin((k + 1) * angle) for k, x in enumerate(args.quadrature))
@@ -150,18 +137,16 @@ def reference(args: Pulse, levels: int = 4) -> Complex[np.ndarray, "levels level
         size = first * np.cos(phase) + second * np.sin(phase)
         hops = size * root * np.exp(1j * t * (energies[1:] - energies[:-1]))
         h = np.diag(hops, -1) + np.diag(hops.conj(), 1)
-        return (-1j * (h @ y)).ravel().view(float)
+        return -1j * (h @ y)
 
-    start = y0(levels).ravel().view(float)
-    end = solve_ivp(rate, (t0, args.duration), start, "DOP853", rtol=1e-13, atol=1e-13).y[:, -1]
-    y = np.ascontiguousarray(end).view(complex).reshape(levels, levels)
+    y = by_dop853(rate, y0(levels), args.duration)
     return np.exp(-1j * energies * args.duration)[:, None] * y
 
 
 def problem() -> dict[str, Any]:
     """What is solved, as arguments of `cfjax.integrate` and `cfjax.work_precision`."""
     args = corrected()
-    return dict(term=LieTerm(field), t0=t0, t1=args.duration, y0=y0(), args=args)
+    return dict(term=cfjax.LieTerm(field), t0=t0, t1=args.duration, y0=y0(), args=args)
 
 
 def invariants(y: Columns, args: Any = None) -> dict[str, Array]:
@@ -170,49 +155,34 @@ def invariants(y: Columns, args: Any = None) -> dict[str, Array]:
     return {"distance from unitary": jnp.linalg.norm(defect)}
 
 
-def chart(**options: Any) -> WorkPrecision:
+def chart(**options: Any) -> cfjax.WorkPrecision:
     """The corrected pulse on a propagator, 100 to 3200 equal steps; Tsit5 and Dopri8 beside it."""
-    space = diffrax.ODETerm(velocity)
-    return work_precision(
+    return cfjax.work_precision(
         **problem(),
-        methods={
-            "CF4": CF4(),
-            "Magnus4": Magnus4(),
-            "Magnus6": Magnus6(),
-            "Magnus8": Magnus8(),
-            "Tsit5": (space, diffrax.Tsit5()),
-            "Dopri8": (space, diffrax.Dopri8()),
-        },
+        methods=by_name(cfjax.CF4(), cfjax.Magnus4(), cfjax.Magnus6(), cfjax.Magnus8())
+        | in_plain_space(velocity, diffrax.Tsit5(), diffrax.Dopri8()),
         reference=reference(corrected()),
         num_steps=[100 * 2**k for k in range(6)],
         **options,
     )
 
 
-def picture() -> "Figure":
+def picture() -> figures.Figure:
     """The two parts of a pulse, and where the levels go under it, without and with quadrature."""
-    from matplotlib.figure import Figure
-
-    figure = Figure((10.5, 5.2), layout="constrained")
+    figure = figures.new(10.5, 5.2)
     axes = figure.subplots(2, 2, sharex=True)
-    n = 1200
-    for column, (name, args) in enumerate(
-        {"in phase only": plain(), "with quadrature": corrected()}.items()
-    ):
-        sol = integrate(
-            LieTerm(field), solver, t0, args.duration, y0(), args, num_steps=n, save_every=1
-        )
-        ys = np.asarray(sol.ys)
-        times = args.duration * np.arange(1, n + 1) / n
-        up, down = axes[:, column]
+    colours = figures.BLUE, figures.ORANGE, figures.VERMILION, figures.PURPLE
+    pulses = {"in phase only": plain(), "with quadrature": corrected()}
+    for (up, down), (name, args) in zip(axes.T, pulses.items(), strict=True):
+        steps = dict(t1=args.duration, num_steps=1200, save_every=1)
+        times, ys = solve(problem(), solver, args=args, **steps)
         loss = float(infidelity(ys[-1], args))
         up.set_title(f"{name}: infidelity {loss:.1e}")
         up.plot(times, np.asarray(drive(times, args)), color="0.8", linewidth=0.8, label="drive")
-        for part, label, colour in zip(
-            envelope(times, args), ("in phase", "quadrature"), ("#0072B2", "#D55E00"), strict=True
-        ):
-            up.plot(times, np.asarray(part), color=colour, label=label)
-        for k, colour in enumerate(["#0072B2", "#E69F00", "#D55E00", "#CC79A7"]):
+        in_phase, quadrature = envelope(times, args)
+        up.plot(times, np.asarray(in_phase), color=figures.BLUE, label="in phase")
+        up.plot(times, np.asarray(quadrature), color=figures.VERMILION, label="quadrature")
+        for k, colour in enumerate(colours):
             down.semilogy(times, np.abs(ys[:, k, 0]) ** 2, color=colour, label=f"level {k}")
         down.set(ylim=(1e-7, 2), xlabel="time, ns")
     axes[0, 0].set_ylabel("rad/ns")

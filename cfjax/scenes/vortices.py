@@ -17,7 +17,7 @@ Myerscough & Frank, Explicit, parallel Poisson integration of point vortices on 
 Comput. Appl. Math. 304 (2016), doi:10.1016/j.cam.2016.02.053.
 """
 
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import diffrax
 import jax
@@ -25,25 +25,14 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
-from .. import (
-    CF4,
-    RKMK8,
-    BlanesMoan4,
-    BlanesMoan6,
-    LieTerm,
-    Rotation,
-    Strang,
-    WorkPrecision,
-    integrate,
-    work_precision,
-)
+import cfjax
 
-if TYPE_CHECKING:
-    from matplotlib.figure import Figure
+from . import _figures as figures
+from ._scene import by_dop853, by_name, in_plain_space, solve
 
 t0, t1 = 0.0, 20.0
 # To `t1`. The splitting into rounds pays over longer times.
-solver = RKMK8()
+solver = cfjax.RKMK8()
 
 Vortices = Float[Array | np.ndarray, "N 3"]
 Strengths = Float[Array | np.ndarray, " N"]
@@ -66,12 +55,12 @@ def strengths(n: int = 4) -> Float[np.ndarray, " N"]:
     return np.repeat([1.0, -1.0], n)
 
 
-def field(t: Any, y: Vortices, args: Strengths) -> Rotation:
+def field(t: Any, y: Vortices, args: Strengths) -> cfjax.Rotation:
     """The frozen field of all vortices at once."""
     eye = jnp.eye(len(y), dtype=y.dtype)
     off = 1 - jnp.sum(y[:, None] * y[None], axis=-1)
     rate = args[None] * (1 - eye) / (4 * jnp.pi * (off + eye))
-    return Rotation(jnp.sum(rate[..., None] * y[None], axis=1))
+    return cfjax.Rotation(jnp.sum(rate[..., None] * y[None], axis=1))
 
 
 def velocity(t: Any, y: Vortices, args: Strengths) -> Float[Array, "N 3"]:
@@ -87,17 +76,17 @@ def rounds(num_vortices: int = 8) -> diffrax.MultiTerm:
     last = num_vortices - 1
     k = np.arange(last)
 
-    def term(r: int) -> LieTerm:
+    def term(r: int) -> cfjax.LieTerm:
         # The last vortex plays the one that would be its own partner.
         partner = np.append((2 * r - k) % last, r)
         partner[r] = last
 
-        def pairs(t: Any, y: Vortices, args: Strengths) -> Rotation:
+        def pairs(t: Any, y: Vortices, args: Strengths) -> cfjax.Rotation:
             pulls = args[:, None] * y
             off = 1 - jnp.sum(y * y[partner], axis=-1, keepdims=True)
-            return Rotation((pulls + pulls[partner]) / (4 * jnp.pi * off))
+            return cfjax.Rotation((pulls + pulls[partner]) / (4 * jnp.pi * off))
 
-        return LieTerm(pairs)
+        return cfjax.LieTerm(pairs)
 
     return diffrax.MultiTerm(*map(term, range(last)))
 
@@ -121,21 +110,18 @@ def reference(
 
     The error of the default start at 20 is about 2e-11.
     """
-    from scipy.integrate import solve_ivp
 
-    def rate(t: float, flat: np.ndarray) -> np.ndarray:
-        y = flat.reshape(-1, 3)
+    def rate(t: float, y: np.ndarray) -> np.ndarray:
         square = np.sum((y[:, None] - y) ** 2, axis=-1)
         np.fill_diagonal(square, np.inf)
-        return np.cross(args / (2 * np.pi * square) @ y, y).ravel()
+        return np.cross(args / (2 * np.pi * square) @ y, y)
 
-    found = solve_ivp(rate, (0.0, t), start.ravel(), "DOP853", rtol=1e-13, atol=1e-13)
-    return found.y[:, -1].reshape(start.shape)
+    return by_dop853(rate, start, t)
 
 
 def problem() -> dict[str, Any]:
     """What is solved, as arguments of `cfjax.integrate` and `cfjax.work_precision`."""
-    return dict(term=LieTerm(field), t0=t0, t1=t1, y0=y0(), args=strengths())
+    return dict(term=cfjax.LieTerm(field), t0=t0, t1=t1, y0=y0(), args=strengths())
 
 
 def invariants(y: Vortices, args: Any = None) -> dict[str, Array]:
@@ -148,67 +134,59 @@ def invariants(y: Vortices, args: Any = None) -> dict[str, Array]:
     }
 
 
-def chart(**options: Any) -> WorkPrecision:
+def chart(**options: Any) -> cfjax.WorkPrecision:
     """A street of vortices to t = 20, 20 to 1280 equal steps; Tsit5 in plain space."""
-    given, pairs = problem(), rounds()
-    methods: dict[str, Any] = {"CF4": CF4(), "RKMK8": RKMK8()}
-    methods |= {type(s).__name__: (pairs, s) for s in (Strang(), BlanesMoan4(), BlanesMoan6())}
-    methods["Tsit5"] = diffrax.ODETerm(velocity), diffrax.Tsit5()
-    answer, num_steps = reference(t1, given["y0"], given["args"]), [20 * 2**k for k in range(7)]
-    return work_precision(
-        **given, methods=methods, reference=answer, num_steps=num_steps, **options
+    return cfjax.work_precision(
+        **problem(),
+        methods=by_name(cfjax.CF4(), cfjax.RKMK8())
+        | by_name(cfjax.Strang(), cfjax.BlanesMoan4(), cfjax.BlanesMoan6(), term=rounds())
+        | in_plain_space(velocity, diffrax.Tsit5()),
+        reference=reference(t1, y0(), strengths()),
+        num_steps=[20 * 2**k for k in range(7)],
+        **options,
     )
 
 
-def picture() -> "Figure":
+def picture() -> figures.Figure:
     """Paths to t = 40, blue from the north; what three methods of equal cost keep to t = 100.
 
     Paths are faint behind the sphere. In a unit of time the methods evaluate each pair some 120
     times. Errors grow where two vortices of opposite signs meet.
     """
-    from matplotlib.figure import Figure
+    args = jnp.asarray(strengths())
+    steps = dict(t1=100.0, num_steps=1000, save_every=1, save_initial=True)
+    shorter = steps | dict(num_steps=3000, save_every=3)
+    times, rkmk8 = solve(problem(), cfjax.RKMK8(), **steps)
+    _, cf4 = solve(problem(), cfjax.CF4(), **shorter)
+    _, blanes_moan4 = solve(problem(), cfjax.BlanesMoan4(), term=rounds(), **steps)
 
-    start, args, end = jnp.asarray(y0()), jnp.asarray(strengths()), 100.0
-    whole, found = LieTerm(field), {}
-    solvers = (whole, CF4(), 3000), (whole, RKMK8(), 1000), (rounds(), BlanesMoan4(), 1000)
-    for term, solver, n in solvers:
-        options: Any = dict(num_steps=n, save_every=n // 1000, save_initial=True)
-        name = type(solver).__name__
-        found[name] = integrate(term, solver, 0.0, end, start, args, **options)
-
-    figure = Figure((10.5, 3.2), layout="constrained")
+    figure = figures.new(10.5, 3.2)
     grid = figure.add_gridspec(2, 4, width_ratios=[1, 1, 1, 1.2])
-    longitude, latitude = np.mgrid[0 : 2 * np.pi : 37j, 0 : np.pi : 19j]
-    ring = np.sin(latitude)
-    ball = np.stack([ring * np.cos(longitude), ring * np.sin(longitude), np.cos(latitude)])
     towards = np.array([np.cos(0.35), 0.0, np.sin(0.35)])
-    ys, colours = np.asarray(found["BlanesMoan4"].ys), ("#D55E00", "#0072B2")
+    colours = figures.VERMILION, figures.BLUE
     for k, t in enumerate((10, 22, 40)):
-        ax: Any = figure.add_subplot(grid[:, k], projection="3d", computed_zorder=False)
+        ax = figures.sphere(figure, grid[:, k], zoom=1.6, color="0.9")
         ax.view_init(elev=np.degrees(0.35), azim=0)
-        ax.plot_wireframe(*ball, color="0.9", linewidth=0.5, zorder=0)
         # The last eight units of time.
-        for i, path in enumerate(np.swapaxes(ys[10 * t - 80 : 10 * t + 1], 0, 1)):
-            colour = colours[i < len(start) // 2]
+        for i, path in enumerate(np.swapaxes(blanes_moan4[10 * t - 80 : 10 * t + 1], 0, 1)):
+            colour = colours[i < len(args) // 2]
             is_seen = (path @ towards > 0)[:, None]
             ax.plot(*path.T, color=colour, linewidth=0.8, alpha=0.3, zorder=1)
             ax.plot(*np.where(is_seen, path, np.nan).T, color=colour, linewidth=1.5, zorder=2)
             ax.scatter(*path[-1], s=22, color=colour, alpha=1 if is_seen[-1] else 0.25, zorder=3)
         ax.set_title(f"t = {t}", y=1.0, size=10)
-        ax.set_axis_off()
-        ax.set_box_aspect((1, 1, 1), zoom=1.6)
 
     labels = {
-        "CF4": ("#009E73", (40, 1e-6)),
-        "RKMK8": ("#E69F00", (40, 3e-12)),
-        "BlanesMoan4": ("k", (48, 3e-15)),
+        "CF4": (cf4, figures.GREEN, (40, 1e-6)),
+        "RKMK8": (rkmk8, figures.ORANGE, (40, 3e-12)),
+        "BlanesMoan4": (blanes_moan4, "k", (48, 3e-15)),
     }
     for row, value in enumerate((energy, momentum)):
         ax = figure.add_subplot(grid[row, 3])
-        for method, (colour, place) in labels.items():
-            kept = np.asarray(jax.vmap(value, in_axes=(0, None))(found[method].ys, args))
-            off = np.abs(kept - kept[0]).reshape(len(kept), -1).max(axis=-1)
-            ax.semilogy(found[method].ts, np.maximum(off, 1e-17), color=colour, linewidth=1)
+        for method, (ys, colour, place) in labels.items():
+            values = np.asarray(jax.vmap(value, in_axes=(0, None))(ys, args))
+            off = np.abs(values - values[0]).reshape(len(values), -1).max(axis=-1)
+            ax.semilogy(times, np.maximum(off, 1e-17), color=colour, linewidth=1)
             if row == 1:
                 ax.text(*place, method, color=colour, size=9)
                 ax.set(xlabel="t")

@@ -11,7 +11,7 @@ Source: Lüscher, Properties and uses of the Wilson flow in lattice QCD, JHEP 08
 doi:10.1007/JHEP08(2010)071.
 """
 
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import diffrax
 import jax.numpy as jnp
@@ -19,26 +19,15 @@ import numpy as np
 from jax import lax
 from jaxtyping import Array, Complex, Float
 
-from .. import (
-    CF3,
-    CF4,
-    CK34,
-    CK54,
-    LeftMatrix,
-    LieTerm,
-    Luscher3,
-    WorkPrecision,
-    integrate,
-    work_precision,
-)
+import cfjax
+
 from .._numerics.matmul import matmul
 from .._xla import call
-
-if TYPE_CHECKING:
-    from matplotlib.figure import Figure
+from . import _figures as figures
+from ._scene import by_dop853, by_name, in_plain_space, solve
 
 t0, t1 = 0.0, 0.5
-solver = CF4()
+solver = cfjax.CF4()
 
 Links = Complex[Array | np.ndarray, "d *sides 3 3"]
 
@@ -54,9 +43,9 @@ def y0(side: int = 4, seed: int = 0, dimensions: int = 4) -> Complex[np.ndarray,
     return q / np.linalg.det(q)[..., None, None] ** (1 / 3)
 
 
-def field(t: Any, y: Links, args: Any = None) -> LeftMatrix:
+def field(t: Any, y: Links, args: Any = None) -> cfjax.LeftMatrix:
     """The frozen field, with `a` of shape `(d, *sides, 3, 3)`."""
-    return LeftMatrix(generator(y))
+    return cfjax.LeftMatrix(generator(y))
 
 
 def generator(y: Links) -> Complex[Array, "d *sides 3 3"]:
@@ -110,7 +99,7 @@ def action(y: Links) -> Float[Array, ""]:
 
 def problem() -> dict[str, Any]:
     """What is solved, as arguments of `cfjax.integrate` and `cfjax.work_precision`."""
-    return dict(term=LieTerm(field), t0=t0, t1=t1, y0=y0())
+    return dict(term=cfjax.LieTerm(field), t0=t0, t1=t1, y0=y0())
 
 
 def invariants(y: Links, args: Any = None) -> dict[str, Array]:
@@ -123,20 +112,13 @@ def invariants(y: Links, args: Any = None) -> dict[str, Array]:
     }
 
 
-def chart(**options: Any) -> WorkPrecision:
+def chart(**options: Any) -> cfjax.WorkPrecision:
     """The Wilson flow of 4^4 links of SU(3), 5 to 80 equal steps; Tsit5 in plain space."""
-    given = problem()
-    return work_precision(
-        **given,
-        methods={
-            "CF3": CF3(),
-            "CF4": CF4(),
-            "Luscher3": Luscher3(),
-            "CK34": CK34(),
-            "CK54": CK54(),
-            "Tsit5": (diffrax.ODETerm(velocity), diffrax.Tsit5()),
-        },
-        reference=reference(t1, given["y0"]),
+    return cfjax.work_precision(
+        **problem(),
+        methods=by_name(cfjax.CF3(), cfjax.CF4(), cfjax.Luscher3(), cfjax.CK34(), cfjax.CK54())
+        | in_plain_space(velocity, diffrax.Tsit5()),
+        reference=reference(t1, y0()),
         num_steps=[5 * 2**k for k in range(5)],
         **options,
     )
@@ -146,12 +128,9 @@ def reference(
     t: float, start: Complex[np.ndarray, "d *sides 3 3"]
 ) -> Complex[np.ndarray, "d *sides 3 3"]:
     """The links at time `t`, by SciPy's DOP853 in plain space, with a tolerance of 1e-12."""
-    from scipy.integrate import solve_ivp
-
     d = len(start)
 
-    def rate(t: float, flat: np.ndarray) -> np.ndarray:
-        y = flat.view(complex).reshape(start.shape)
+    def rate(t: float, y: np.ndarray) -> np.ndarray:
         out = np.empty_like(y)
         for mu in range(d):
             total = np.zeros_like(y[mu])
@@ -165,24 +144,20 @@ def reference(
             z = (loop.conj().swapaxes(-1, -2) - loop) / 2
             z = z - np.trace(z, axis1=-2, axis2=-1)[..., None, None] * np.eye(3) / 3
             out[mu] = z @ y[mu]
-        return out.ravel().view(float)
+        return out
 
-    flat = np.ascontiguousarray(start).ravel().view(float)
-    found = solve_ivp(rate, (0.0, t), flat, "DOP853", rtol=1e-12, atol=1e-12)
-    return np.ascontiguousarray(found.y[:, -1]).view(complex).reshape(start.shape)
+    return by_dop853(rate, start, t, rtol=1e-12, atol=1e-12)
 
 
-def picture(side: int = 8) -> "Figure":
+def picture(side: int = 8) -> figures.Figure:
     """A slice of a larger lattice: where the action is, as it flows away, to t = 3."""
-    from matplotlib.figure import Figure
-
-    start = y0(side)
-    # The links at t = 0.1, 0.2, ...
-    ys: Any = integrate(LieTerm(field), solver, t0, 3.0, start, num_steps=60, save_every=2).ys
-    states = {0.0: start, 0.1: ys[0], 0.3: ys[2], 1.0: ys[9], 3.0: ys[29]}
-    figure = Figure((2.2 * len(states), 3.1), layout="constrained")
-    for ax, (t, y) in zip(figure.subplots(1, len(states)), states.items(), strict=True):
-        values = np.asarray(density(jnp.asarray(y)))
+    # The links at t = 0, 0.1, 0.2, ...
+    steps = dict(num_steps=60, save_every=2, save_initial=True)
+    times, ys = solve(problem(), solver, t1=3.0, y0=y0(side), **steps)
+    shots = (0, 1, 3, 10, 30)
+    figure = figures.new(2.2 * len(shots), 3.1)
+    for ax, k in zip(figure.subplots(1, len(shots)), shots, strict=True):
+        t, values = times[k], np.asarray(density(jnp.asarray(ys[k])))
         ax.imshow(values[:, :, 0, 0], interpolation="bicubic", vmin=0, cmap="magma")
         ax.set(xticks=[], yticks=[], title=f"t = {t:g}, mean {values.mean():.2g}")
         figure.colorbar(ax.images[0], ax=ax, location="bottom", label="action of a point")

@@ -22,7 +22,7 @@ simulation of spherical ideal hydrodynamics, J. Fluid Mech. 884 (2020), A22.
 """
 
 from functools import lru_cache
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import diffrax
 import jax.numpy as jnp
@@ -30,25 +30,14 @@ import numpy as np
 from jax import lax
 from jaxtyping import Array, Complex, Float
 
-from .. import (
-    CF3,
-    CF4,
-    CF43,
-    CF54,
-    Congruence,
-    LieTerm,
-    WorkPrecision,
-    integrate,
-    tangent,
-    work_precision,
-)
+import cfjax
 
-if TYPE_CHECKING:
-    from matplotlib.figure import Figure
+from . import _figures as figures
+from ._scene import by_dop853, by_name, in_plain_space, solve
 
 t0, t1 = 0.0, 4.0
 # Over shorter times than a million its energy is better than that of ImplicitMidpoint.
-solver = CF4()
+solver = cfjax.CF4()
 
 
 def y0(n: int = 32, seed: int = 0, degree: int = 6) -> Complex[np.ndarray, "N N"]:
@@ -76,16 +65,16 @@ def inverse_laplacian(n: int) -> Float[np.ndarray, "N N N"]:
     Element k acts on the k-th diagonal above the main one and the (n - k)-th below it, which
     together have n entries. Takes 8 n^3 bytes.
     """
-    found = np.zeros((n, n, n))
+    inverse = np.zeros((n, n, n))
     for m in range(n):
         values = np.arange(m, n) * np.arange(m + 1.0, n + 1)
         # A constant has no stream function.
         factors = np.where(values > 0, -1 / np.maximum(values, 1), 0)
         block = (_harmonics(n, m) * factors) @ _harmonics(n, m).T
-        found[m, : n - m, : n - m] = block
+        inverse[m, : n - m, : n - m] = block
         if m > 0:
-            found[n - m, m:, m:] = block
-    return found
+            inverse[n - m, m:, m:] = block
+    return inverse
 
 
 def stream_function(
@@ -101,17 +90,19 @@ def stream_function(
     return rows[(k - i) % len(y), i]
 
 
-def field(t: Any, y: Complex[Array, "N N"], args: Float[Array | np.ndarray, "N N N"]) -> Congruence:
+def field(
+    t: Any, y: Complex[Array, "N N"], args: Float[Array | np.ndarray, "N N N"]
+) -> cfjax.Congruence:
     """The frozen field, with `args = inverse_laplacian(N)`."""
     # As it is skew-Hermitian, this is a conjugation that keeps matrices Hermitian to the last bit.
-    return Congruence((0.5j * (len(y) ** 2 - 1) ** 0.5) * stream_function(y, args))
+    return cfjax.Congruence((0.5j * (len(y) ** 2 - 1) ** 0.5) * stream_function(y, args))
 
 
 def velocity(
     t: Any, y: Complex[Array, "N N"], args: Float[Array | np.ndarray, "N N N"]
 ) -> Complex[Array, "N N"]:
     """The same field in plain space, where methods lose the eigenvalues."""
-    return tangent(field(t, y, args), y)
+    return cfjax.tangent(field(t, y, args), y)
 
 
 def energy(
@@ -199,7 +190,6 @@ def reference(t: float, start: Complex[np.ndarray, "N N"]) -> Complex[np.ndarray
     The error of `y0()` at 4 is about 1e-11.
     """
     from scipy import sparse
-    from scipy.integrate import solve_ivp
     from scipy.sparse.linalg import splu
 
     n = len(start)
@@ -212,21 +202,20 @@ def reference(t: float, start: Complex[np.ndarray, "N N"]) -> Complex[np.ndarray
     solve = splu(sparse.csc_array(laplacian)).solve
     scale = 0.5j * np.sqrt(n**2 - 1)
 
-    def rate(t: float, flat: np.ndarray) -> np.ndarray:
-        y = flat.view(complex).reshape(n, n)
-        p = np.ascontiguousarray(solve(flat.reshape(-1, 2))).view(complex).reshape(n, n)
-        return (scale * (p @ y - y @ p)).ravel().view(float)
+    def rate(t: float, y: np.ndarray) -> np.ndarray:
+        # Real and imaginary parts are two right hand sides.
+        parts = solve(y.reshape(-1, 1).view(float))
+        p = np.ascontiguousarray(parts).view(complex).reshape(n, n)
+        return scale * (p @ y - y @ p)
 
-    flat = np.ascontiguousarray(start).ravel().view(float)
-    found = solve_ivp(rate, (0.0, t), flat, "DOP853", rtol=1e-13, atol=1e-13).y[:, -1]
-    return np.ascontiguousarray(found).view(complex).reshape(n, n)
+    return by_dop853(rate, start, t)
 
 
 def problem() -> dict[str, Any]:
     """What is solved, as arguments of `cfjax.integrate` and `cfjax.work_precision`."""
     start = y0()
     inverse = jnp.asarray(inverse_laplacian(len(start)))
-    return dict(term=LieTerm(field), t0=t0, t1=t1, y0=start, args=inverse)
+    return dict(term=cfjax.LieTerm(field), t0=t0, t1=t1, y0=start, args=inverse)
 
 
 def invariants(y: Complex[Array, "N N"], args: Any = None) -> dict[str, Array]:
@@ -238,38 +227,28 @@ def invariants(y: Complex[Array, "N N"], args: Any = None) -> dict[str, Array]:
     }
 
 
-def chart(**options: Any) -> WorkPrecision:
+def chart(**options: Any) -> cfjax.WorkPrecision:
     """Vorticity on the sphere, N = 32, to t = 4, 10 to 320 equal steps; Tsit5 in plain space."""
-    given = problem()
-    space = diffrax.ODETerm(velocity)
-    return work_precision(
-        **given,
-        methods={
-            "CF3": CF3(),
-            "CF4": CF4(),
-            "CF43": CF43(),
-            "CF54": CF54(),
-            "Dopri5": (space, diffrax.Dopri5()),
-            "Tsit5": (space, diffrax.Tsit5()),
-        },
-        reference=reference(t1, given["y0"]),
+    return cfjax.work_precision(
+        **problem(),
+        methods=by_name(cfjax.CF3(), cfjax.CF4(), cfjax.CF43(), cfjax.CF54())
+        | in_plain_space(velocity, diffrax.Dopri5(), diffrax.Tsit5()),
+        reference=reference(t1, y0()),
         num_steps=[10 * 2**k for k in range(6)],
         **options,
     )
 
 
-def picture(n: int = 64) -> "Figure":
+def picture(n: int = 64) -> figures.Figure:
     """Random vorticity that winds up into a few vortices, to t = 60, and its stream function."""
-    from matplotlib.figure import Figure
-
     start, inverse = y0(n), jnp.asarray(inverse_laplacian(n))
-    times, options = [0, 4, 8, 16, 60], dict(num_steps=600, save_every=40)
-    ys: Any = integrate(LieTerm(field), solver, 0.0, 60.0, start, inverse, **options).ys
+    times, steps = [0, 4, 8, 16, 60], dict(num_steps=600, save_every=40, save_initial=True)
+    _, ys = solve(problem(), solver, t1=60.0, y0=start, args=inverse, **steps)
     latitude, longitude = np.linspace(-np.pi / 2, np.pi / 2, 121), np.linspace(-np.pi, np.pi, 241)
-    figure = Figure((2.8 * len(times), 3.2), layout="constrained")
+    figure = figures.new(2.8 * len(times), 3.2)
     rows: Any = [], []
     for k, t in enumerate(times):
-        y = np.asarray(ys[t // 4 - 1]) if t else start
+        y = ys[t // 4]
         p = np.asarray(stream_function(y, inverse))
         for row, (matrix, most) in enumerate([(y, 3.0), (p, 0.4)]):
             ax: Any = figure.add_subplot(
