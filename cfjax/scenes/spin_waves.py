@@ -90,6 +90,11 @@ def wave(
     return np.stack([np.sin(tilt) * np.cos(phase), np.sin(tilt) * np.sin(phase), z], axis=-1)
 
 
+def reference(t: float) -> Float[np.ndarray, "8 8 3"]:
+    """The exact solution of `problem` at time `t`: one wave."""
+    return wave(t)
+
+
 def amplitudes(y: Spins, waves: Int[Array | np.ndarray, "waves 2"]) -> Complex[Array, " waves"]:
     """The waves in a state; `waves` has the turns along each axis."""
     across = jnp.fft.fft2(lax.complex(y[..., 0], y[..., 1]))
@@ -144,7 +149,7 @@ def chart(**options: Any) -> cfjax.WorkPrecision:
         **problem(),
         methods=by_name(cfjax.Strang(), cfjax.BlanesMoan4(), cfjax.BlanesMoan6())
         | by_name(cfjax.CF4(), cfjax.CF54(), term=cfjax.LieTerm(spins.field)),
-        reference=wave(t1),
+        reference=reference(t1),
         num_steps=[10 * 2**k for k in range(6)],
         **options,
     )
