@@ -21,15 +21,12 @@ def new(width: float, height: float) -> Figure:
     return Figure((width, height), layout="constrained")
 
 
-def sphere(
-    figure: Figure, *place: Any, zoom: float, color: str = "0.88", meridians: int = 36
-) -> Any:
+def sphere(figure: Figure, *place: Any, zoom: float, color: str = "0.88") -> Any:
     """Axes with a wire frame of the unit sphere, behind all that is drawn later."""
     axes: Any = figure.add_subplot(*place, projection="3d", computed_zorder=False)
-    longitude = np.linspace(0, 2 * np.pi, meridians + 1)[:, None]
-    latitude = np.linspace(0, np.pi, meridians // 2 + 1)
-    ring, height = np.sin(latitude), np.cos(latitude) + 0 * longitude
-    frame = ring * np.cos(longitude), ring * np.sin(longitude), height
+    longitude, latitude = np.mgrid[0 : 2 * np.pi : 37j, 0 : np.pi : 19j]
+    ring = np.sin(latitude)
+    frame = ring * np.cos(longitude), ring * np.sin(longitude), np.cos(latitude)
     axes.plot_wireframe(*frame, color=color, linewidth=0.5, zorder=0)
     axes.set_axis_off()
     axes.set_box_aspect((1, 1, 1), zoom=zoom)

@@ -157,10 +157,16 @@ def picture() -> figures.Figure:
     middle = jnp.broadcast_to(jnp.asarray([0.0, 1.0, 0.0], ys["q"].dtype), ys["m"].shape)
     path = np.asarray(cfjax.quaternion_rotate(ys["q"], middle, layout="wxyz"))
     figure = figures.new(9.0, 4.2)
-    sphere = figures.sphere(figure, 1, 2, 1, zoom=1.3, color="0.85", meridians=24)
+    sphere: Any = figure.add_subplot(1, 2, 1, projection="3d")
+    longitude, latitude = np.mgrid[0 : 2 * np.pi : 25j, 0 : np.pi : 13j]
+    ring = np.sin(latitude)
+    ball = ring * np.cos(longitude), ring * np.sin(longitude), np.cos(latitude)
+    sphere.plot_wireframe(*ball, color="0.85", linewidth=0.5)
     sphere.plot(*path.T, color=figures.BLUE, linewidth=1.2)
     sphere.scatter(*path[0], color=figures.VERMILION, s=30)
     sphere.set(title="The middle axis, from the dot on")
+    sphere.set_axis_off()
+    sphere.set_box_aspect((1, 1, 1), zoom=1.3)
     body = figure.add_subplot(1, 2, 2)
     for name, values, style in zip("123", ys["m"].T, ("-", "-", ":"), strict=True):
         body.plot(times, values, style, label=f"axis {name}")
