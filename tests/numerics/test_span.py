@@ -59,13 +59,13 @@ def test_a_joint_span_has_each_block_once_and_the_corner_in_front():
     span = Span.joint([made(FIRST, SECOND), made(Corner(P), SECOND), made(THIRD)])
     assert isinstance(span.blocks[0], Corner)
     assert len(span.blocks) == 4
-    assert {span.position(x) for x in (FIRST, SECOND, THIRD)} == {1, 2, 3}
+    assert {span.index(x) for x in (FIRST, SECOND, THIRD)} == {1, 2, 3}
     w = whole(span.blocks)
     np.testing.assert_allclose(span.gram, w.T @ w, rtol=0, atol=1e-14)
     # Another array with the same values is another block.
-    assert span.position(FIRST + 0) == -1
+    assert span.index(FIRST + 0) == -1
     other = made(SECOND, FIRST)
-    np.testing.assert_array_equal(w[:, span.places(other)], whole(other.blocks))
+    np.testing.assert_array_equal(w[:, span.column_indices(other)], whole(other.blocks))
 
 
 def test_the_square_of_many_rows():

@@ -1,0 +1,32 @@
+"""The bounds of Taylor polynomials. Chebyshev series are tested where they are used."""
+
+import math
+
+import mpmath as mp
+import pytest
+
+from cfjax._numerics.expm_series import TAYLOR_THETA
+
+UNIT = {"float32": 2.0**-24, "float64": 2.0**-53}
+
+
+@pytest.mark.parametrize("precision", UNIT)
+def test_the_bounds_are_where_the_backward_error_reaches_the_unit_roundoff(precision):
+    """With `log(exp(-x) T(x)) = sum_k c_k x^k` it is `sum_k |c_k| theta^(k-1)`."""
+    for degree, theta in TAYLOR_THETA[precision].items():
+        length = degree + 20  # Beyond, less than 1e-12 of the first term.
+        with mp.workdps(40):
+            one = [mp.mpf(1) / math.factorial(k) for k in range(length)]
+            # exp(-x) T(x) = 1 - exp(-x) (the rest of the series).
+            q = [
+                -sum(one[i] * (-1) ** (k - i) * one[k - i] for i in range(degree + 1, k + 1))
+                for k in range(length)
+            ]
+            c = [mp.mpf(0)] * length
+            for k in range(degree + 1, length):
+                c[k] = q[k] - sum(i * c[i] * q[k - i] for i in range(degree + 1, k)) / k
+
+        def backward(x, c=c):
+            return sum(abs(float(a)) * x ** (k - 1) for k, a in enumerate(c) if a)
+
+        assert backward(theta) <= UNIT[precision] < backward(theta * 1.004)
