@@ -16,8 +16,8 @@ Nothing outside may import from the files within. `README.md` here says what eac
 """
 
 from . import limits as limits
-from .call import call as call
 from .loop import repeat as repeat
+from .materialise import call as call
 from .materialise import computed_once as computed_once
 from .materialise import materialised as materialised
 from .materialise import materialised_if_long as materialised_if_long

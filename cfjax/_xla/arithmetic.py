@@ -11,8 +11,8 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 from jax import lax
-from jax.extend.core import JaxprEqn
 
+from .jaxprs import is_inexact
 from .limits import MAX_LENGTH, MAX_PRODUCT
 from .struct_of_arrays import (
     Call,
@@ -20,15 +20,14 @@ from .struct_of_arrays import (
     aligned,
     common,
     conformed,
-    is_inexact,
-    known,
     spread,
+    static_value,
     struct_of_arrays,
 )
 
 
 def elementwise(call: Call) -> StructOfArrays | None:
-    which = known(call.values[0])
+    which = static_value(call.values[0])
     if call.eqn.primitive.name == "select_n" and which is not None and not call.is_large:
         return _chosen(call, which)
     if not call.shape:
@@ -46,14 +45,14 @@ def elementwise(call: Call) -> StructOfArrays | None:
     if not call.is_large:
         # Each on its own, so that a derivative has the order of sums that JAX has.
         return StructOfArrays(map(compute, *columns), call.shape)
-    made: dict[Any, Any] = {}
+    computed: dict[Any, Any] = {}
 
     def entry(*row: Any) -> Any:
         key = tuple(map(id, row))
-        if key not in made:
+        if key not in computed:
             # With the row, so that none of it is forgotten and its identity used again.
-            made[key] = compute(*aligned(row)), row
-        return made[key][0]
+            computed[key] = compute(*aligned(row)), row
+        return computed[key][0]
 
     return StructOfArrays(map(entry, *columns), call.shape, is_short)
 
@@ -66,14 +65,14 @@ def _chosen(call: Call, which: np.ndarray) -> StructOfArrays:
 
 
 def reduced(call: Call) -> StructOfArrays | None:
-    x, axes = call.first(), call.params["axes"]
+    x, axes, name = call.first(), call.params["axes"], call.eqn.primitive.name
     positions = tuple(k for k, axis in enumerate(x.long) if axis in axes)
-    kept = [k for k in range(len(x.shape)) if k not in axes]
-    rows = x.places.transpose(*kept, *axes)
-    rows = rows.reshape(math.prod(rows.shape[: len(kept)]), -1)
-    if _is_lexicographic(call.eqn) or (
-        positions and call.eqn.primitive.name in _EXTREMES and rows.shape[1] > 1
-    ):
+    free = [k for k in range(len(x.shape)) if k not in axes]
+    rows = x.places.transpose(*free, *axes)
+    rows = rows.reshape(math.prod(rows.shape[: len(free)]), -1)
+    aval: Any = call.eqn.outvars[0].aval
+    is_lexicographic = jnp.issubdtype(aval.dtype, jnp.complexfloating)
+    if name in _EXTREMES and (is_lexicographic or (positions and rows.shape[1] > 1)):
         # Of all that are largest each has its share, in whichever column.
         return None
     entries = x.entries
@@ -88,23 +87,12 @@ def reduced(call: Call) -> StructOfArrays | None:
             return call.eqn.primitive.bind(spread(e, sides), **params)
 
         entries = list(map(column, x.entries))
-    combine = _reduction(call.eqn)
+    if name in _EXTREMES and is_inexact(aval):
+        combine = functools.partial(_extreme, _EXTREMES[name])
+    else:
+        combine = functools.partial(functools.reduce, _COMBINED[name])
     outs = (combine(aligned([jnp.asarray(entries[k]) for k in row])) for row in rows)
-    return StructOfArrays(outs, call.shape, [x.is_short[k] for k in kept])
-
-
-def _reduction(eqn: JaxprEqn) -> Callable[[Sequence[Any]], Any]:
-    """What a reduction makes of the entries that it reduces, all of one shape."""
-    name = eqn.primitive.name
-    if name in _EXTREMES and is_inexact(eqn.outvars[0].aval):
-        return functools.partial(_extreme, _EXTREMES[name])
-    return functools.partial(functools.reduce, _COMBINED[name])
-
-
-def _is_lexicographic(eqn: JaxprEqn) -> bool:
-    aval: Any = eqn.outvars[0].aval
-    is_complex = jnp.issubdtype(aval.dtype, jnp.complexfloating)
-    return is_complex and eqn.primitive.name in _EXTREMES
+    return StructOfArrays(outs, call.shape, [x.is_short[k] for k in free])
 
 
 _EXTREMES: dict[str, Callable[[Any, Any], Any]] = {"reduce_max": lax.max, "reduce_min": lax.min}

@@ -4,11 +4,12 @@ import itertools
 from collections.abc import Sequence
 from typing import Any
 
-from jax.extend.core import ClosedJaxpr, Jaxpr, jaxpr_as_fun
+from jax.extend.core import ClosedJaxpr, Jaxpr, Literal, jaxpr_as_fun
 
-from .jaxprs import altered, called, narrowed, value_of, variables
+from .jaxprs import called, narrowed, part_of, variables, without_constants
 from .limits import FUNCTION, MAX_RESULTS_IN_BATCHES
 from .materialise import not_materialised, together
+from .struct_of_arrays import literal
 
 _FREE = frozenset(
     "broadcast_in_dim cfjax_pack cfjax_unpack convert_element_type copy reshape slice squeeze "
@@ -22,29 +23,24 @@ def in_two(program: ClosedJaxpr, first: int, operands: Sequence[Any]) -> list[An
     XLA would compute what leads to each of the others anew. The copy is in parts, each with few
     results, which are materialised together. What is not used is not computed.
     """
-    given = range(len(program.jaxpr.outvars))
-    main, main_takes = narrowed(program, given[:first])
-    rest, rest_takes = narrowed(program, given[first:])
+    results = range(len(program.jaxpr.outvars))
+    main, main_places = narrowed(program, results[:first])
+    tail, tail_places = narrowed(program, results[first:])
     # So that the copy is not seen to be one.
-    inputs = together([operands[k] for k in rest_takes])
-    outs = _in_parts(not_materialised(rest), inputs)
-    return [*called(main, [operands[k] for k in main_takes]), *outs]
+    inputs = together([operands[k] for k in tail_places])
+    outs = _in_parts(not_materialised(tail), inputs)
+    return [*called(main, [operands[k] for k in main_places]), *outs]
 
 
 def _in_parts(program: ClosedJaxpr, operands: Sequence[Any]) -> list[Any]:
-    jaxpr = program.jaxpr
-    names, values = (*jaxpr.constvars, *jaxpr.invars), (*program.consts, *operands)
-    env: dict[Any, Any] = dict(zip(names, values, strict=True))
+    jaxpr = without_constants(program).jaxpr
+    env: dict[Any, Any] = dict(zip(jaxpr.invars, (*program.consts, *operands), strict=True))
     for start, stop in itertools.pairwise(_ends_of_few(jaxpr)):
-        eqns = jaxpr.eqns[start:stop]
-        made = {v for e in eqns for v in e.outvars}
-        taken = dict.fromkeys(v for e in eqns for v in variables(e.invars) if v not in made)
         later = [v for e in jaxpr.eqns[stop:] for v in variables(e.invars)]
-        given = dict.fromkeys(v for v in (*later, *variables(jaxpr.outvars)) if v in made)
-        part = altered(jaxpr, eqns=eqns, constvars=[], invars=list(taken), outvars=list(given))
-        outs = together(jaxpr_as_fun(ClosedJaxpr(part, []))(*(env[v] for v in taken)))
-        env.update(zip(given, outs, strict=True))
-    return [value_of(v, env) for v in jaxpr.outvars]
+        part = part_of(jaxpr, jaxpr.eqns[start:stop], [*later, *variables(jaxpr.outvars)])
+        outs = together(jaxpr_as_fun(ClosedJaxpr(part, []))(*(env[v] for v in part.invars)))
+        env.update(zip(part.outvars, outs, strict=True))
+    return [literal(v) if isinstance(v, Literal) else env[v] for v in jaxpr.outvars]
 
 
 def _ends_of_few(jaxpr: Jaxpr) -> list[int]:
@@ -53,25 +49,17 @@ def _ends_of_few(jaxpr: Jaxpr) -> list[int]:
     A part is also not too long for one function.
     """
     n = len(jaxpr.eqns)
-    last = _last_uses(jaxpr)
+    last_uses = {v: k for k, eqn in enumerate(jaxpr.eqns) for v in variables(eqn.invars)}
+    last_uses.update(dict.fromkeys(variables(jaxpr.outvars), n))
     ends = [0]
     while ends[-1] < n:
-        live, length, found = set(), 0, []
+        live, length, choices = set(), 0, []
         for k in range(ends[-1], n):
             eqn = jaxpr.eqns[k]
             length += eqn.primitive.name not in _FREE
-            live = {v for v in (*live, *eqn.outvars) if last.get(v, -1) > k}
-            found.append((len(live) > MAX_RESULTS_IN_BATCHES and len(live), -k))
+            live = {v for v in (*live, *eqn.outvars) if last_uses.get(v, -1) > k}
+            choices.append((len(live) > MAX_RESULTS_IN_BATCHES and len(live), -k))
             if length > FUNCTION:
                 break
-        ends.append(1 - min(found)[1])
+        ends.append(1 - min(choices)[1])
     return ends
-
-
-def _last_uses(jaxpr: Jaxpr) -> dict[Any, int]:
-    """The number of the operation that uses a value last; that after the last one for results."""
-    last = dict.fromkeys(variables(jaxpr.outvars), len(jaxpr.eqns))
-    for k, eqn in reversed(list(enumerate(jaxpr.eqns))):
-        for v in variables(eqn.invars):
-            last.setdefault(v, k)
-    return last

@@ -1,7 +1,6 @@
 """Programs of JAX as values: what they need, what reaches what, parts of them, their evaluation."""
 
-import functools
-import weakref
+import itertools
 from collections.abc import Callable, Container, Hashable, Iterable, Sequence
 from typing import Any
 
@@ -26,33 +25,36 @@ from jaxtyping import Array
 call_p = Primitive("cfjax_call")
 call_p.multiple_results = True
 
-# Operations that call a program, and under which parameter. Where nothing is differentiated any
-# more, rules for that are not needed either.
+# Operations that call a program, and under which parameter.
 CALLS = {
     "cfjax_call": "program",
     "closed_call": "call_jaxpr",
     "custom_jvp_call": "call_jaxpr",
     "custom_vmap_call": "call",
     "jit": "jaxpr",
-    "pjit": "jaxpr",
 }
+# Those that are opened in what may be differentiated again; and where nothing is differentiated any
+# more, and rules for that are not needed either.
+OPENED = frozenset(("jit",))
+OPENED_LAST = OPENED | {"custom_jvp_call"}
 
 
-def program_of(fun: Callable[..., Sequence[Array]], *structs: Any) -> ClosedJaxpr:
-    made = jax.make_jaxpr(fun)(*structs)
-    return ClosedJaxpr(without_dead_code(made.jaxpr), made.consts)
+def program_of(fun: Callable[..., Sequence[Array]], *operands: Any) -> ClosedJaxpr:
+    closed = jax.make_jaxpr(fun)(*operands)
+    return ClosedJaxpr(without_dead_code(closed.jaxpr), closed.consts)
 
 
-def structs(atoms: Sequence[Any]) -> list[jax.ShapeDtypeStruct]:
-    return structs_of([v.aval for v in atoms])
-
-
-def structs_of(avals: Sequence[Any]) -> list[jax.ShapeDtypeStruct]:
+def structs(avals: Sequence[Any]) -> list[jax.ShapeDtypeStruct]:
     return [jax.ShapeDtypeStruct(aval.shape, aval.dtype) for aval in avals]
 
 
 def variables(atoms: Iterable[Any]) -> list[Any]:
     return [v for v in atoms if not isinstance(v, Literal)]
+
+
+def are_among(atoms: Iterable[Any], some: Container[Any]) -> list[bool]:
+    """Which of the atoms are some variables. JAX's literals have no hash."""
+    return [not isinstance(v, Literal) and v in some for v in atoms]
 
 
 def altered(jaxpr: Jaxpr, **parts: Any) -> Jaxpr:
@@ -73,61 +75,74 @@ def is_inexact(x: Any) -> bool:
 
 def without_dead_code(jaxpr: Jaxpr) -> Jaxpr:
     """Only what the results need."""
-    wanted = set(variables(jaxpr.outvars))
-    kept = []
-    for eqn in reversed(jaxpr.eqns):
-        if eqn.effects or not wanted.isdisjoint(eqn.outvars):
-            kept.append(eqn)
-            wanted.update(variables(eqn.invars))
-    return jaxpr.replace(eqns=kept[::-1])
+    return jaxpr.replace(eqns=live(jaxpr.eqns, variables(jaxpr.outvars)))
+
+
+def live(eqns: Sequence[JaxprEqn], outvars: Iterable[Any]) -> list[JaxprEqn]:
+    """The equations that the results need."""
+    needed, reverse = set(outvars), []
+    for eqn in reversed(eqns):
+        if eqn.effects or not needed.isdisjoint(eqn.outvars):
+            reverse.append(eqn)
+            needed.update(variables(eqn.invars))
+    return reverse[::-1]
+
+
+def part_of(jaxpr: Jaxpr, eqns: Sequence[JaxprEqn], needed: Iterable[Any]) -> Jaxpr:
+    """Some equations as a program that returns what is needed of them, and takes what it needs."""
+    defined = {v for eqn in eqns for v in eqn.outvars}
+    outvars = list(dict.fromkeys(v for v in needed if v in defined))
+    eqns = live(eqns, outvars)
+    operands = dict.fromkeys(v for e in eqns for v in variables(e.invars) if v not in defined)
+    return altered(jaxpr, constvars=[], invars=list(operands), eqns=eqns, outvars=outvars)
 
 
 def narrowed(
-    program: ClosedJaxpr, gives: Sequence[int] | None = None, takes: Sequence[int] | None = None
+    program: ClosedJaxpr, results: Sequence[int], operands: Sequence[int] | None = None
 ) -> tuple[ClosedJaxpr, Sequence[int]]:
-    """A program for some of the results, by default all, and the operands that it takes.
+    """A program for some of the results, and the operands that it takes.
 
     By default these are those that it needs.
     """
     jaxpr = program.jaxpr
-    outvars = jaxpr.outvars if gives is None else [jaxpr.outvars[k] for k in gives]
-    code = without_dead_code(altered(jaxpr, outvars=outvars))
-    if takes is None:
+    code = without_dead_code(altered(jaxpr, outvars=[jaxpr.outvars[k] for k in results]))
+    if operands is None:
         used = {v for e in code.eqns for v in variables(e.invars)} | set(variables(code.outvars))
-        takes = [k for k, v in enumerate(code.invars) if v in used]
-    code = altered(code, invars=[code.invars[k] for k in takes])
-    return ClosedJaxpr(code, program.consts), takes
+        operands = [k for k, v in enumerate(code.invars) if v in used]
+    code = altered(code, invars=[code.invars[k] for k in operands])
+    return ClosedJaxpr(code, program.consts), operands
 
 
-def reached(jaxpr: Jaxpr, sources: Sequence[bool]) -> list[bool]:
-    """Which results may depend on some of the operands."""
-    found = {v for v, is_one in zip(jaxpr.invars, sources, strict=True) if is_one}
-
-    def are_found(atoms: Sequence[Any]) -> list[bool]:
-        return [not isinstance(v, Literal) and v in found for v in atoms]
-
+def dependent(
+    jaxpr: Jaxpr, sources: Iterable[Any], among: Callable[[Any], bool] = lambda _: True
+) -> set[Any]:
+    """The sources and all that may depend on them, of the values that are `among` some."""
+    values = set(sources)
     for eqn in jaxpr.eqns:
-        if any(are_found(eqn.invars)):
-            found.update(eqn.outvars)
-    return are_found(jaxpr.outvars)
+        if not values.isdisjoint(variables(eqn.invars)):
+            values.update(filter(among, eqn.outvars))
+    return values
 
 
-def value_of(v: Any, env: dict[Any, Any]) -> Any:
-    """What a name of a program stands for, or its number."""
-    aval: Any = v.aval
-    return jnp.asarray(v.val, aval.dtype) if isinstance(v, Literal) else env[v]
+def reached(jaxpr: Jaxpr, operands: Iterable[bool]) -> list[bool]:
+    """Which results may depend on some of the operands."""
+    return are_among(jaxpr.outvars, dependent(jaxpr, itertools.compress(jaxpr.invars, operands)))
 
 
-def evaluate(jaxpr: Jaxpr, eqn: JaxprEqn, values: Sequence[Any]) -> Sequence[Any]:
+# To make others of: JAX wants to know of each program where it was traced.
+_EMPTY = jax.make_jaxpr(lambda: ())().jaxpr
+
+
+def evaluate(eqn: JaxprEqn, values: Sequence[Any]) -> Sequence[Any]:
     """The results of one operation of a program; None for those that are dropped."""
     # Most are of this kind, and the other way makes a program of each.
     if not eqn.primitive.multiple_results and not any(jaxprs_in_params(eqn.params)):
         return [eqn.primitive.bind(*values, **eqn.params)]
-    known = {v: x for v, x in zip(eqn.invars, values, strict=True) if not isinstance(v, Literal)}
+    env = {v: x for v, x in zip(eqn.invars, values, strict=True) if not isinstance(v, Literal)}
     # JAX's own evaluator knows how every operation is called, in every version of JAX.
     outvars = [v for v in eqn.outvars if not isinstance(v, DropVar)]
-    alone = altered(jaxpr, constvars=[], invars=list(known), outvars=outvars, eqns=[eqn])
-    outs = iter(jaxpr_as_fun(ClosedJaxpr(alone, []))(*known.values()))
+    alone = altered(_EMPTY, invars=list(env), outvars=outvars, eqns=[eqn])
+    outs = iter(jaxpr_as_fun(ClosedJaxpr(alone, []))(*env.values()))
     return [None if isinstance(v, DropVar) else next(outs) for v in eqn.outvars]
 
 
@@ -146,35 +161,36 @@ def without_constants(program: ClosedJaxpr) -> ClosedJaxpr:
     return ClosedJaxpr(altered(jaxpr, constvars=[], invars=invars), [])
 
 
+def renamed(atoms: Iterable[Any], names: dict[Any, Any]) -> list[Any]:
+    """The atoms, of which some variables have other names."""
+    return [v if isinstance(v, Literal) else names.get(v, v) for v in atoms]
+
+
 def flattened(program: ClosedJaxpr, calls: Container[str], is_once: bool = False) -> ClosedJaxpr:
     """The program without calls of some kinds, and `is_once` with everything once that is computed
     alike.
     """
     consts: dict[int, tuple[Var, Any]] = {}
     eqns: list[JaxprEqn] = []
-    known: dict[Any, list[Any]] = {}
+    computed: dict[Any, list[Any]] = {}
 
     def run(program: ClosedJaxpr, atoms: Sequence[Any]) -> list[Any]:
-        jaxpr, env = program.jaxpr, dict(zip(program.jaxpr.invars, atoms, strict=True))
+        jaxpr, names = program.jaxpr, dict(zip(program.jaxpr.invars, atoms, strict=True))
         for v, value in zip(jaxpr.constvars, program.consts, strict=True):
-            env[v], _ = consts.setdefault(id(value), (Var(v.aval), value))
-
-        def read(v: Any) -> Any:
-            return v if isinstance(v, Literal) else env[v]
-
+            names[v], _ = consts.setdefault(id(value), (Var(v.aval), value))
         for eqn in jaxpr.eqns:
-            invars, name = list(map(read, eqn.invars)), eqn.primitive.name
+            invars, name = renamed(eqn.invars, names), eqn.primitive.name
             if name in calls:
                 outvars = run(eqn.params[CALLS[name]], invars)
             else:
                 key = _key(eqn, invars) if is_once else object()
-                outvars = known.get(key)
+                outvars = computed.get(key)
                 if outvars is None:
                     outvars = [v if isinstance(v, DropVar) else Var(v.aval) for v in eqn.outvars]
-                    known[key] = outvars
+                    computed[key] = outvars
                     eqns.append(eqn.replace(invars=invars, outvars=outvars))
-            env.update(zip(eqn.outvars, outvars, strict=True))
-        return list(map(read, jaxpr.outvars))
+            names.update(zip(eqn.outvars, outvars, strict=True))
+        return renamed(jaxpr.outvars, names)
 
     outvars = run(program, program.jaxpr.invars)
     constvars, values = zip(*consts.values(), strict=True) if consts else ((), ())
@@ -201,31 +217,6 @@ def parameters(eqn: JaxprEqn) -> Hashable:
     except TypeError:
         return object()  # Equal to no other, so such operations are never merged.
     return values
-
-
-# Of the programs of a solve, which are differentiated one soon after the other.
-_KEPT = 32
-
-
-def once_for_each_program(fun: Callable[..., Any]) -> Callable[..., Any]:
-    """`fun(program, *rest)`, computed once while one program after the other is differentiated.
-
-    No program is held that JAX has dropped, and of those that JAX keeps, which are thousands, what
-    is derived is kept for the last ones alone.
-    """
-    kept: weakref.WeakKeyDictionary[ClosedJaxpr, dict[Any, Any]] = weakref.WeakKeyDictionary()
-
-    @functools.wraps(fun)
-    def once(program: ClosedJaxpr, *rest: Any) -> Any:
-        found = kept.setdefault(program, {})
-        if rest not in found:
-            found[rest] = fun(program, *rest)
-        result = found[rest]
-        while len(kept) > _KEPT:
-            del kept[next(iter(kept))]
-        return result
-
-    return once
 
 
 @call_p.def_impl

@@ -11,12 +11,12 @@ from jax import lax
 from jax.extend.core import ClosedJaxpr, jaxpr_as_fun
 from jaxtyping import Array, Int, PyTree
 
-from .jaxprs import altered, is_inexact, program_of, reached, structs_of
+from .jaxprs import altered, is_inexact, program_of, reached, structs
 from .limits import MANY, MAX_ENTRIES, MAX_SIZE
 from .pack import pack, unpack
 from .program import read
 from .scope import is_rows
-from .step import one_of
+from .step import OF_FEW, OF_MANY, bound
 
 
 def repeat(
@@ -42,24 +42,25 @@ def repeat(
     leaves, structure = jtu.tree_flatten(carry)
     leaves = list(map(jnp.asarray, leaves))
     program, parameters = reading.program, reading.parameters
-    form, n = _Form.of(leaves, _are_moving(program, leaves)), len(parameters)
+    packing, n = _Packing.of(leaves, program), len(parameters)
 
     def of_parts(*operands: Array) -> list[Array]:
-        return form.packed(jaxpr_as_fun(program)(*operands[:n], *form.unpacked(operands[n:])))
+        return packing.packed(jaxpr_as_fun(program)(*operands[:n], *packing.unpacked(operands[n:])))
 
-    start = form.packed(leaves)
+    start = packing.packed(leaves)
     code = program_of(of_parts, *parameters, *start)
     is_many = not isinstance(num_steps, int) or num_steps > MANY
+    max_lengths = OF_MANY if is_many else OF_FEW
 
     def once(parts: Sequence[Array]) -> list[Array]:
-        return one_of(code, parameters, parts, reading.rows, is_many)
+        return bound(code, parameters, parts, len(parts), reading.rows, max_lengths)
 
     def whole(parts: Sequence[Array]) -> PyTree:
-        return jtu.tree_unflatten(structure, form.unpacked(parts))
+        return jtu.tree_unflatten(structure, packing.unpacked(parts))
 
     keeps = None if keep is None else lambda parts: parts
-    end, kept = _loop(once, start, num_steps, keeps)
-    return whole(end), None if keep is None else keep(jax.vmap(whole)(kept))
+    end, carries = _loop(once, start, num_steps, keeps)
+    return whole(end), None if keep is None else keep(jax.vmap(whole)(carries))
 
 
 def _loop(
@@ -77,52 +78,44 @@ def _loop(
     return lax.fori_loop(0, num_steps, lambda _, carry: step(carry), carry), None
 
 
-def _are_moving(program: ClosedJaxpr, leaves: Sequence[Array]) -> list[bool]:
-    """Which parts of the carry have a derivative: not those behind a `stop_gradient`."""
-    jaxpr = program.jaxpr
-    eqns = [eqn for eqn in jaxpr.eqns if eqn.primitive.name != "stop_gradient"]
-    return reached(altered(jaxpr, eqns=eqns), list(map(is_inexact, program.in_avals)))
-
-
-class _Form(NamedTuple):
+class _Packing(NamedTuple):
     """What is carried in the place of some arrays.
 
-    Those of each group are one vector, and these come first. Short vectors along leading axes are
-    apart, one array for each of their entries.
+    Those of each group are one vector, and these come first. Of the others short vectors along
+    leading axes are apart, one array for each of their entries.
     """
 
     arrays: Sequence[jax.ShapeDtypeStruct]
     groups: Sequence[Sequence[int]]
+    others: Sequence[int]
 
     @classmethod
-    def of(cls, arrays: Sequence[Array], are_moving: Sequence[bool]) -> "_Form":
+    def of(cls, arrays: Sequence[Array], program: ClosedJaxpr) -> "_Packing":
         """Reverse mode does not keep what has no derivative, as what sums have lost, if apart."""
+        eqns = [eqn for eqn in program.jaxpr.eqns if eqn.primitive.name != "stop_gradient"]
+        are_moving = reached(altered(program.jaxpr, eqns=eqns), map(is_inexact, program.in_avals))
         dtype = next((x.dtype for x in arrays if is_inexact(x)), None)
         places = [k for k, x in enumerate(arrays) if x.dtype == dtype and x.size <= MAX_SIZE]
         groups = [[k for k in places if are_moving[k] == moves] for moves in (True, False)]
-        return cls(structs_of(arrays), [group for group in groups if group])
+        others = [k for k in range(len(arrays)) if k not in places]
+        return cls(structs(arrays), [group for group in groups if group], others)
 
     def packed(self, arrays: Sequence[Array]) -> list[Array]:
-        vectors = [jnp.concatenate([jnp.ravel(arrays[k]) for k in group]) for group in self.groups]
-        rest = []
-        for k in self._others():
+        parts = [jnp.concatenate([jnp.ravel(arrays[k]) for k in group]) for group in self.groups]
+        for k in self.others:
             x = arrays[k]
-            rest += unpack(x, axis=x.ndim - 1) if is_rows(x) else [x]
-        return [*vectors, *rest]
+            parts += unpack(x, axis=x.ndim - 1) if is_rows(x) else [x]
+        return parts
 
     def unpacked(self, parts: Sequence[Array]) -> list[Array]:
-        rest, found = iter(parts), {}
+        tail, arrays = iter(parts), {}
         for group in self.groups:
             ends = np.cumsum([self.arrays[k].size for k in group])[:-1]
-            found.update(zip(group, jnp.split(next(rest), ends), strict=True))
-        for k in self._others():
+            arrays.update(zip(group, jnp.split(next(tail), ends), strict=True))
+        for k in self.others:
             x = self.arrays[k]
             if is_rows(x):
-                found[k] = pack([next(rest) for _ in range(x.shape[-1])], axis=x.ndim - 1)
+                arrays[k] = pack([next(tail) for _ in range(x.shape[-1])], axis=x.ndim - 1)
             else:
-                found[k] = next(rest)
-        return [found[k].reshape(x.shape) for k, x in enumerate(self.arrays)]
-
-    def _others(self) -> list[int]:
-        grouped = {k for group in self.groups for k in group}
-        return [k for k in range(len(self.arrays)) if k not in grouped]
+                arrays[k] = next(tail)
+        return [arrays[k].reshape(x.shape) for k, x in enumerate(self.arrays)]

@@ -1,7 +1,7 @@
 """Materialised values, which XLA computes once and on their own."""
 
 import functools
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from typing import Any
 
 import jax
@@ -10,11 +10,11 @@ import jax.tree_util as jtu
 import numpy as np
 from jax import lax
 from jax.experimental.xla_metadata import set_xla_metadata
-from jax.extend.core import ClosedJaxpr, Jaxpr, Literal, Primitive
+from jax.extend.core import ClosedJaxpr, Jaxpr, Primitive
 from jax.interpreters import ad, batching, mlir
 from jaxtyping import Array, PyTree
 
-from .jaxprs import altered, is_inexact, replaced, without_dead_code
+from .jaxprs import altered, is_inexact, renamed, replaced, without_dead_code
 from .limits import MAX_RESULTS, MAX_RESULTS_IN_BATCHES, MAX_SIZE
 from .pack import pack, sharding, unpack
 from .scope import is_on, is_rewritten, is_short
@@ -67,16 +67,13 @@ def materialised_in_rows(tree: PyTree, alone: bool = False) -> PyTree:
     a program that is not rewritten, as it stands: in a long chain of flows XLA computes each again
     for all that follow.
     """
-    is_plain = alone and is_on() and not is_rewritten()
-    if not (is_rewritten() or is_plain):
+    if is_rewritten():
+        pays = lambda x: np.size(x) > MAX_SIZE  # noqa: E731
+    elif alone and is_on():
+        pays = lambda x: np.ndim(x) > 0  # noqa: E731
+    else:
         return tree
-    leaves, structure = jtu.tree_flatten(tree)
-    places = [
-        k for k, x in enumerate(leaves) if (np.ndim(x) > 0 if is_plain else np.size(x) > MAX_SIZE)
-    ]
-    for k in places:
-        (leaves[k],) = materialised([leaves[k]], in_batches=True)
-    return structure.unflatten(leaves)
+    return jtu.tree_map(lambda x: materialised([x], in_batches=True)[0] if pays(x) else x, tree)
 
 
 def computed_once(tree: PyTree) -> PyTree:
@@ -85,11 +82,10 @@ def computed_once(tree: PyTree) -> PyTree:
     return materialised_in_rows(tree) if is_rewritten() else lax.optimization_barrier(tree)
 
 
-def together(values: Sequence[Any]) -> list[Any]:
-    """The same, but for integers materialised together."""
-    smooth = [k for k, x in enumerate(values) if is_inexact(x)]
-    new = materialised([values[k] for k in smooth], in_batches=True) if smooth else []
-    return replaced(values, smooth, new)
+def together(values: Sequence[Any], places: Sequence[int] | None = None) -> list[Any]:
+    """The same, but for integers materialised together; or only those at some places."""
+    places = range(len(values)) if places is None else places
+    return _at([k for k in places if is_inexact(values[k])], values, in_batches=True)
 
 
 def _once(tree: PyTree, **options: bool) -> PyTree:
@@ -97,44 +93,38 @@ def _once(tree: PyTree, **options: bool) -> PyTree:
         return tree
     leaves, structure = jtu.tree_flatten(tree)
     places = [k for k, x in enumerate(leaves) if is_short(x)]
-    new = materialised([leaves[k] for k in places], **options) if places else []
-    return structure.unflatten(replaced(leaves, places, new))
+    return structure.unflatten(_at(places, leaves, **options))
 
 
-def not_materialised(program: ClosedJaxpr) -> ClosedJaxpr:
-    """The program in which everything that is materialised is as it was."""
-    return ClosedJaxpr(_not_materialised(program.jaxpr), program.consts)
+def _at(places: Sequence[int], values: Sequence[Any], **options: bool) -> list[Any]:
+    new = materialised([values[k] for k in places], **options) if places else []
+    return replaced(values, places, new)
 
 
-def _not_materialised(jaxpr: Jaxpr) -> Jaxpr:
-    same: dict[Any, Any] = {}
-
-    def read(v: Any) -> Any:
-        return v if isinstance(v, Literal) else same.get(v, v)
-
-    eqns = []
-    for eqn in jaxpr.eqns:
-        invars = list(map(read, eqn.invars))
-        if eqn.primitive is materialised_p:
-            same.update(zip(eqn.outvars, invars, strict=True))
-            continue
-        params = {name: _within(value) for name, value in eqn.params.items()}
-        eqns.append(eqn.replace(invars=invars, params=params))
-    outvars = list(map(read, jaxpr.outvars))
-    return without_dead_code(altered(jaxpr, eqns=eqns, outvars=outvars))
-
-
-def _within(value: Any) -> Any:
-    """A parameter, whose programs are without what is materialised."""
+def not_materialised(value: Any) -> Any:
+    """A program, or a parameter of an operation, in which nothing is materialised."""
     if isinstance(value, ClosedJaxpr):
-        return not_materialised(value)
+        return ClosedJaxpr(_not_materialised(value.jaxpr), value.consts)
     if isinstance(value, Jaxpr):
         return _not_materialised(value)
     if isinstance(value, tuple) and any(isinstance(x, ClosedJaxpr) for x in value):
-        new = map(_within, value)
+        new = map(not_materialised, value)
         # Those of a linear solve have names.
         return value._make(new) if hasattr(value, "_make") else tuple(new)  # pyright: ignore[reportAttributeAccessIssue]
     return value
+
+
+def _not_materialised(jaxpr: Jaxpr) -> Jaxpr:
+    names: dict[Any, Any] = {}
+    eqns = []
+    for eqn in jaxpr.eqns:
+        invars = renamed(eqn.invars, names)
+        if eqn.primitive is materialised_p:
+            names.update(zip(eqn.outvars, invars, strict=True))
+        else:
+            params = {name: not_materialised(value) for name, value in eqn.params.items()}
+            eqns.append(eqn.replace(invars=invars, params=params))
+    return without_dead_code(altered(jaxpr, eqns=eqns, outvars=renamed(jaxpr.outvars, names)))
 
 
 materialised_p = Primitive("cfjax_materialised")
@@ -172,14 +162,35 @@ def _by_call(entries: Sequence[Array]) -> list[Array]:
     # more XLA may update it in place where it is still read (`understood.py`).
     is_one = len(entries) == 1
     whole = entries[0] if is_one else pack(entries, axis=entries[0].ndim)
-    with set_xla_metadata(inlineable="false"):
-        whole = _identity(whole)
+    whole = _identity(whole)
     return [whole] if is_one else unpack(whole, axis=entries[0].ndim)
 
 
-@jax.jit
+def _apart(fun: Callable[..., Any]) -> Callable[..., Any]:
+    """`fun` as a function of its own, which XLA compiles apart from what is around."""
+    compiled = jax.jit(fun)
+
+    def called(*args: Any) -> Any:
+        with set_xla_metadata(inlineable="false"):
+            return compiled(*args)
+
+    return called
+
+
+@_apart
 def _identity(x: Array) -> Array:
     return x
+
+
+def call(fun: Callable[..., Any]) -> Callable[..., Any]:
+    """`fun` of arrays as a function of its own in the program, on CPU.
+
+    Otherwise XLA fuses it with what follows, and computes it anew for every entry of that.
+    For functions of large arrays: what goes in and comes out goes through memory.
+    """
+    apart = _apart(fun)
+    # Only there the calls are known to work.
+    return lambda *args: lax.platform_dependent(*args, cpu=apart, default=fun)
 
 
 @materialised_p.def_abstract_eval
@@ -189,19 +200,15 @@ def _(*entries, **params):
 
 def _materialised_jvp(entries, tangents, **params):
     moving = [k for k, tangent in enumerate(tangents) if type(tangent) is not ad.Zero]
-    new = materialised_p.bind(*(tangents[k] for k in moving), **params) if moving else []
-    return materialised_p.bind(*entries, **params), replaced(tangents, moving, new)
+    outs = _at(moving, tangents, **params)
+    return materialised_p.bind(*entries, **params), outs
 
 
-def _materialised_transpose(cotangents, *entries, **params):
-    coming = [k for k, cotangent in enumerate(cotangents) if type(cotangent) is not ad.Zero]
-    outs: list[Any] = [None] * len(entries)
-    if coming:
-        # Of zeros all that comes before would be computed, too.
-        outs = replaced(
-            outs, coming, materialised_p.bind(*(cotangents[k] for k in coming), **params)
-        )
-    return outs
+def _materialised_transpose(cts, *entries, **params):
+    # Of zeros all that comes before would be computed, too.
+    coming = [k for k, ct in enumerate(cts) if type(ct) is not ad.Zero]
+    outs = _at(coming, cts, **params)
+    return [x if k in coming else None for k, x in enumerate(outs)]
 
 
 def _materialised_batch(entries, dims, **params):

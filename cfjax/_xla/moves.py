@@ -15,7 +15,6 @@ import jax.numpy as jnp
 import numpy as np
 from jax import lax
 from jax.extend.core import JaxprEqn
-from jaxtyping import Array
 
 from .limits import MAX_LENGTH
 from .struct_of_arrays import (
@@ -23,8 +22,8 @@ from .struct_of_arrays import (
     StructOfArrays,
     common,
     conformed,
-    known,
     spread,
+    static_value,
     struct_of_arrays,
 )
 
@@ -32,8 +31,6 @@ from .struct_of_arrays import (
 _SCATTERS: dict[str, Callable[[Any, Any], Any]] = {
     "scatter-add": operator.add,
     "scatter-mul": operator.mul,
-    "scatter_add": operator.add,
-    "scatter_mul": operator.mul,
 }
 
 
@@ -207,13 +204,11 @@ def concatenated(call: Call) -> StructOfArrays:
         places = np.concatenate(places, axis)
         return StructOfArrays([entries[k] for k in places.flat], call.shape, flags)
     position = flags[:axis].count(False)
-
-    def long(x: StructOfArrays) -> list[Any]:
-        if x.shape[axis] == 1:
-            return [jnp.expand_dims(e, position) for e in x.entries]
-        return list(x.entries)
-
     lengths = [x.shape[axis] for x in arrays]
+    columns = [
+        [jnp.expand_dims(e, position) for e in x.entries] if n == 1 else x.entries
+        for n, x in zip(lengths, arrays, strict=True)
+    ]
 
     def joined(*parts: Any) -> Any:
         others = [[*e.shape[:position], 1, *e.shape[position + 1 :]] for e in parts]
@@ -226,7 +221,7 @@ def concatenated(call: Call) -> StructOfArrays:
             position,
         )
 
-    return StructOfArrays(map(joined, *map(long, arrays)), call.shape, flags)
+    return StructOfArrays(map(joined, *columns), call.shape, flags)
 
 
 def flipped(call: Call) -> StructOfArrays:
@@ -248,10 +243,12 @@ _MOVED = {
 }
 
 
-def _by_jax(eqn: JaxprEqn, values: Sequence[Any]) -> list[Any] | None:
+def _by_jax(
+    eqn: JaxprEqn, values: Sequence[Any], shape: Sequence[int], is_short: Sequence[bool]
+) -> StructOfArrays | None:
     """The entries that JAX's own operation moves to each place; None if it gives others too."""
     moved = range(len(values))[_MOVED[eqn.primitive.name]]
-    operands = [None if k in moved else known(x) for k, x in enumerate(values)]
+    operands = [None if k in moved else static_value(x) for k, x in enumerate(values)]
     if any(x is None and k not in moved for k, x in enumerate(operands)):
         return None
     entries, places = _numbered([struct_of_arrays(values[k]) for k in moved])
@@ -263,34 +260,30 @@ def _by_jax(eqn: JaxprEqn, values: Sequence[Any]) -> list[Any] | None:
         is_clipped = params["mode"] == lax.GatherScatterMode.CLIP
         mode = lax.GatherScatterMode.CLIP if is_clipped else lax.GatherScatterMode.FILL_OR_DROP
         params = params | {"fill_value": -1, "mode": mode}
-    outs = _outs(eqn.primitive.name, operands, params)
+    outs = _outs(eqn.replace(params=params), operands)
     if not (0 <= outs.min() and outs.max() < len(entries)):
         return None
-    return [entries[k] for k in outs.flat]
+    return StructOfArrays([entries[k] for k in outs.flat], shape, is_short)
 
 
-def _outs(name: str, operands: list[Any], params: dict[str, Any]) -> np.ndarray:
+def _outs(eqn: JaxprEqn, operands: list[Any]) -> np.ndarray:
     """The result. JAX would compile a program for each, which takes longer than the step."""
-    x = operands[0]
+    name, x, params = eqn.primitive.name, operands[0], eqn.params
     if name == "pad":
         return _pad(x, operands[1], params["padding_config"])
-    if name in ("dynamic_slice", "dynamic_update_slice"):
-        is_update = name == "dynamic_update_slice"
-        sizes = operands[1].shape if is_update else params["slice_sizes"]
-        starts = operands[2 if is_update else 1 :]
-        given = zip(x.shape, starts, sizes, strict=True)
-        firsts = [min(max(int(k), 0), n - size) for n, k, size in given]
-        window = tuple(slice(k, k + size) for k, size in zip(firsts, sizes, strict=True))
-        if not is_update:
-            return x[window]
-        outs = x.copy()
-        outs[window] = operands[1]
-        return outs
-    with jax.ensure_compile_time_eval():
-        arrays = list(map(jnp.asarray, operands))
-        if name == "scatter":
-            return _scatter(arrays, params)
-        return np.asarray(lax.gather_p.bind(*arrays, **params))
+    if name in ("gather", "scatter"):
+        with jax.ensure_compile_time_eval():
+            return np.asarray(eqn.primitive.bind(*map(jnp.asarray, operands), **params))
+    is_update = name == "dynamic_update_slice"
+    sizes = operands[1].shape if is_update else params["slice_sizes"]
+    axes = zip(x.shape, operands[2 if is_update else 1 :], sizes, strict=True)
+    firsts = [min(max(int(k), 0), n - size) for n, k, size in axes]
+    window = tuple(slice(k, k + size) for k, size in zip(firsts, sizes, strict=True))
+    if not is_update:
+        return x[window]
+    outs = x.copy()
+    outs[window] = operands[1]
+    return outs
 
 
 def _pad(x: np.ndarray, fill: Any, config: Sequence[tuple[int, int, int]]) -> np.ndarray:
@@ -302,13 +295,6 @@ def _pad(x: np.ndarray, fill: Any, config: Sequence[tuple[int, int, int]]) -> np
     outs = np.pad(spaced, more, constant_values=fill)
     less = zip(outs.shape, config, strict=True)
     return outs[tuple(slice(max(-low, 0), n - max(-high, 0)) for n, (low, high, _) in less)]
-
-
-def _scatter(operands: Sequence[Array], params: dict[str, Any]) -> np.ndarray:
-    names = "dimension_numbers", "indices_are_sorted", "unique_indices", "mode"
-    options: dict[str, Any] = {k: params[k] for k in names}
-    x, indices, updates = operands
-    return np.asarray(lax.scatter(x, indices, updates, **options))
 
 
 def moved(call: Call) -> StructOfArrays | None:
@@ -323,8 +309,7 @@ def moved(call: Call) -> StructOfArrays | None:
     else:
         sizes = (n if short else 1 for n, short in zip(part, x.is_short, strict=True))
         params = params | {"slice_sizes": tuple(sizes)}
-    entries = _by_jax(call.eqn.replace(params=params), values)
-    return None if entries is None else StructOfArrays(entries, call.shape, x.is_short)
+    return _by_jax(call.eqn.replace(params=params), values, call.shape, x.is_short)
 
 
 def padded(call: Call) -> StructOfArrays | None:
@@ -336,12 +321,12 @@ def padded(call: Call) -> StructOfArrays | None:
         x = call.through(x).mapped(lambda e: lax.pad(spread(e, lengths), number, long), sides)
     short = [ends if is_one else (0, 0, 0) for ends, is_one in zip(config, flags, strict=True)]
     eqn = call.eqn.replace(params={"padding_config": tuple(short)})
-    entries = _by_jax(eqn, [x, fill])
-    if entries is None:
+    out = _by_jax(eqn, [x, fill], call.shape, flags)
+    if out is None:
         return None
     # The number that fills repeats.
     n = len(x.long)
-    entries = [e if jnp.ndim(e) == n else jnp.reshape(e, [1] * n) for e in entries]
+    entries = (e if jnp.ndim(e) == n else jnp.reshape(e, [1] * n) for e in out.entries)
     return StructOfArrays(entries, call.shape, flags)
 
 
@@ -352,20 +337,20 @@ def gathered(call: Call) -> StructOfArrays | None:
     if any(k in gone or k in numbers.start_index_map or sizes[k] != x.shape[k] for k in x.long):
         return None
     flags = [True] * len(call.shape)
-    kept = (k for k in range(len(x.shape)) if k not in gone)
-    for k, axis in zip(numbers.offset_dims, kept, strict=True):
+    window = (k for k in range(len(x.shape)) if k not in gone)
+    for k, axis in zip(numbers.offset_dims, window, strict=True):
         flags[k] = x.is_short[axis]
     sizes = tuple(n if short else 1 for n, short in zip(sizes, x.is_short, strict=True))
-    entries = _by_jax(call.eqn.replace(params=params | {"slice_sizes": sizes}), call.values)
-    return None if entries is None else StructOfArrays(entries, call.shape, flags)
+    eqn = call.eqn.replace(params=params | {"slice_sizes": sizes})
+    return _by_jax(eqn, call.values, call.shape, flags)
 
 
 def scattered(call: Call) -> StructOfArrays | None:
     x, indices, updates = call.first(), call.values[1], struct_of_arrays(call.values[2])
     numbers = call.params["dimension_numbers"]
     gone = (*numbers.inserted_window_dims, *numbers.operand_batching_dims)
-    kept = [k for k in range(len(x.shape)) if k not in gone]
-    window = dict(zip(numbers.update_window_dims, kept, strict=True))
+    axes = (k for k in range(len(x.shape)) if k not in gone)
+    window = dict(zip(numbers.update_window_dims, axes, strict=True))
     indexed = (*gone, *numbers.scatter_dims_to_operand_dims)
     if any(k in indexed for k in x.long) or any(
         not x.is_short[axis] and updates.shape[k] != x.shape[axis] for k, axis in window.items()
@@ -375,29 +360,17 @@ def scattered(call: Call) -> StructOfArrays | None:
     updates = conformed(updates, updates.shape, flags)
     combine = _SCATTERS.get(call.eqn.primitive.name)
     if combine is None:
-        entries = _by_jax(call.eqn, [x, indices, updates])
-    else:
-        entries = _combined(combine, x, known(indices), updates, call.params)
-    return None if entries is None else StructOfArrays(entries, x.shape, x.is_short)
-
-
-def _combined(
-    combine: Callable[[Any, Any], Any],
-    x: StructOfArrays,
-    indices: np.ndarray | None,
-    updates: StructOfArrays,
-    params: dict[str, Any],
-) -> list[Any] | None:
+        return _by_jax(call.eqn, [x, indices, updates], x.shape, x.is_short)
+    indices = static_value(indices)
     if indices is None:
         return None
+    params = call.params | {"update_jaxpr": None, "update_consts": ()}
     with jax.ensure_compile_time_eval():
         places = jnp.asarray(np.asarray(updates.places, np.int32))
         none = jnp.full(x.inner, -1, np.int32)
-        taken = _scatter((none, jnp.asarray(indices), places), params)
-    used = taken[taken >= 0]
-    if len(np.unique(used)) < len(updates.entries):
+        taken = np.asarray(lax.scatter_p.bind(none, jnp.asarray(indices), places, **params))
+    if len(np.unique(taken[taken >= 0])) < len(updates.entries):
         return None  # Some go to one entry, or to none.
-    return [
-        combine(entry, updates.entries[k]) if k >= 0 else entry
-        for entry, k in zip(x.entries, taken.flat, strict=True)
-    ]
+    pairs = zip(x.entries, taken.flat, strict=True)
+    entries = (combine(entry, updates.entries[k]) if k >= 0 else entry for entry, k in pairs)
+    return StructOfArrays(entries, x.shape, x.is_short)

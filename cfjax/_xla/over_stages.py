@@ -75,7 +75,6 @@ class Loop(NamedTuple):
     body: ClosedJaxpr
     num_constants: int
     num_carried: int
-    length: int
     turns: Sequence[int]
 
     @classmethod
@@ -89,4 +88,4 @@ class Loop(NamedTuple):
             constants, carried = (len(list(part)) for part in parts[:2])
         turns = range(params["length"])
         turns = turns[::-1] if params["reverse"] else turns
-        return cls(params["jaxpr"], constants, carried, params["length"], turns)
+        return cls(params["jaxpr"], constants, carried, turns)

@@ -52,8 +52,8 @@ def _varying(x: Array) -> frozenset[str]:
 
 def sharding(x: Array) -> Any:
     """Along which axes of a mesh it is spread; None without a mesh."""
-    found = jax.typeof(x).sharding
-    return None if found.mesh.empty else found
+    spread = jax.typeof(x).sharding
+    return None if spread.mesh.empty else spread
 
 
 def _with_shape(x: Any, shape: Sequence[int], spec: Sequence[Any]) -> Any:
@@ -70,10 +70,10 @@ unpack_p.multiple_results = True
 @pack_p.def_impl
 def _pack_impl(*entries, axis, sums=False):
     shape = (*entries[0].shape[:axis], len(entries), *entries[0].shape[axis:])
-    rest = [n for n in range(len(shape)) if n != axis]
+    axes = [n for n in range(len(shape)) if n != axis]
     # Spread over a mesh as the entries are.
     spread = sharding(lax.expand_dims(entries[0], [axis]))
-    parts = [lax.broadcast_in_dim(entry, shape, rest, out_sharding=spread) for entry in entries]
+    parts = [lax.broadcast_in_dim(entry, shape, axes, out_sharding=spread) for entry in entries]
     # By the bits of the place: XLA keeps each comparison of places as an array, outside of a loop,
     # and a loop that reads too many is not one function.
     place, bit = lax.broadcasted_iota(np.int32, shape, axis, out_sharding=spread), 1
@@ -100,9 +100,9 @@ def _(*entries, axis, sums):
 
 @unpack_p.def_abstract_eval
 def _(x, *, axis):
-    rest = [n for n in range(x.ndim) if n != axis]
+    axes = [n for n in range(x.ndim) if n != axis]
     shape, spec = x.shape, x.sharding.spec
-    return [_with_shape(x, [shape[n] for n in rest], [spec[n] for n in rest])] * shape[axis]
+    return [_with_shape(x, [shape[n] for n in axes], [spec[n] for n in axes])] * shape[axis]
 
 
 def _pack_jvp(entries, tangents, **params):
@@ -115,23 +115,19 @@ def _unpack_jvp(xs, tangents, *, axis):
     return unpack_p.bind(x, axis=axis), unpack_p.bind(tangent, axis=axis)
 
 
-def _pack_transpose(cotangent, *entries, axis, sums):
-    if type(cotangent) is ad.Zero:
+def _pack_transpose(ct, *entries, axis, sums):
+    if type(ct) is ad.Zero:
         return [None] * len(entries)
     if sums:
-        place = lax.broadcasted_iota(
-            np.int32, cotangent.shape, axis, out_sharding=sharding(cotangent)
-        )
-        return [
-            jnp.sum(jnp.where(place == n, cotangent, 0), axis=axis) for n in range(len(entries))
-        ]
-    return unpack_p.bind(cotangent, axis=axis)
+        place = lax.broadcasted_iota(np.int32, ct.shape, axis, out_sharding=sharding(ct))
+        return [jnp.sum(jnp.where(place == n, ct, 0), axis=axis) for n in range(len(entries))]
+    return unpack_p.bind(ct, axis=axis)
 
 
-def _unpack_transpose(cotangents, x, *, axis):
-    if all(type(cotangent) is ad.Zero for cotangent in cotangents):
+def _unpack_transpose(cts, x, *, axis):
+    if all(type(ct) is ad.Zero for ct in cts):
         return [None]
-    return [pack_p.bind(*map(ad.instantiate_zeros, cotangents), axis=axis, sums=False)]
+    return [pack_p.bind(*map(ad.instantiate_zeros, cts), axis=axis, sums=False)]
 
 
 def _pack_batch(entries, dims, *, axis, sums):

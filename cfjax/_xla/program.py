@@ -7,6 +7,7 @@ are arrays of these axes.
 """
 
 import functools
+import itertools
 import math
 from collections.abc import Callable, Sequence
 from typing import Any, NamedTuple
@@ -17,20 +18,21 @@ import jax.tree_util as jtu
 import numpy as np
 from jax import lax
 from jax.core import Tracer
-from jax.extend.core import (
-    ClosedJaxpr,
-    Jaxpr,
-    JaxprEqn,
-    Literal,
-)
+from jax.extend.core import ClosedJaxpr, Jaxpr, JaxprEqn, Literal
 from jaxtyping import Array, PyTree
 
 from .jaxprs import (
+    CALLS,
+    OPENED,
+    OPENED_LAST,
     altered,
+    are_among,
     evaluate,
     flattened,
+    is_inexact,
     replaced,
-    structs_of,
+    structs,
+    without_constants,
     without_dead_code,
 )
 from .limits import (
@@ -45,33 +47,20 @@ from .limits import (
 from .materialise import materialised, materialised_p, together
 from .over_stages import Loop, is_scalarised_p
 from .rules import on_entries
-from .scope import (
-    is_numeric,
-    is_on,
-    is_rows,
-    is_short,
-    unread,
-    within,
-)
+from .scope import is_numeric, is_on, is_rows, is_short, unread, within
 from .smooth import by_fixed, has_reciprocals, scaled_reciprocal
 from .struct_of_arrays import (
     StructOfArrays,
     apart_like,
-    is_inexact,
     is_small,
     is_small_shape,
     is_whole,
-    known,
     literal,
+    static_value,
     struct_of_arrays,
 )
 from .turns import in_parts, is_table, of_tables
 from .understood import MOVES, REDUCTIONS, is_in_place, is_readable
-
-# Calls that are scalarised as a part of the program.
-_CALLS = {"jit": "jaxpr", "pjit": "jaxpr"}
-# Where nothing is differentiated any more, rules for that are not needed either.
-_LAST_CALLS = _CALLS | {"custom_jvp_call": "call_jaxpr"}
 
 
 def split(tree: PyTree, rows: bool = False) -> PyTree:
@@ -81,15 +70,6 @@ def split(tree: PyTree, rows: bool = False) -> PyTree:
         return struct_of_arrays(x) if is_small(x) or (rows and is_rows(x)) else x
 
     return jtu.tree_map(apart, tree, is_leaf=_is_apart)
-
-
-def split_like(other: PyTree, tree: PyTree) -> PyTree:
-    """The tree scalarised as another one of its structure, shapes and dtypes is."""
-
-    def apart(like: Any, x: Any) -> Any:
-        return apart_like(like, x) if _is_apart(like) else _whole(x)
-
-    return jtu.tree_map(apart, other, tree, is_leaf=_is_apart)
 
 
 def join(tree: PyTree) -> PyTree:
@@ -123,17 +103,15 @@ class Reading(NamedTuple):
 
 
 def read(
-    fun: Callable[[PyTree], PyTree],
-    y: PyTree,
-    most: int = MAX_ENTRIES["step"],
+    fun: Callable[[PyTree], PyTree], y: PyTree, max_entries: int = MAX_ENTRIES["step"]
 ) -> Reading | None:
     """The program of `fun` at `y`, which has at most so many entries.
 
     None if it does not pay or cannot be scalarised. It must have no effects and be readable
     (`is_readable`).
     """
-    rows = _has_rows(y, most)
-    if not is_on() or not (rows or _is_small_state(y, most)):
+    rows = _has_rows(y, max_entries)
+    if not is_on() or not (rows or _is_small_state(y, max_entries)):
         return None
     with within():
         jaxpr, shape = jax.make_jaxpr(fun, return_shape=True)(y)
@@ -152,13 +130,12 @@ def read(
 
 
 def _with_parameters(code: Jaxpr, consts: Sequence[Any]) -> tuple[ClosedJaxpr, list[Array]]:
-    known, given = [], []
-    for pair in zip(code.constvars, consts, strict=True):
-        is_known = not isinstance(pair[1], jax.Array) or _known_constant(pair[1]) is not None
-        (known if is_known else given).append(pair)
-    variables = [v for v, _ in given]
-    code = altered(code, constvars=[v for v, _ in known], invars=[*variables, *code.invars])
-    return ClosedJaxpr(code, [x for _, x in known]), [jnp.asarray(x) for _, x in given]
+    static, parameters = [], []
+    for v, x in zip(code.constvars, consts, strict=True):
+        (static if _is_static(x) else parameters).append((v, x))
+    invars = [*(v for v, _ in parameters), *code.invars]
+    code = altered(code, constvars=[v for v, _ in static], invars=invars)
+    return ClosedJaxpr(code, [x for _, x in static]), [jnp.asarray(x) for _, x in parameters]
 
 
 def on_numbers(
@@ -175,24 +152,16 @@ def on_numbers(
     differentiated any more. With `is_cut` each turn of a loop is a piece that reverse mode computes
     again, or several turns together where nothing is differentiated.
     """
-    jaxpr, consts = program.jaxpr, list(map(_constant, program.consts))
-    flags = [*[True] * len(consts), *fixed]
+    jaxpr = program.jaxpr
     is_long = length(jaxpr) > FLAT_WHOLE
-    calls = _LAST_CALLS if is_last else _CALLS
     cut = None if not is_cut else "groups" if is_last else "turns"
-    form = _Form(rows, is_long, cut, has_reciprocals(jaxpr, flags), calls, {}, {})
-    outs, _ = _evaluate(jaxpr, (*consts, *operands), flags, form)
-    like = jax.eval_shape(functools.partial(split, rows=rows), structs_of(program.out_avals))
+    form = _Form(rows, is_long, cut, has_reciprocals(jaxpr, fixed), is_last, {}, {})
+    outs, _ = _evaluate(program, operands, fixed, form)
+    likes = jax.eval_shape(functools.partial(split, rows=rows), structs(program.out_avals))
     # What is known before the program runs may come out as NumPy's.
     outs = [x if _is_apart(x) else jnp.asarray(x) for x in outs]
-    return split_like(like, outs)
-
-
-def _known_constant(x: Any) -> np.ndarray | None:
-    """An array of indices that is known now."""
-    if isinstance(x, Tracer) or not isinstance(x, jax.Array | np.ndarray | np.generic):
-        return None
-    return None if np.size(x) > MAX_SIZE or is_inexact(x) or not is_numeric(x) else np.asarray(x)
+    pairs = zip(likes, outs, strict=True)
+    return [apart_like(like, x) if _is_apart(like) else _whole(x) for like, x in pairs]
 
 
 def _is_small_state(y: PyTree, max_entries: int) -> bool:
@@ -224,8 +193,8 @@ def length(jaxpr: Jaxpr) -> float:
 
 def _length_of(eqn: JaxprEqn) -> float:
     name = eqn.primitive.name
-    if name in _LAST_CALLS:
-        return length(eqn.params[_LAST_CALLS[name]].jaxpr)
+    if name in OPENED_LAST:
+        return length(eqn.params[CALLS[name]].jaxpr)
     if name == "scan":
         return eqn.params["length"] * length(eqn.params["jaxpr"].jaxpr)
     if name == "cond":
@@ -248,11 +217,8 @@ def _length_of(eqn: JaxprEqn) -> float:
 
 def num_turns(jaxpr: Jaxpr) -> int:
     """Of the longest loop over stages, or 1."""
-    inner = [
-        eqn.params[_LAST_CALLS[name]].jaxpr
-        for eqn in jaxpr.eqns
-        if (name := eqn.primitive.name) in _LAST_CALLS
-    ]
+    calls = [eqn for eqn in jaxpr.eqns if eqn.primitive.name in OPENED_LAST]
+    inner = [eqn.params[CALLS[eqn.primitive.name]].jaxpr for eqn in calls]
     loops = [eqn.params["length"] for eqn in jaxpr.eqns if eqn.primitive.name == "scan"]
     return max([1, *loops, *map(num_turns, inner)])
 
@@ -265,32 +231,29 @@ def _entries(shape: tuple[int, ...]) -> int:
 
 
 class _Form(NamedTuple):
-    """How a program is scalarised.
+    """How a program is scalarised."""
 
-    Whether arrays have leading axes and the program is long; whether it is cut at the turns of a
-    loop, or at groups of turns; whether products with reciprocals take the place of divisions by
-    what is fixed; which calls are a part of it, and under which parameter; its literals, each of
-    which is made once; and what is materialised.
-    """
-
-    rows: bool
-    is_long: bool
+    rows: bool  # It has arrays with leading axes.
+    is_long: bool  # Too long for one function of XLA's.
+    # "turns": each turn of a loop is a piece that reverse mode computes again. "groups": what
+    # several turns carry is materialised.
     cut: str | None
-    has_reciprocals: bool
-    calls: dict[str, str]
-    literals: dict[Any, Any]
-    kept: dict[int, Any]
+    has_reciprocals: bool  # In the place of divisions by what is fixed.
+    is_last: bool  # Nothing is differentiated any more.
+    literals: dict[Any, Any]  # Each is made once.
+    in_memory: dict[int, Any]  # What is materialised already, by its identity.
 
 
 def _evaluate(
-    jaxpr: Jaxpr, values: Sequence[Any], fixed: Sequence[bool], form: _Form
+    program: ClosedJaxpr, operands: Sequence[Any], fixed: Sequence[bool], form: _Form
 ) -> tuple[list[Any], list[bool]]:
-    """What a program makes of values for its constants and arguments, some of which are fixed.
-
-    Fixed results are those that depend on nothing else.
-    """
+    """The results of a program, and whether each is fixed: depends on fixed operands alone."""
+    jaxpr, consts = program.jaxpr, map(_constant, program.consts)
+    varying = set(itertools.compress(jaxpr.invars, (not x for x in fixed)))
     env: dict[Any, Any] = {}
-    loose: set[Any] = set()
+    for v, x in zip((*jaxpr.constvars, *jaxpr.invars), (*consts, *operands), strict=True):
+        is_array = isinstance(x, np.ndarray) and x.ndim > 0
+        env[v] = struct_of_arrays(x) if is_array or is_small(x) else x
 
     def read(v: Any) -> Any:
         if not isinstance(v, Literal):
@@ -302,40 +265,29 @@ def _evaluate(
             form.literals[key] = literal(v)
         return form.literals[key]
 
-    def is_fixed(v: Any) -> bool:
-        return isinstance(v, Literal) or v not in loose
-
-    variables = (*jaxpr.constvars, *jaxpr.invars)
-    for variable, value, is_one in zip(variables, values, fixed, strict=True):
-        is_known = isinstance(value, np.ndarray) and value.ndim > 0
-        env[variable] = struct_of_arrays(value) if is_known or is_small(value) else value
-        if not is_one:
-            loose.add(variable)
     # Each reciprocal once.
     divisors: dict[int, tuple[Any, Any, Any]] = {}
     for eqn in jaxpr.eqns:
-        values = [read(v) for v in eqn.invars]
-        fixed = [is_fixed(v) for v in eqn.invars]
+        values = list(map(read, eqn.invars))
+        fixed = [not x for x in are_among(eqn.invars, varying)]
         outs_fixed = [all(fixed)] * len(eqn.outvars)
         name = eqn.primitive.name
-        if name in form.calls:
-            inner = eqn.params[form.calls[name]]
-            outs, outs_fixed = _evaluate_inner(inner, values, fixed, form)
+        if name in (OPENED_LAST if form.is_last else OPENED):
+            outs, outs_fixed = _evaluate(eqn.params[CALLS[name]], values, fixed, form)
         elif eqn.primitive is is_scalarised_p:
             # In a derivative, what is computed again at the end of a step that fails would be zero
             # times NaN.
-            is_one = eqn.params["in_derivatives"] or form.calls is _LAST_CALLS
-            outs = [np.asarray(is_one)]
+            outs = [np.asarray(eqn.params["in_derivatives"] or form.is_last)]
         elif name == "scan":
             outs, outs_fixed = _unrolled(Loop.of(eqn), values, fixed, form)
         elif name == "cond":
-            which = known(values[0])
+            which = static_value(values[0])
             if which is None:
                 raise Declined
             # As XLA does with a number that is none of a branch.
             branches = eqn.params["branches"]
             branch = branches[min(max(int(which), 0), len(branches) - 1)]
-            outs, outs_fixed = _evaluate_inner(branch, values[1:], fixed[1:], form)
+            outs, outs_fixed = _evaluate(branch, values[1:], fixed[1:], form)
         elif form.has_reciprocals and by_fixed(eqn, fixed):
             x, divisor = values
             if id(divisor) not in divisors:
@@ -343,118 +295,107 @@ def _evaluate(
                 divisors[id(divisor)] = *scaled_reciprocal(divisor), divisor
             scale, reciprocal, _ = divisors[id(divisor)]
             eqn = eqn.replace(primitive=lax.mul_p, params=_PARAMETERS_OF_A_PRODUCT)
-            outs = _results(jaxpr, eqn, [x, scale], fixed, form)
-            outs = _results(jaxpr, eqn, [*outs, reciprocal], fixed, form)
+            outs = _results(eqn, [x, scale], fixed, form)
+            outs = _results(eqn, [*outs, reciprocal], fixed, form)
         else:
-            outs = _results(jaxpr, eqn, values, fixed, form)
+            outs = _results(eqn, values, fixed, form)
         env.update(zip(eqn.outvars, outs, strict=True))
-        loose.update(v for v, is_one in zip(eqn.outvars, outs_fixed, strict=True) if not is_one)
-    return [read(v) for v in jaxpr.outvars], [is_fixed(v) for v in jaxpr.outvars]
-
-
-def _evaluate_inner(
-    program: ClosedJaxpr, values: Sequence[Any], fixed: Sequence[bool], form: _Form
-) -> tuple[list[Any], list[bool]]:
-    consts = list(map(_constant, program.consts))
-    return _evaluate(program.jaxpr, (*consts, *values), (*[True] * len(consts), *fixed), form)
+        varying.update(v for v, x in zip(eqn.outvars, outs_fixed, strict=True) if not x)
+    return list(map(read, jaxpr.outvars)), [not x for x in are_among(jaxpr.outvars, varying)]
 
 
 def _unrolled(
-    loop: Loop, values: Sequence[Any], fixed: Sequence[bool], form: _Form
+    loop: Loop, operands: Sequence[Any], fixed: Sequence[bool], form: _Form
 ) -> tuple[list[Any], list[bool]]:
     """The results of a loop, one turn after the other."""
     n, m = loop.num_constants, loop.num_constants + loop.num_carried
-    carry = values[n:m]
+    carry = operands[n:m]
     # What is fixed in the first turn need not be so in the next.
     flags = [*fixed[:n], *[False] * len(carry), *fixed[m:]]
-    rows: dict[int, list[Any]] = {}
+    ys: dict[int, list[Any]] = {}
     outs_fixed: list[bool] = []
+    run = _in_parts if form.cut == "turns" else _evaluate
     group, size = 0, length(loop.body.jaxpr)
     for k in loop.turns:
-        turn = [_entry(x, k) for x in values[m:]]
-        given = [*values[:n], *carry, *turn]
-        run = _in_parts if form.cut == "turns" else _evaluate_inner
-        outs, outs_fixed = run(loop.body, given, flags, form)
-        carry, rows[k] = outs[: m - n], outs[m - n :]
+        turn = [_entry(x, k) for x in operands[m:]]
+        outs, outs_fixed = run(loop.body, [*operands[:n], *carry, *turn], flags, form)
+        carry, ys[k] = outs[: m - n], outs[m - n :]
         if form.cut == "groups":
             group += 1
-            new = {id(x) for x in jtu.tree_leaves(carry) if isinstance(x, Tracer)} - {*form.kept}
+            traced = {id(x) for x in jtu.tree_leaves(carry) if isinstance(x, Tracer)}
+            num_new = len(traced - {*form.in_memory})
             # With one turn more.
             is_full = (group + 1) * size > FUNCTION
-            if is_full or (group + 1) * len(new) > group * MAX_RESULTS_IN_BATCHES:
-                carry, group = _entries_materialised(carry, form.kept), 0
-                form.kept.update((id(x), x) for x in jtu.tree_leaves(carry))
-    stacks = map(_stacked, zip(*(rows[k] for k in range(loop.length)), strict=True))
+            if is_full or (group + 1) * num_new > group * MAX_RESULTS_IN_BATCHES:
+                carry, group = _entries_materialised(carry, form.in_memory), 0
+                form.in_memory.update((id(x), x) for x in jtu.tree_leaves(carry))
+    stacks = map(_stacked, zip(*(ys[k] for k in sorted(ys)), strict=True))
     # It is the same in every turn.
     return [*carry, *stacks], [*[False] * len(carry), *outs_fixed[m - n :]]
 
 
 def _in_parts(
-    program: ClosedJaxpr, values: Sequence[Any], fixed: Sequence[bool], form: _Form
+    program: ClosedJaxpr, operands: Sequence[Any], fixed: Sequence[bool], form: _Form
 ) -> tuple[list[Any], list[bool]]:
     """A turn, of which reverse mode keeps what goes in and comes out, and computes the rest again.
 
     These are materialised, so that what XLA computes at once is about one turn.
     """
-    program = flattened(program, ("jit", "pjit"))
-    jaxpr, consts = program.jaxpr, list(map(_constant, program.consts))
-    code = altered(jaxpr, constvars=[], invars=[*jaxpr.constvars, *jaxpr.invars])
-    values, fixed = [*consts, *values], [*[True] * len(consts), *fixed]
+    program = flattened(program, OPENED)
+    jaxpr, consts = without_constants(program).jaxpr, list(map(_constant, program.consts))
+    operands, fixed = [*consts, *operands], [*[True] * len(consts), *fixed]
     are_tables = is_table
     if form.rows:
         # The points along the other axes are not those of stages.
-        pairs = zip(code.invars, values, strict=True)
-        are_tables = of_tables(code, [v for v, x in pairs if _is_apart(x) and x.is_table])
+        pairs = zip(jaxpr.invars, operands, strict=True)
+        are_tables = of_tables(jaxpr, [v for v, x in pairs if _is_apart(x) and x.is_table])
 
-    def core(part: Jaxpr, given: Sequence[Any], are_fixed: Sequence[bool]) -> Any:
-        given = _entries_materialised(given, {})
-        return _again(part, given, are_fixed, form, list(map(are_tables, part.outvars)))
+    def on_vectors(part: Jaxpr, operands: Sequence[Any], fixed: Sequence[bool]) -> Any:
+        operands = _entries_materialised(operands, {})
+        return _again(part, operands, fixed, form, list(map(are_tables, part.outvars)))
 
-    def rest(part: Jaxpr, given: Sequence[Any], are_fixed: Sequence[bool]) -> Any:
-        return _evaluate(part, given, are_fixed, form)
+    def on_tables(part: Jaxpr, operands: Sequence[Any], fixed: Sequence[bool]) -> Any:
+        return _evaluate(ClosedJaxpr(part, []), operands, fixed, form)
 
-    made = in_parts(code, values, fixed, core, rest, are_tables)
-    found = [(literal(v), True) if isinstance(v, Literal) else made[v] for v in jaxpr.outvars]
-    return [x for x, _ in found], [is_one for _, is_one in found]
+    return in_parts(jaxpr, operands, fixed, on_vectors, on_tables, are_tables)
 
 
-def _entries_materialised(values: Sequence[Any], kept: dict[int, Any]) -> list[Any]:
-    """The same, with all numbers and entries materialised together that are not `kept` already."""
+def _entries_materialised(values: Sequence[Any], in_memory: dict[int, Any]) -> list[Any]:
+    """The same, with all numbers and entries materialised together that are not `in_memory`."""
     apart = [k for k, x in enumerate(values) if not is_whole(x)]
     leaves, structure = jtu.tree_flatten([values[k] for k in apart])
-    moving = {id(x): x for x in leaves if isinstance(x, Tracer) and id(x) not in kept}
-    new = dict(zip(moving, together(list(moving.values())), strict=True))
-    made = structure.unflatten([new.get(id(x), x) for x in leaves])
-    return replaced(values, apart, made)
+    traced = {id(x): x for x in leaves if isinstance(x, Tracer) and id(x) not in in_memory}
+    new = dict(zip(traced, together(list(traced.values())), strict=True))
+    return replaced(values, apart, structure.unflatten([new.get(id(x), x) for x in leaves]))
 
 
 def _again(
     jaxpr: Jaxpr,
-    values: Sequence[Any],
+    operands: Sequence[Any],
     fixed: Sequence[bool],
     form: _Form,
     are_tables: Sequence[bool],
 ) -> tuple[list[Any], list[bool]]:
-    """What a program makes of values, which reverse mode computes again."""
-    leaves, structure = jtu.tree_flatten(list(values))
-    places = [k for k, x in enumerate(leaves) if isinstance(x, Tracer)]
-    known: Any = None
+    """The results of a program, which reverse mode computes again."""
+    leaves, structure = jtu.tree_flatten(list(operands))
+    traced = [k for k, x in enumerate(leaves) if isinstance(x, Tracer)]
+    static: Any = None
 
-    def run(some: list[Any]) -> list[Any]:
-        nonlocal known
-        given = structure.unflatten(replaced(leaves, places, some))
-        inner = form._replace(literals={}, kept={})
-        outs, outs_fixed = _evaluate(jaxpr, given, fixed, inner)
-        single = [k for k, is_one in enumerate(outs_fixed) if not (is_one or are_tables[k])]
-        new = _entries_materialised([outs[k] for k in single], inner.kept)
-        made, shape = jtu.tree_flatten(replaced(outs, single, new))
-        moving = [k for k, x in enumerate(made) if isinstance(x, Tracer)]
-        known = [None if k in moving else x for k, x in enumerate(made)], moving, shape, outs_fixed
-        return [made[k] for k in moving]
+    def run(residuals: list[Any]) -> list[Any]:
+        nonlocal static
+        operands = structure.unflatten(replaced(leaves, traced, residuals))
+        inner = form._replace(literals={}, in_memory={})
+        outs, outs_fixed = _evaluate(ClosedJaxpr(jaxpr, []), operands, fixed, inner)
+        single = [k for k, x in enumerate(outs_fixed) if not (x or are_tables[k])]
+        new = _entries_materialised([outs[k] for k in single], inner.in_memory)
+        entries, shape = jtu.tree_flatten(replaced(outs, single, new))
+        places = [k for k, x in enumerate(entries) if isinstance(x, Tracer)]
+        static = replaced(entries, places, [None] * len(places)), places, shape, outs_fixed
+        return [entries[k] for k in places]
 
-    new = jax.checkpoint(run)([leaves[k] for k in places])
-    made, moving, shape, outs_fixed = known
-    return shape.unflatten(replaced(made, moving, new)), outs_fixed
+    new = jax.checkpoint(run)([leaves[k] for k in traced])
+    entries, places, shape, outs_fixed = static
+    return shape.unflatten(replaced(entries, places, new)), outs_fixed
 
 
 def _entry(x: Any, k: int) -> Any:
@@ -473,50 +414,42 @@ def _stacked(rows: Sequence[Any]) -> Any:
     return StructOfArrays([e for x in parts for e in x.entries], (len(parts), *parts[0].shape))
 
 
+def _is_static(x: Any) -> bool:
+    """Whether a constant is known now, as an array of indices, and all that is none of JAX's."""
+    if not isinstance(x, jax.Array):
+        return True
+    is_traced = isinstance(x, Tracer)
+    return not (is_traced or x.size > MAX_SIZE or is_inexact(x)) and is_numeric(x)
+
+
 def _constant(x: Any) -> Any:
-    """What a program closes over: known, if it is no array of JAX's."""
+    """A constant of a program: known, if it is no array of JAX's."""
     if isinstance(x, jax.Array):
-        found = _known_constant(x)
-        return x if found is None else found
+        return np.asarray(x) if _is_static(x) else x
     if not is_numeric(x) or not is_inexact(np.asarray(x)):
         return x
     # As JAX's, which may overflow.
-    if np.ndim(x) == 0 or np.size(x) > _MAX_KNOWN or is_rows(x):
+    if np.ndim(x) == 0 or np.size(x) > _MAX_STATIC or is_rows(x):
         return jnp.asarray(x)
     return StructOfArrays(list(map(jnp.asarray, np.ravel(x))), np.shape(x))
 
 
 # As of the weights of a method of 16 stages.
-_MAX_KNOWN = 4 * MAX_SIZE
-
-
+_MAX_STATIC = 4 * MAX_SIZE
 # As a version of JAX has them.
 _PARAMETERS_OF_A_PRODUCT = jax.make_jaxpr(lax.mul)(1.0, 1.0).jaxpr.eqns[0].params
 
 
-def _results(
-    jaxpr: Jaxpr, eqn: JaxprEqn, values: list[Any], fixed: Sequence[bool], form: _Form
-) -> list[Any]:
+def _results(eqn: JaxprEqn, values: list[Any], fixed: Sequence[bool], form: _Form) -> Sequence[Any]:
     """The results of one operation: scalarised, if there is a rule for it."""
-    outs = _apart(jaxpr, eqn, values, fixed, form)
-    if outs is None and is_in_place(eqn):
-        raise Declined
-    if outs is None:
-        outs = map(split, evaluate(jaxpr, eqn, list(map(_whole, values))))
-    return list(outs)
-
-
-def _apart(
-    jaxpr: Jaxpr, eqn: JaxprEqn, values: list[Any], fixed: Sequence[bool], form: _Form
-) -> Sequence[Any] | None:
-    """The results of one operation, scalarised, if there is a rule for it, otherwise None."""
     if eqn.primitive is materialised_p:
         if eqn.params["is_cut"] and not form.is_long:
             return values
-        # What is whole is in memory anyway.
-        groups = [jtu.tree_flatten(x) for x in values]
-        new = materialised([x for group, _ in groups for x in group], **eqn.params)
-        form.kept.update((id(x), x) for x in new)
-        new = iter(new)
-        return [shape.unflatten(next(new) for _ in group) for group, shape in groups]
-    return on_entries(jaxpr, eqn, values, fixed, form.rows)
+        leaves, structure = jtu.tree_flatten(values)
+        new = materialised(leaves, **eqn.params)
+        form.in_memory.update((id(x), x) for x in new)
+        return structure.unflatten(new)
+    outs = on_entries(eqn, values, fixed, form.rows)
+    if outs is None and is_in_place(eqn):
+        raise Declined
+    return list(map(split, evaluate(eqn, list(map(_whole, values))))) if outs is None else outs

@@ -5,19 +5,12 @@ from typing import Any
 
 import jax
 import numpy as np
-from jax.extend.core import Jaxpr, JaxprEqn
+from jax.extend.core import JaxprEqn
 
 from . import arithmetic, moves
-from .jaxprs import evaluate, parameters
+from .jaxprs import evaluate, is_inexact, parameters
 from .scope import is_numeric
-from .struct_of_arrays import (
-    Call,
-    StructOfArrays,
-    is_inexact,
-    is_small_shape,
-    is_whole,
-    known,
-)
+from .struct_of_arrays import Call, StructOfArrays, is_small_shape, is_whole, static_value
 from .understood import ELEMENTWISE, REDUCTIONS, is_understood
 
 _RULES: dict[str, Callable[[Call], StructOfArrays | list[StructOfArrays] | None]] = {
@@ -38,8 +31,6 @@ _RULES: dict[str, Callable[[Call], StructOfArrays | list[StructOfArrays] | None]
     "scatter": moves.scattered,
     "scatter-add": moves.scattered,
     "scatter-mul": moves.scattered,
-    "scatter_add": moves.scattered,
-    "scatter_mul": moves.scattered,
     "slice": moves.sliced,
     "split": moves.split,
     "squeeze": moves.reshaped,
@@ -51,7 +42,7 @@ _RULES: dict[str, Callable[[Call], StructOfArrays | list[StructOfArrays] | None]
 
 
 def on_entries(
-    jaxpr: Jaxpr, eqn: JaxprEqn, values: Sequence[Any], fixed: Sequence[bool], rows: bool
+    eqn: JaxprEqn, values: Sequence[Any], fixed: Sequence[bool], rows: bool
 ) -> Sequence[Any] | None:
     """The results of one operation, if there is a rule for it, otherwise None.
 
@@ -66,10 +57,10 @@ def on_entries(
         or not all(is_small_shape(aval.shape) for aval in avals)
     )
     if not is_large:
-        constants = [x for x in map(known, values) if x is not None]
-        is_known = len(constants) == len(values) and not any(map(is_inexact, outs))
-        if is_known and not eqn.effects:
-            return _of_known(jaxpr, eqn, constants)
+        static = [x for x in map(static_value, values) if x is not None]
+        is_static = len(static) == len(values) and not any(map(is_inexact, outs))
+        if is_static and not eqn.effects:
+            return _of_static(eqn, static)
         if not all(is_small_shape(aval.shape) for aval in outs) or any(map(is_whole, values)):
             return None
     if eqn.effects or not is_understood(eqn) or any(aval.size == 0 for aval in avals):
@@ -83,19 +74,19 @@ def on_entries(
     return [x if x.shape else x.entries[0] for x in results]
 
 
-# What an operation makes of what is known. A loop over stages asks for the same in each turn, and
+# What an operation makes of static values. A loop over stages asks for the same in each turn, and
 # JAX takes longer to answer than the rest of the turn.
-_found: dict[Hashable, list[np.ndarray]] = {}
-_MOST_FOUND = 2048
+_cache: dict[Hashable, list[np.ndarray]] = {}
+_MAX_CACHED = 2048
 
 
-def _of_known(jaxpr: Jaxpr, eqn: JaxprEqn, constants: Sequence[np.ndarray]) -> list[np.ndarray]:
-    given = tuple((x.tobytes(), x.dtype, x.shape) for x in constants)
-    key = eqn.primitive, parameters(eqn), given
-    if key not in _found:
+def _of_static(eqn: JaxprEqn, values: Sequence[np.ndarray]) -> list[np.ndarray]:
+    operands = tuple((x.tobytes(), x.dtype, x.shape) for x in values)
+    key = eqn.primitive, parameters(eqn), operands
+    if key not in _cache:
         with jax.ensure_compile_time_eval():
-            outs = list(map(np.asarray, evaluate(jaxpr, eqn, constants)))
-        if len(_found) >= _MOST_FOUND:
-            _found.clear()
-        _found[key] = outs
-    return _found[key]
+            outs = list(map(np.asarray, evaluate(eqn, values)))
+        if len(_cache) >= _MAX_CACHED:
+            _cache.clear()
+        _cache[key] = outs
+    return _cache[key]

@@ -43,18 +43,14 @@ def rewriting(on: bool | None) -> contextlib.AbstractContextManager:
 
 
 def is_on() -> bool:
-    return _on.value is not False and not _is_spread()
+    # Values that say how they are spread over a mesh: nothing here hands that on.
+    axes = jax.sharding.get_abstract_mesh().axis_types or ()
+    return _on.value is not False and all(kind == jax.sharding.AxisType.Auto for kind in axes)
 
 
 def is_everywhere() -> bool:
     """Whether also what rarely pays is scalarised."""
     return _on.value is True
-
-
-def _is_spread() -> bool:
-    """Whether values say how they are spread over a mesh, which nothing here hands on."""
-    mesh = jax.sharding.get_abstract_mesh()
-    return any(kind != jax.sharding.AxisType.Auto for kind in mesh.axis_types or ())
 
 
 def unread(error: Exception) -> None:

@@ -7,6 +7,7 @@ than 1. So a program has products only if nothing but smooth operations makes an
 """
 
 import functools
+import itertools
 from collections.abc import Callable, Sequence
 from typing import Any
 
@@ -17,6 +18,7 @@ from jax import lax
 from jax.extend.core import Jaxpr, JaxprEqn, Literal
 from jaxtyping import Array, PyTree
 
+from .jaxprs import CALLS, OPENED_LAST, are_among
 from .over_stages import Loop
 from .understood import is_understood
 
@@ -26,8 +28,8 @@ _SMOOTH = frozenset(
     "acos acosh add add_any asin asinh atan atan2 atanh broadcast_in_dim cbrt cfjax_pack "
     "cfjax_unpack complex concatenate conj copy cos cosh cumprod cumsum div dot_general erf exp "
     "exp2 expm1 fft imag integer_pow log log1p logistic mul neg pad pow real reduce_prod "
-    "reduce_sum reshape rev rsqrt scatter-add scatter-mul scatter_add scatter_mul sin sinh slice "
-    "split sqrt square squeeze stack stop_gradient sub tan tanh transpose".split()
+    "reduce_sum reshape rev rsqrt scatter-add scatter-mul sin sinh slice split sqrt square "
+    "squeeze stack stop_gradient sub tan tanh transpose".split()
 )
 # Which of their operands may be what a division gives. The others are indices and predicates.
 _SMOOTH_IN_PART = {
@@ -37,7 +39,6 @@ _SMOOTH_IN_PART = {
     "scatter": slice(0, None, 2),
     "select_n": slice(1, None),
 }
-_CALLS = {"custom_jvp_call": "call_jaxpr", "jit": "jaxpr", "pjit": "jaxpr"}
 
 
 def smooth(fun: Callable[..., Any]) -> Callable[..., Any]:
@@ -55,10 +56,9 @@ def smooth(fun: Callable[..., Any]) -> Callable[..., Any]:
 
 
 def has_reciprocals(jaxpr: Jaxpr, fixed: Sequence[bool]) -> bool:
-    """Whether divisions by what is fixed may be products; `fixed` says it of all arguments."""
-    is_fixed = dict(zip((*jaxpr.constvars, *jaxpr.invars), fixed, strict=True))
+    """Whether divisions by what is fixed may be products; `fixed` says it of the operands."""
     try:
-        _follow(jaxpr, is_fixed, set(), False)
+        _follow(jaxpr, fixed, [False] * len(fixed), False)
     except _NotSmooth:
         return False
     return True
@@ -96,71 +96,66 @@ def scaled_reciprocal(divisor: PyTree) -> tuple[PyTree, PyTree]:
     return scales, jtu.tree_map(lambda s, a: lax.integer_pow(s * a, -1), scales, divisor)
 
 
-def _follow(jaxpr: Jaxpr, is_fixed: dict[Any, bool], inexact: set[Any], is_smooth: bool) -> None:
-    """Follows what comes of divisions: the variables whose last bits may differ, `inexact`."""
+def _follow(
+    jaxpr: Jaxpr, fixed: Sequence[bool], inexact: Sequence[bool], is_smooth: bool
+) -> list[tuple[bool, bool]]:
+    """Follows what comes of divisions: of each result, whether it is fixed, and whether its last
+    bits may differ, by what is said of the operands.
+    """
+    varying = set(itertools.compress(jaxpr.invars, (not x for x in fixed)))
+    rounded = set(itertools.compress(jaxpr.invars, inexact))
+
+    def read(atoms: Sequence[Any]) -> tuple[list[bool], list[bool]]:
+        return [not x for x in are_among(atoms, varying)], are_among(atoms, rounded)
+
     for eqn in jaxpr.eqns:
-        fixed = [isinstance(v, Literal) or is_fixed[v] for v in eqn.invars]
-        reached = [not isinstance(v, Literal) and v in inexact for v in eqn.invars]
+        fixed, inexact = read(eqn.invars)
         within = is_smooth or _SCOPE in str(getattr(eqn.source_info, "name_stack", ""))
-        is_fixed.update((v, all(fixed)) for v in eqn.outvars)
-        inside = _inside(eqn, fixed, reached, within)
-        if inside is not None:
-            for v, (is_one, is_inexact) in zip(eqn.outvars, inside, strict=True):
-                is_fixed[v] = is_one
-                if is_inexact:
-                    inexact.add(v)
-        elif any(reached):
-            if not within and not _is_smooth(eqn, reached):
+        outs = _inside(eqn, fixed, inexact, within)
+        if outs is None:
+            if any(inexact) and not within and not _is_smooth(eqn, inexact):
                 raise _NotSmooth
-            inexact.update(eqn.outvars)
-        elif by_fixed(eqn, fixed):
-            inexact.update(eqn.outvars)
+            outs = [(all(fixed), any(inexact) or by_fixed(eqn, fixed))] * len(eqn.outvars)
+        for v, (is_fixed, is_inexact) in zip(eqn.outvars, outs, strict=True):
+            if not is_fixed:
+                varying.add(v)
+            if is_inexact:
+                rounded.add(v)
+    return list(zip(*read(jaxpr.outvars), strict=True))
 
 
 def _inside(
-    eqn: JaxprEqn, fixed: list[bool], reached: list[bool], is_smooth: bool
+    eqn: JaxprEqn, fixed: list[bool], inexact: list[bool], is_smooth: bool
 ) -> Sequence[tuple[bool, bool]] | None:
-    """Of each result of an operation with programs within, whether it is fixed, and whether its
-    last bits may differ. None for other operations.
-    """
+    """The same of the results of an operation with programs within. None for other operations."""
     name = eqn.primitive.name
-    if name in _CALLS:
-        return _results(eqn.params[_CALLS[name]].jaxpr, fixed, reached, is_smooth)
+    if name in OPENED_LAST:
+        return _follow(eqn.params[CALLS[name]].jaxpr, fixed, inexact, is_smooth)
     if name == "cond":
-        if reached[0]:
+        if inexact[0]:
             raise _NotSmooth
-        given = fixed[1:], reached[1:], is_smooth
-        some = [_results(branch.jaxpr, *given) for branch in eqn.params["branches"]]
+        branches = [
+            _follow(branch.jaxpr, fixed[1:], inexact[1:], is_smooth)
+            for branch in eqn.params["branches"]
+        ]
         return [
-            (all(is_one for is_one, _ in each), any(is_inexact for _, is_inexact in each))
-            for each in zip(*some, strict=True)
+            (all(is_fixed for is_fixed, _ in outs), any(is_inexact for _, is_inexact in outs))
+            for outs in zip(*branches, strict=True)
         ]
     if name != "scan":
         return None
     loop = Loop.of(eqn)
-    n, m = loop.num_constants, loop.num_carried
-    fixed = [is_one and not n <= k < n + m for k, is_one in enumerate(fixed)]
+    n, m = loop.num_constants, loop.num_constants + loop.num_carried
+    fixed = [is_fixed and not n <= k < m for k, is_fixed in enumerate(fixed)]
     while True:
-        results = _results(loop.body.jaxpr, fixed, reached, is_smooth)
-        carried = [a or b for a, (_, b) in zip(reached[n : n + m], results[:m], strict=True)]
-        if carried == reached[n : n + m]:
-            return [*((False, is_inexact) for is_inexact in carried), *results[m:]]
-        reached = [*reached[:n], *carried, *reached[n + m :]]
+        outs = _follow(loop.body.jaxpr, fixed, inexact, is_smooth)
+        carry = [a or b for a, (_, b) in zip(inexact[n:m], outs[: m - n], strict=True)]
+        if carry == inexact[n:m]:
+            return [*((False, is_inexact) for is_inexact in carry), *outs[m - n :]]
+        inexact = [*inexact[:n], *carry, *inexact[m:]]
 
 
-def _results(
-    jaxpr: Jaxpr, fixed: Sequence[bool], reached: Sequence[bool], is_smooth: bool
-) -> list[tuple[bool, bool]]:
-    known = dict(zip(jaxpr.invars, fixed, strict=True))
-    known.update((v, True) for v in jaxpr.constvars)
-    some = {v for v, is_one in zip(jaxpr.invars, reached, strict=True) if is_one}
-    _follow(jaxpr, known, some, is_smooth)
-    return [
-        (True, False) if isinstance(v, Literal) else (known[v], v in some) for v in jaxpr.outvars
-    ]
-
-
-def _is_smooth(eqn: JaxprEqn, reached: Sequence[bool]) -> bool:
+def _is_smooth(eqn: JaxprEqn, inexact: Sequence[bool]) -> bool:
     name = eqn.primitive.name
     if name == "cfjax_materialised":
         return True
@@ -170,6 +165,6 @@ def _is_smooth(eqn: JaxprEqn, reached: Sequence[bool]) -> bool:
     if not is_understood(eqn):
         return False
     if name in _SMOOTH_IN_PART:
-        places = range(len(reached))
-        return not any(reached[k] for k in places if k not in places[_SMOOTH_IN_PART[name]])
+        places = range(len(inexact))
+        return not any(inexact[k] for k in places if k not in places[_SMOOTH_IN_PART[name]])
     return name in _SMOOTH

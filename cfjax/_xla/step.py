@@ -11,6 +11,7 @@ others are, and the program is up to twice as long.
 """
 
 import functools
+import weakref
 from collections.abc import Callable, Sequence
 from typing import Any, NamedTuple
 
@@ -30,12 +31,10 @@ from .jaxprs import (
     flattened,
     is_inexact,
     narrowed,
-    once_for_each_program,
     program_of,
     reached,
     replaced,
     structs,
-    structs_of,
 )
 from .limits import (
     CUT_IN_BATCHES,
@@ -60,18 +59,71 @@ step_p = Primitive("cfjax_step")
 step_p.multiple_results = True
 
 
+# Of a function of whole arrays, or of numbers, at primals, in some directions.
+
+
+def _tangents(fun, primals, tangents):
+    return jax.jvp(fun, primals, tangents)[1]
+
+
+def _cotangents(fun, primals, cotangents):
+    return list(jax.vjp(fun, *primals)[1](cotangents))
+
+
+def _transposed(fun, primals, cotangents):
+    return list(jax.linear_transpose(fun, *primals)(cotangents))
+
+
 class Of(NamedTuple):
     """What a program is derived from and how, and for which operands and results of that."""
 
-    derive: "_Derive"
+    derive: Callable[[Callable[..., Any], list[Any], list[Any]], list[Any]]
     program: ClosedJaxpr
     fixed: tuple[bool, ...]
     of: "Of | None"
     moving: tuple[int, ...]
-    smooth: tuple[int, ...]
+    results: tuple[int, ...]
+
+    @property
+    def residuals(self) -> list[int]:
+        """The operands that the derivative has too, before its directions."""
+        linear = self.moving if self.derive is _transposed else ()
+        return _others(self.program.in_avals, linear)
+
+    def applied(self, fun: Callable[..., Any], operands: Sequence[Any]) -> Callable[..., list[Any]]:
+        """The derivative of a function of such operands, which is the program or its like."""
+        residuals, moving = self.residuals, self.moving
+
+        def derivative(*xs: Any) -> list[Any]:
+            values = replaced(operands, residuals, xs[: len(residuals)])
+
+            def some(*primals: Any) -> list[Any]:
+                outs = fun(*replaced(values, moving, primals))
+                return [outs[k] for k in self.results]
+
+            return self.derive(some, [values[k] for k in moving], list(xs[len(residuals) :]))
+
+        return derivative
 
     def derived(self) -> ClosedJaxpr:
-        return _derived(self.program, self.derive, self.moving, self.smooth)
+        programs = _derived.setdefault(self.program, {})
+        key = self.derive, self.moving, self.results
+        if key not in programs:
+            operands, outs = self.program.in_avals, self.program.out_avals
+            ways = [outs[k] for k in self.results]
+            if self.derive is _tangents:
+                ways = [operands[k] for k in self.moving]
+            fun = self.applied(jaxpr_as_fun(self.program), operands)
+            programs[key] = program_of(fun, *(operands[k] for k in self.residuals), *ways)
+        while len(_derived) > _MAX_PROGRAMS:
+            del _derived[next(iter(_derived))]
+        return programs[key]
+
+
+# While one program after the other is differentiated, each is derived once. No program is held that
+# JAX has dropped, and of those that JAX keeps, which are thousands, the last ones alone.
+_derived: weakref.WeakKeyDictionary[ClosedJaxpr, dict[Any, Any]] = weakref.WeakKeyDictionary()
+_MAX_PROGRAMS = 32
 
 
 class Kind(NamedTuple):
@@ -84,7 +136,8 @@ class Kind(NamedTuple):
     # Whether the state has short vectors along leading axes.
     rows: bool
     # How long values and derivatives of one system may be, to be scalarised as a whole.
-    most: tuple[int, int]
+    max_values: int
+    max_derivatives: int
     # The axes of each `vmap` around it, the innermost first.
     levels: tuple[tuple[int | None, ...], ...] = ()
     # How many of the last operands it is linear in, if it is a derivative.
@@ -104,12 +157,12 @@ class Kind(NamedTuple):
         """How long a program may be, to be scalarised as a whole."""
         if self.is_batch and (self.is_first or not self.linear):
             return FLAT_MANY
-        return self.most[bool(self.linear)]
+        return self.max_derivatives if self.linear else self.max_values
 
     @property
     def is_first(self) -> bool:
         """Whether it is no derivative of a derivative."""
-        return self.most[1] > FLAT_SECOND
+        return self.max_derivatives > FLAT_SECOND
 
     def is_cut(self, jaxpr: Jaxpr) -> bool:
         """Whether a program that is scalarised as a whole is cut at the turns of its loop.
@@ -125,9 +178,9 @@ class Kind(NamedTuple):
         return num_operations > least and num_operations * num_turns(jaxpr) > uncut
 
 
-# The limits for a step of many, and for any other.
-_MANY = FLAT_MANY, FLAT_MANY
-_USUAL = FLAT_VALUES, FLAT_DERIVATIVES
+# For a step of many, which may take longer to compile, and for any other.
+OF_MANY = FLAT_MANY, FLAT_MANY
+OF_FEW = FLAT_VALUES, FLAT_DERIVATIVES
 
 
 def scalarised(
@@ -145,51 +198,40 @@ def scalarised(
     reading = None if is_rewritten() else read(fun, y)
     if reading is None:
         return fun(y)
-    structure = jtu.tree_structure(reading.shape)
-    outs = _bound(
+    leaves, structure = jtu.tree_flatten(reading.shape)
+    outs = bound(
         reading.program,
         reading.parameters,
         list(map(jnp.asarray, jtu.tree_leaves(y))),
-        len(jtu.tree_leaves(reading.shape[0])) if is_pair else structure.num_leaves,
+        len(jtu.tree_leaves(reading.shape[0])) if is_pair else len(leaves),
         reading.rows,
-        (0, 0) if in_batches else _MANY if is_everywhere() else _USUAL,
+        (0, 0) if in_batches else OF_MANY if is_everywhere() else OF_FEW,
     )
     return jtu.tree_unflatten(structure, outs)
 
 
-def one_of(
+def bound(
     program: ClosedJaxpr,
     parameters: Sequence[Any],
-    operands: Sequence[Any],
-    rows: bool,
-    is_many: bool,
-) -> list[Any]:
-    """A step of several in one loop. If they are many, it may take longer to compile."""
-    most = _MANY if is_many else _USUAL
-    return _bound(program, parameters, operands, len(program.out_avals), rows, most)
-
-
-def _bound(
-    program: ClosedJaxpr,
-    parameters: Sequence[Any],
-    operands: Sequence[Any],
+    state: Sequence[Any],
     first: int,
     rows: bool,
-    most: tuple[int, int],
+    max_lengths: tuple[int, int],
 ) -> list[Any]:
-    given, outs = [*parameters, *operands], program.out_avals
-    fixed = (*[True] * len(parameters), *[False] * len(operands))
+    """The results of a step as one operation. `Kind` says what the other arguments are."""
+    operands, outs = [*parameters, *state], program.out_avals
+    fixed = (*[True] * len(parameters), *[False] * len(state))
     # Integers that depend on integers alone, as the number of a step, are on their own: a transpose
     # of what is linear has their values.
-    are_made = reached(program.jaxpr, list(map(is_inexact, given)))
-    made = [k for k, x in enumerate(outs) if is_inexact(x) or are_made[k]]
-    exact = [k for k in range(len(outs)) if k not in made]
-    code, _ = narrowed(program, made, range(len(given)))
-    kind = Kind(fixed, sum(k < first for k in made), rows, most)
-    new = step_p.bind(*given, program=code, kind=kind)
-    counting, takes = narrowed(program, exact)
-    known = map(jnp.asarray, jaxpr_as_fun(counting)(*(given[k] for k in takes)))
-    return replaced(replaced([None] * len(outs), made, new), exact, list(known))
+    are_reached = reached(program.jaxpr, map(is_inexact, operands))
+    exact = [k for k, x in enumerate(outs) if not (is_inexact(x) or are_reached[k])]
+    others = _others(outs, exact)
+    code, _ = narrowed(program, others, range(len(operands)))
+    kind = Kind(fixed, sum(k < first for k in others), rows, *max_lengths)
+    new = step_p.bind(*operands, program=code, kind=kind)
+    counting, places = narrowed(program, exact)
+    counts = map(jnp.asarray, jaxpr_as_fun(counting)(*(operands[k] for k in places)))
+    return replaced(replaced([None] * len(outs), others, new), exact, list(counts))
 
 
 @step_p.def_abstract_eval
@@ -202,8 +244,8 @@ def _sizes(operands: Sequence[Any], levels: Sequence[Any]) -> list[int]:
     """How many members each batch has, the outermost first."""
     shapes, sizes = [list(x.shape) for x in operands], []
     for axes in reversed(levels):
-        given = zip(shapes, axes, strict=True)
-        firsts = [shape.pop(0) for shape, axis in given if axis is not None]
+        pairs = zip(shapes, axes, strict=True)
+        firsts = [shape.pop(0) for shape, axis in pairs if axis is not None]
         sizes.append(firsts[0])
     return sizes
 
@@ -211,27 +253,27 @@ def _sizes(operands: Sequence[Any], levels: Sequence[Any]) -> list[int]:
 def _jvp(primals, tangents, *, program, kind):
     if kind.linear:
         # Several derivatives in one loop take long to compile.
-        kind = kind._replace(most=(kind.most[0], min(kind.most[1], FLAT_SECOND)))
+        kind = kind._replace(max_derivatives=min(kind.max_derivatives, FLAT_SECOND))
     outs = step_p.bind(*primals, program=program, kind=kind)
     ways: list[Any] = [ad.Zero(jax.typeof(x).to_tangent_aval()) for x in outs]
-    given = enumerate(zip(primals, tangents, strict=True))
-    moving = tuple(k for k, (x, way) in given if type(way) is not ad.Zero and is_inexact(x))
+    pairs = enumerate(zip(primals, tangents, strict=True))
+    moving = tuple(k for k, (x, way) in pairs if type(way) is not ad.Zero and is_inexact(x))
     are_reached = reached(program.jaxpr, [k in moving for k in range(len(primals))])
-    smooth = tuple(k for k, x in enumerate(outs) if is_inexact(x) and are_reached[k])
-    if not (moving and smooth):
+    results = tuple(k for k, x in enumerate(outs) if is_inexact(x) and are_reached[k])
+    if not (moving and results):
         return outs, ways
-    of = Of(_tangent, program, kind.fixed, kind.of, moving, smooth)
+    of = Of(_tangents, program, kind.fixed, kind.of, moving, results)
     new = _derivative(
         kind._replace(
             levels=tuple((*axes, *(axes[k] for k in moving)) for axes in kind.levels),
             fixed=(*kind.fixed, *[False] * len(moving)),
-            first=len(smooth),
+            first=len(results),
             linear=len(moving),
         ),
         of,
         [*primals, *(tangents[k] for k in moving)],
     )
-    return outs, replaced(ways, smooth, new)
+    return outs, replaced(ways, results, new)
 
 
 def _derivative(kind: Kind, of: Of, operands: Sequence[Any]) -> list[Any]:
@@ -239,115 +281,48 @@ def _derivative(kind: Kind, of: Of, operands: Sequence[Any]) -> list[Any]:
 
 
 def _transpose(cotangents, *operands, program, kind):
-    unknown = tuple(k for k, x in enumerate(operands) if ad.is_undefined_primal(x))
+    linear = tuple(k for k, x in enumerate(operands) if ad.is_undefined_primal(x))
     coming = tuple(k for k, x in enumerate(cotangents) if type(x) is not ad.Zero)
-    results: list[Any] = [None] * len(operands)
+    derivatives: list[Any] = [None] * len(operands)
     if not coming:
-        return results
-    rest = [k for k in range(len(operands)) if k not in unknown]
-    first, of = len(operands) - kind.linear, kind.of
-    if of is not None and of.derive is _tangent and unknown[0] >= first:
+        return derivatives
+    residuals = _others(operands, linear)
+    n, of = len(operands) - kind.linear, kind.of
+    if of is not None and of.derive is _tangents and linear[0] >= n:
         # By `vjp` of what this is the derivative of: a loop in it has values in its carry, and is
         # not linear.
-        moving = tuple(of.moving[k - first] for k in unknown)
-        smooth = tuple(of.smooth[k] for k in coming)
-        of = of._replace(derive=_backward, moving=moving, smooth=smooth)
+        moving = tuple(of.moving[k - n] for k in linear)
+        results = tuple(of.results[k] for k in coming)
+        of = of._replace(derive=_cotangents, moving=moving, results=results)
         # The other directions have no part in it.
-        rest = [k for k in rest if k < first]
+        residuals = [k for k in residuals if k < n]
     else:
-        of = Of(_transposed, program, kind.fixed, of, unknown, coming)
+        of = Of(_transposed, program, kind.fixed, of, linear, coming)
     levels = kind.levels
     outs = _derivative(
         kind._replace(
-            levels=tuple((*(axes[k] for k in rest), *[0] * len(coming)) for axes in levels),
-            fixed=(*(kind.fixed[k] for k in rest), *[False] * len(coming)),
-            first=len(unknown),
+            levels=tuple((*(axes[k] for k in residuals), *[0] * len(coming)) for axes in levels),
+            fixed=(*(kind.fixed[k] for k in residuals), *[False] * len(coming)),
+            first=len(linear),
             linear=len(coming),
         ),
         of,
-        [*(operands[k] for k in rest), *(cotangents[k] for k in coming)],
+        [*(operands[k] for k in residuals), *(cotangents[k] for k in coming)],
     )
-    for k, x in zip(unknown, outs, strict=True):
+    for k, x in zip(linear, outs, strict=True):
         # What all members share gets the sum of their derivatives.
-        shared = tuple(n for n, axes in enumerate(reversed(levels)) if axes[k] is None)
-        results[k] = jnp.sum(x, shared) if shared else x
-    return results
+        shared = tuple(i for i, axes in enumerate(reversed(levels)) if axes[k] is None)
+        derivatives[k] = jnp.sum(x, shared) if shared else x
+    return derivatives
 
 
-# Of a function of whole arrays, or of numbers, with the shapes of its operands; of operands that
-# move; and of results.
-_Derive = Callable[[Callable[..., Any], Sequence[Any], Sequence[int], Sequence[int]], Any]
-
-
-def _tangent(fun, shapes, moving, smooth):
-    """Of the operands, and of tangents of those that move."""
-    n = len(shapes)
-
-    def tangent(*xs):
-        some = _some(fun, xs[:n], moving, smooth)
-        return jax.jvp(some, [xs[k] for k in moving], list(xs[n:]))[1]
-
-    return tangent
-
-
-def _backward(fun, shapes, moving, smooth):
-    """Of the operands, and of cotangents of the results."""
-    n = len(shapes)
-
-    def backward(*xs):
-        some = _some(fun, xs[:n], moving, smooth)
-        return list(jax.vjp(some, *(xs[k] for k in moving))[1](list(xs[n:])))
-
-    return backward
-
-
-def _transposed(fun, shapes, moving, smooth):
-    """Of the operands in which the function is not linear, and of cotangents of the results."""
-    rest = _others(shapes, moving)
-
-    def transposed(*xs):
-        some = _some(fun, replaced(shapes, rest, xs[: len(rest)]), moving, smooth)
-        back = jax.linear_transpose(some, *(shapes[k] for k in moving))
-        return list(back(list(xs[len(rest) :])))
-
-    return transposed
-
-
-def _others(operands: Sequence[Any], moving: Sequence[int]) -> list[int]:
-    return [k for k in range(len(operands)) if k not in moving]
-
-
-def _some(
-    fun: Callable[..., Sequence[Any]],
-    values: Sequence[Any],
-    places: Sequence[int],
-    gives: Sequence[int],
-) -> Callable[..., list[Any]]:
-    """Some results as a function of some operands."""
-
-    def some(*xs: Any) -> list[Any]:
-        outs = fun(*replaced(values, places, xs))
-        return [outs[k] for k in gives]
-
-    return some
-
-
-@once_for_each_program
-def _derived(
-    program: ClosedJaxpr, derive: _Derive, moving: tuple[int, ...], smooth: tuple[int, ...]
-) -> ClosedJaxpr:
-    given, outs = program.in_avals, program.out_avals
-    fun = derive(jaxpr_as_fun(program), given, moving, smooth)
-    if derive is _tangent:
-        return program_of(fun, *given, *(given[k] for k in moving))
-    if derive is _transposed:
-        given = [given[k] for k in _others(given, moving)]
-    return program_of(fun, *given, *(outs[k] for k in smooth))
+def _others(values: Sequence[Any], places: Sequence[int]) -> list[int]:
+    return [k for k in range(len(values)) if k not in places]
 
 
 def _batch(operands, dims, *, program, kind):
-    given = zip(operands, dims, strict=True)
-    moved = [x if d is None else jnp.moveaxis(x, d, 0) for x, d in given]
+    pairs = zip(operands, dims, strict=True)
+    moved = [x if d is None else jnp.moveaxis(x, d, 0) for x, d in pairs]
     axes = tuple(None if d is None else 0 for d in dims)
     kind = kind._replace(levels=(*kind.levels, axes))
     outs = step_p.bind(*moved, program=program, kind=kind)
@@ -373,9 +348,9 @@ def _run(*operands, program, kind):
     if few is not None or num_operations > kind.limit():
         return _as_traced(operands, program, kind)
     if kind.is_batch and num_operations > FLAT_WHOLE:
-        operands = _without_single_numbers(operands, kind.levels)
+        operands = _single_numbers_materialised(operands, kind.levels)
     is_cut = kind.is_cut(program.jaxpr)
-    if kind.linear and kind.levels and not is_cut and kind.most == _MANY:
+    if kind.linear and kind.levels and not is_cut and kind.max_derivatives == FLAT_MANY:
         # What is kept of many steps lies entry beside entry, and XLA would read it where it lies,
         # one member at a time: `CF4` on 1000 bodies took 6.5 ms for 50 steps, and takes 3.0 ms.
         operands = together(operands)
@@ -405,8 +380,8 @@ def _of_numbers(
     if of is None:
         return lambda *xs: on_numbers(program, fixed, xs, rows, is_last, is_cut)
     fun = _of_numbers(of.program, of.fixed, of.of, rows, is_cut, False)
-    shapes = jax.eval_shape(functools.partial(split, rows=rows), structs_of(of.program.in_avals))
-    return of.derive(fun, shapes, of.moving, of.smooth)
+    shapes = jax.eval_shape(functools.partial(split, rows=rows), structs(of.program.in_avals))
+    return of.applied(fun, shapes)
 
 
 def _one_by_one(operands, program, kind, k):
@@ -419,14 +394,13 @@ def _one_by_one(operands, program, kind, k):
     levels = kind.levels
     kind = kind._replace(levels=(*levels[:k], *levels[k + 1 :]))
     if not kind.is_batch:
-        kind = kind._replace(most=(kind.most[0], min(kind.most[1], FLAT_DERIVATIVES)))
+        kind = kind._replace(max_derivatives=min(kind.max_derivatives, FLAT_DERIVATIVES))
     moving = [n for n, axis in enumerate(levels[k]) if axis is not None]
     # What is outside of this batch comes first.
-    places = [sum(axes[n] is not None for axes in levels[k + 1 :]) for n in moving]
-    given = zip(moving, places, strict=True)
+    axes = [sum(level[n] is not None for level in levels[k + 1 :]) for n in moving]
     outs = lax.map(
         lambda some: step_p.bind(*replaced(operands, moving, some), program=program, kind=kind),
-        [jnp.moveaxis(operands[n], place, 0) for n, place in given],
+        [jnp.moveaxis(operands[n], axis, 0) for n, axis in zip(moving, axes, strict=True)],
     )
     return [jnp.moveaxis(x, 0, len(levels) - 1 - k) for x in outs]
 
@@ -442,26 +416,26 @@ def _flat(
         axes = [(axes[k],) for axes in levels if axes[k] is not None]
         return _in_batches(functools.partial(split, rows=rows), axes)(operands[k])
 
-    given = [apart(k) for k in range(len(operands))]
+    entries = [apart(k) for k in range(len(operands))]
     try:
-        made, out = jax.make_jaxpr(_in_batches(fun, levels), return_shape=True)(*given)
-        code = flattened(made, CALLS, is_once=True)
+        closed, out = jax.make_jaxpr(_in_batches(fun, levels), return_shape=True)(*entries)
+        code = flattened(closed, CALLS, is_once=True)
     except Declined:
         return None
     except Exception as error:
         return unread(error)
-    leaves = jtu.tree_leaves(given)
+    leaves = jtu.tree_leaves(entries)
     if levels and kind.first < len(out):
         new = in_two(code, len(jtu.tree_leaves(out[: kind.first])), leaves)
     else:
         new = called(code, leaves)
     if kind.is_once:
         # But for what is known, as the derivative by what has no part in it.
-        are_made = reached(code.jaxpr, [True] * len(leaves))
-        places = [k for k, is_one in enumerate(are_made) if is_one]
+        are_reached = reached(code.jaxpr, [True] * len(leaves))
+        places = [k for k, is_one in enumerate(are_reached) if is_one]
         # More results are left to XLA, which drops what nobody uses.
         if len(places) <= MAX_RESULTS_IN_BATCHES:
-            new = replaced(new, places, together([new[k] for k in places]))
+            new = together(new, places)
     outs = jtu.tree_unflatten(jtu.tree_structure(out), new)
     return [_in_batches(join, [(0,)] * len(levels))(x) for x in outs]
 
@@ -470,22 +444,21 @@ def whole(eqn: JaxprEqn) -> ClosedJaxpr:
     """The program of an operation as it was traced, of all members of a batch."""
     program, levels = eqn.params["program"], eqn.params["kind"].levels
     fun = _in_batches(jaxpr_as_fun(program), levels)
-    return program_of(fun, *structs(eqn.invars)) if levels else program
+    return program_of(fun, *structs([v.aval for v in eqn.invars])) if levels else program
 
 
 def _as_traced(operands, program, kind) -> list[Any]:
     if kind.levels:
-        operands = _without_single_numbers(operands, kind.levels)
-    turn = functools.partial(_turn, kind)
-    fun = jaxpr_as_fun(by_turns(not_materialised(program), kind.fixed, turn))
+        operands = _single_numbers_materialised(operands, kind.levels)
+
+    def run(operands: Sequence[Any], turn: ClosedJaxpr, fixed: Sequence[bool]) -> list[Any]:
+        lengths = kind.max_values, kind.max_derivatives
+        of_turn = Kind(tuple(fixed), len(turn.out_avals), kind.rows, *lengths, is_once=True)
+        return step_p.bind(*operands, program=turn, kind=of_turn)
+
+    fun = jaxpr_as_fun(by_turns(not_materialised(program), kind.fixed, run))
     # A literal comes out as NumPy's.
     return list(map(jnp.asarray, _in_batches(fun, kind.levels)(*operands)))
-
-
-def _turn(kind: Kind, operands: Sequence[Any], program: ClosedJaxpr, fixed: Sequence[bool]):
-    """A turn of a loop as an operation."""
-    kind = Kind(tuple(fixed), len(program.out_avals), kind.rows, kind.most, is_once=True)
-    return step_p.bind(*operands, program=program, kind=kind)
 
 
 def _in_batches(fun: Callable[..., Any], levels: Sequence[Any]) -> Callable[..., Any]:
@@ -494,13 +467,13 @@ def _in_batches(fun: Callable[..., Any], levels: Sequence[Any]) -> Callable[...,
     return fun
 
 
-def _without_single_numbers(operands: Sequence[Any], levels: Sequence[Any]) -> list[Any]:
+def _single_numbers_materialised(operands: Sequence[Any], levels: Sequence[Any]) -> list[Any]:
     """The operands, materialised where they have no batch axis, as the time of a step.
 
     XLA would compute them anew in each of its functions for a batch.
     """
-    single = [k for k in range(len(operands)) if all(axes[k] is None for axes in levels)]
-    return replaced(operands, single, together([operands[k] for k in single]))
+    places = range(len(operands))
+    return together(operands, [k for k in places if all(axes[k] is None for axes in levels)])
 
 
 ad.primitive_jvps[step_p] = _jvp

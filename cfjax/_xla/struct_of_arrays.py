@@ -17,6 +17,7 @@ from jax import lax
 from jax.extend.core import JaxprEqn, Literal
 from jaxtyping import Array
 
+from .jaxprs import is_inexact
 from .limits import MAX_LENGTH, MAX_SIZE, MAX_STAGES
 from .materialise import materialised
 from .pack import pack, unpack
@@ -133,20 +134,15 @@ class Call(NamedTuple):
 def literal(v: Literal) -> Any:
     aval: Any = v.aval
     # Integers stay NumPy's, so that it is known which entries an index takes.
-    number = np.asarray if not jnp.issubdtype(aval.dtype, jnp.inexact) else jnp.asarray
-    return number(v.val, aval.dtype)
+    return (jnp if is_inexact(aval) else np).asarray(v.val, aval.dtype)
 
 
-def known(x: Any) -> np.ndarray | None:
+def static_value(x: Any) -> np.ndarray | None:
     """What is known while the program is made."""
     if isinstance(x, StructOfArrays):
-        is_known = all(isinstance(e, np.ndarray | np.generic) for e in x.entries)
-        return np.asarray(x.entries).reshape(x.shape) if is_known else None
+        is_static = all(isinstance(e, np.ndarray | np.generic) for e in x.entries)
+        return np.asarray(x.entries).reshape(x.shape) if is_static else None
     return np.asarray(x) if isinstance(x, np.ndarray | np.generic) else None
-
-
-def is_inexact(aval: Any) -> bool:
-    return not hasattr(aval, "dtype") or jnp.issubdtype(aval.dtype, jnp.inexact)
 
 
 def is_whole(x: Any) -> bool:
@@ -210,10 +206,10 @@ def conformed(x: StructOfArrays, shape: Sequence[int], is_short: Sequence[bool])
             entries = [jnp.expand_dims(e, position) for e in entries]
         elif is_short[axis]:
             rows = [_apart(e, n, position) for e in entries]
-            kept = {id(e): e for row in rows for e in row}
-            number = {key: k for k, key in enumerate(kept)}
+            distinct = {id(e): e for row in rows for e in row}
+            number = {key: k for k, key in enumerate(distinct)}
             numbers = np.array([[number[id(e)] for e in row] for row in rows])
-            entries = list(kept.values())
+            entries = list(distinct.values())
             places = np.moveaxis(numbers[places.squeeze(axis)], -1, axis)
         else:
             rows = np.moveaxis(places, axis, -1)
@@ -261,9 +257,9 @@ def common(arrays: Sequence[StructOfArrays], shape: Sequence[int]) -> list[bool]
     def decide(axis: int, n: int) -> bool:
         if n == 1:
             return True
-        given = [x for x in arrays if x.shape[axis] != 1]
-        short = any(x.is_short[axis] for x in given)
-        long = any(not x.is_short[axis] and not _repeats(x, axis) for x in given)
+        along = [x for x in arrays if x.shape[axis] != 1]
+        short = any(x.is_short[axis] for x in along)
+        long = any(not x.is_short[axis] and not _repeats(x, axis) for x in along)
         if short and long:
             return axis == len(shape) - 1 and n <= MAX_LENGTH
         return short

@@ -21,10 +21,6 @@ MOVES = frozenset(
     "broadcast_in_dim cfjax_pack cfjax_unpack concatenate dynamic_slice dynamic_update_slice "
     "gather pad reshape rev scatter slice split squeeze stack transpose".split()
 )
-# XLA updates an array in place for these, and jaxlib 0.10 then reads what it has overwritten if the
-# array, or the result, also has another shape: `x.at[1:].set(lax.dynamic_slice_in_dim(x, k, 99))`
-# with a reshape beside it. Taken apart, arrays have other shapes in many places.
-_IN_PLACE = frozenset(("dynamic_update_slice",))
 # The parameters of each operation. The rules of elementwise ones hand all of theirs on.
 _HANDED_ON = "accuracy input_dtype new_dtype out_dtype rounding_method sharding weak_type y"
 _INDEXED = "dimension_numbers indices_are_sorted mode unique_indices "
@@ -44,8 +40,7 @@ _TEXTS: dict[str, str] = {
     "reshape": "dimensions new_sizes sharding",
     "rev": "dimensions",
     **dict.fromkeys(
-        ("scatter", "scatter-add", "scatter-mul", "scatter_add", "scatter_mul"),
-        _INDEXED + "update_consts update_jaxpr",
+        ("scatter", "scatter-add", "scatter-mul"), _INDEXED + "update_consts update_jaxpr"
     ),
     "slice": "limit_indices start_indices strides",
     "split": "axis sizes",
@@ -80,8 +75,14 @@ def _is_known(name: str, parameter: str, value: Any) -> bool:
 
 
 def is_in_place(eqn: JaxprEqn) -> bool:
-    """Whether XLA may update an operand of it in place."""
-    return eqn.primitive.name in _IN_PLACE or eqn.primitive.name.startswith("scatter")
+    """Whether XLA may update an operand of it in place.
+
+    Then jaxlib 0.10 reads what it has overwritten if the array, or the result, also has another
+    shape: `x.at[1:].set(lax.dynamic_slice_in_dim(x, k, 99))` with a reshape beside it. Taken apart,
+    arrays have other shapes in many places.
+    """
+    name = eqn.primitive.name
+    return name == "dynamic_update_slice" or name.startswith("scatter")
 
 
 _CONTROL = frozenset(("cond", "scan", "while"))

@@ -42,8 +42,8 @@ def lengths(request, monkeypatch):
     jax.clear_caches()
     if request.param == "as traced":
         for name, limit in (
-            ("_USUAL", (0, 0)),
-            ("_MANY", (0, 0)),
+            ("OF_FEW", (0, 0)),
+            ("OF_MANY", (0, 0)),
             ("FLAT_MANY", 0),
         ):
             monkeypatch.setattr(random_programs.lowering, name, limit)

@@ -125,10 +125,10 @@ def leftover(monkeypatch):
     """The names of operations that got arrays whole."""
     names = []
 
-    def noted(jaxpr, eqn, values):
+    def noted(eqn, values):
         if any(map(np.ndim, values)):
             names.append(eqn.primitive.name)
-        return evaluate(jaxpr, eqn, values)
+        return evaluate(eqn, values)
 
     evaluate = program.evaluate
     monkeypatch.setattr(program, "evaluate", noted)
