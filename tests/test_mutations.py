@@ -90,7 +90,7 @@ def test_the_tests_of_a_file():
     assert all((ROOT / x).exists() for p in PACKAGE.rglob("*.py") for x in mutations.tests_of(p))
     for file, tests in {
         "_solvers/stages.py": "tests/solvers/test_stages.py",
-        "_numerics/rotate.py": "tests/numerics",
+        "_fields/elementwise.py": "tests/fields",
         "_xla/turns.py": "tests/xla/test_turns.py",
         "_control_term.py": "tests/noise/test_control_term.py",
         "__main__.py": "tests/test_main.py",

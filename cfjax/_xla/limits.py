@@ -45,7 +45,7 @@ FLAT_DERIVATIVES = 3 * FUNCTION
 # a thousand times over, depending on what else is known of a program. What is known of it before
 # are its operations times the turns of its loop: values and derivatives with more than this are
 # cut, as a cut that is not needed costs up to a factor of three (gradients, batch).
-CUT_ONE, CUT_IN_BATCHES = 4 * FUNCTION, 5 * FUNCTION // 2
+CUT_ONE, CUT_IN_BATCHES = 5 * FUNCTION, 5 * FUNCTION // 2
 UNCUT_VALUES, UNCUT_DERIVATIVES = 32 * FUNCTION, 18 * FUNCTION
 # Of batches, short vectors along leading axes, and what is made for many steps. A gradient of this
 # length takes some 12 s to compile (gradients, batch, chain).

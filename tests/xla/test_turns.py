@@ -127,10 +127,12 @@ def test_a_step_that_is_too_long_keeps_its_loop_in_equal_steps():
             term, args = given["term"], given["args"]
             return cfjax.integrate(term, solver, 0.0, 0.1, y, args, num_steps=20, throw=False).ys
 
-        return sum("stablehlo.while" in line for line in lines_of(solve, given["y0"]))
+        return sum(
+            "stablehlo.while" in line for line in lines_of(jax.grad(size(solve)), given["y0"])
+        )
 
-    # A step of `CF4` has none.
-    assert num_loops(cfjax.RKMK8()) == num_loops(cfjax.CF4()) + 1
+    # A step of `CF4` has none. That of `RKMK8` has some on its way back.
+    assert num_loops(cfjax.RKMK8()) > num_loops(cfjax.CF4())
 
 
 @functools.cache
