@@ -7,6 +7,7 @@ import numpy as np
 import pytest
 import scipy.linalg
 
+import cfjax
 from cfjax import Rotation
 
 EPS = 2.0**-52
@@ -218,9 +219,16 @@ def test_wrong_dtype(dtype):
 @pytest.mark.parametrize("shape", [(), (2,), (4,), (2, 3)])
 def test_wrong_point(shape):
     # The text comes from the class, or from the check of its annotation in this test run.
-    for method in (Rotation(np.ones(3)).flow, Rotation(np.ones(3)).tangent):
+    field = Rotation(np.ones(3))
+    for method in (field.flow, field.increment, field.mean, field.tangent):
         with pytest.raises((TypeError, ValueError), match="Rotation"):
             method(jnp.ones(shape))
+
+
+def test_bracket_with_another_class():
+    text = "Rotation has a bracket with another Rotation only, got LeftMatrix"
+    with pytest.raises(TypeError, match=text):
+        Rotation(np.ones(3)).bracket(cfjax.LeftMatrix(np.eye(3)))
 
 
 def test_tangent_names_the_shapes():

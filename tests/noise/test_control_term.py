@@ -603,3 +603,10 @@ def test_methods_that_refuse_noise():
         cfjax.integrate(term, cfjax.Magnus4(), 0.0, 1.0, Y0, num_steps=2)
     with pytest.raises(TypeError, match=re.escape("use diffrax.HalfSolver(solver)")):
         cfjax.integrate(term, cfjax.Richardson(cfjax.CF4()), 0.0, 1.0, Y0, num_steps=2)
+
+
+def test_a_tableau_of_order_one_takes_no_noise(no_shape_hook):
+    term = term_of(GIVEN)
+    with pytest.raises(TypeError, match="must have order 2 or more"):
+        cfjax.CommutatorFree(cfjax.LieEuler().tableau).for_terms(term)
+    assert cfjax.CommutatorFree(cfjax.CF2().tableau).for_terms(term).order(term) == 2
