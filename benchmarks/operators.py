@@ -4,8 +4,8 @@
 - spins: a chain of 12 in a transverse field, as in `cfjax.scenes.annealing`, halfway.
 - diffusion and advection: differences on 1024 points, symmetric, or nearly skew but damped.
 
-The 2-norm of a step is given. `OperatorSum` knows the operators when the program is traced, and
-`LeftMatrix` sees a matrix only when it runs. The others are the dense exponential of cfjax times
+The 2-norm of a step is given, and declared for `OperatorSum`. `LeftMatrix` sees a matrix only when
+it runs. The others are the dense exponential of cfjax times
 the vector, and the Lanczos method of matfree, without reorthogonalisation, if the operator is
 Hermitian, otherwise the Arnoldi method of matfree. Both use the exponential of cfjax for the small
 matrix, which is faster than an exponential by eigenvalues. They have no tolerance: each takes the

@@ -12,7 +12,7 @@ from jaxtyping import Array, Int, Real
 
 # For each degree the largest norm for which the Taylor polynomial has a backward error below half a
 # unit in the last place; up to where the terms grow and cancel. As in Table 3.1 of Al-Mohy &
-# Higham; tests/numerics/test_expm_multiply.py derives them.
+# Higham; tests/numerics/test_expm_series.py derives them.
 TAYLOR_THETA = {
     "float32": {
         **{3: 0.01123, 4: 0.05116, 5: 0.1308, 6: 0.2495, 7: 0.4014, 8: 0.58, 9: 0.7795},

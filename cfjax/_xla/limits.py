@@ -42,7 +42,7 @@ FLAT_VALUES = FUNCTION
 FLAT_DERIVATIVES = 3 * FUNCTION
 # Of those scalarised as a whole, one system and batches, the longer ones are cut in a loop over
 # many stages. XLA computes what a turn needs of all turns before it in each of its functions, up to
-# a thousand times over, depending on what else is known of a program. What is known of it before
+# thousands of times over, depending on what else is known of a program. What is known of it before
 # are its operations times the turns of its loop: values and derivatives with more than this are
 # cut, as a cut that is not needed costs up to a factor of three (gradients, batch).
 CUT_ONE, CUT_IN_BATCHES = 5 * FUNCTION, 5 * FUNCTION // 2

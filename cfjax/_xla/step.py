@@ -164,13 +164,12 @@ class Kind(NamedTuple):
         """Whether it is no derivative of a derivative."""
         return self.max_derivatives > FLAT_SECOND
 
-    def is_cut(self, jaxpr: Jaxpr) -> bool:
+    def is_cut(self, jaxpr: Jaxpr, num_operations: float) -> bool:
         """Whether a program that is scalarised as a whole is cut at the turns of its loop.
 
         What is not cut may explode: 1000 bodies with `RKMK8` took half a second a step where their
         inertia is known, and 0.15 ms where it is an argument.
         """
-        num_operations = length(jaxpr)
         if self.rows:
             return bool(self.linear) and num_operations > FLAT_WHOLE
         least = CUT_IN_BATCHES if self.levels else CUT_ONE
@@ -349,7 +348,7 @@ def _run(*operands, program, kind):
         return _as_traced(operands, program, kind)
     if kind.is_batch and num_operations > FLAT_WHOLE:
         operands = _single_numbers_materialised(operands, kind.levels)
-    is_cut = kind.is_cut(program.jaxpr)
+    is_cut = kind.is_cut(program.jaxpr, num_operations)
     if kind.linear and kind.levels and not is_cut and kind.max_derivatives == FLAT_MANY:
         # What is kept of many steps lies entry beside entry, and XLA would read it where it lies,
         # one member at a time: `CF4` on 1000 bodies took 6.5 ms for 50 steps, and takes 3.0 ms.

@@ -114,32 +114,15 @@ def test_random_times_are_on_the_manifold_and_nodes_are_the_steps(name):
     ys = jax.vmap(sol.evaluate)(jnp.asarray(times))
     lengths = np.linalg.norm(ys, axis=1)
     assert np.abs(lengths - np.linalg.norm(y0)).max() < 1e-13
-    steps = diffrax.diffeqsolve(
-        cfjax.LieTerm(field),
-        solver,
-        0.0,
-        1.0,
-        1 / n,
-        y0,
-        args,
-        saveat=diffrax.SaveAt(t0=True, steps=True),
-        max_steps=n,
-    )
+    problem = cfjax.LieTerm(field), solver, 0.0, 1.0, 1 / n, y0, args
+    at_steps = diffrax.SaveAt(t0=True, steps=True)
+    steps = diffrax.diffeqsolve(*problem, saveat=at_steps, max_steps=n)
     for left in (True, False):
         for t, y in zip(steps.ts, steps.ys, strict=True):
             # The same flows in another order of rounding.
             np.testing.assert_allclose(sol.evaluate(t, left=left), y, rtol=0, atol=1e-14)
-    saved = diffrax.diffeqsolve(
-        cfjax.LieTerm(field),
-        solver,
-        0.0,
-        1.0,
-        1 / n,
-        y0,
-        args,
-        saveat=diffrax.SaveAt(ts=jnp.sort(jnp.asarray(times))),
-        max_steps=n,
-    )
+    at_times = diffrax.SaveAt(ts=jnp.sort(jnp.asarray(times)))
+    saved = diffrax.diffeqsolve(*problem, saveat=at_times, max_steps=n)
     np.testing.assert_allclose(saved.ys, ys[np.argsort(times)], rtol=0, atol=1e-14)
 
 
