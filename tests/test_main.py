@@ -398,7 +398,8 @@ def test_ctrl_c_while_jax_is_imported(start):
     out, error = process.communicate()
     assert process.returncode == 130
     assert out == ""
-    assert error.splitlines()[-1] == "cfjax: interrupted" and "Traceback" not in error
+    # The thread that imports may still report a module before the process has ended.
+    assert error.splitlines().count("cfjax: interrupted") == 1 and "Traceback" not in error
 
 
 def test_files_are_written_whole_or_not_at_all(start, tmp_path):
