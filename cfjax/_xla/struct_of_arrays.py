@@ -140,8 +140,13 @@ def literal(v: Literal) -> Any:
 def static_value(x: Any) -> np.ndarray | None:
     """What is known while the program is made."""
     if isinstance(x, StructOfArrays):
-        is_static = all(isinstance(e, np.ndarray | np.generic) for e in x.entries)
-        return np.asarray(x.entries).reshape(x.shape) if is_static else None
+        # Without an entry the dtype is not known either.
+        if not x.entries or not all(isinstance(e, np.ndarray | np.generic) for e in x.entries):
+            return None
+        stacked = np.stack([np.broadcast_to(e, x.sides) for e in x.entries])
+        short = [k for k, is_short in enumerate(x.is_short) if is_short]
+        stacked = stacked.reshape(*(x.shape[k] for k in short), *x.sides)
+        return stacked.transpose(np.argsort([*short, *x.long]))
     return np.asarray(x) if isinstance(x, np.ndarray | np.generic) else None
 
 

@@ -13,7 +13,7 @@ import cfjax
 from cfjax._xla import limits, program, scalarised
 from cfjax._xla.program import join, split
 from cfjax._xla.scope import is_rows
-from cfjax._xla.struct_of_arrays import StructOfArrays, struct_of_arrays
+from cfjax._xla.struct_of_arrays import StructOfArrays, static_value, struct_of_arrays
 
 pytestmark = pytest.mark.usefixtures("rewritten")
 
@@ -202,6 +202,19 @@ def test_a_matrix_is_no_lattice():
     fun = lambda y: y @ (y.T @ y)  # noqa: E731
     # A sum of 100 terms, with another order.
     np.testing.assert_allclose(scalarised(fun, y), fun(y), rtol=1e-12, atol=1e-12)
+
+
+def test_the_value_of_what_is_known_along_leading_axes():
+    """Entries with the long axes, or 1 in place of one, make the array that they are taken from."""
+    whole = np.arange(4 * 5 * 3).reshape(4, 5, 3)
+    short_last = StructOfArrays(np.moveaxis(whole, -1, 0), whole.shape, [False, False, True])
+    np.testing.assert_array_equal(static_value(short_last), whole)
+    short_first = StructOfArrays(whole, whole.shape, [True, False, False])
+    np.testing.assert_array_equal(static_value(short_first), whole)
+    repeated = StructOfArrays([np.zeros((4, 1)), np.ones((4, 1))], (4, 5, 2), [False, False, True])
+    np.testing.assert_array_equal(static_value(repeated), np.broadcast_to([0.0, 1.0], (4, 5, 2)))
+    # The dtype of no entries is not known, and no indices would be numbers with a fraction.
+    assert static_value(StructOfArrays([], (0,))) is None
 
 
 def test_split_and_join():
