@@ -39,7 +39,7 @@ class Lindblad(AbstractFrozenField):
 
     ```python
     def field(t, rho, args):
-        return cfjax.Lindblad(h0 + jnp.cos(3 * t) * h1, [lower, lower.T], [gamma * (n + 1), gamma * n])
+        return cfjax.Lindblad(h0 + jnp.cos(3 * t) * h1, [lower, lower.T], [0.2, 0.1])
     ```
 
     A flow with rates that are not negative is completely positive, and every flow keeps the trace,
@@ -259,7 +259,10 @@ def _jump(k: int, jump: Any, h: Array) -> Matrix:
 def _checked_rates(field: Lindblad, first: Lindblad) -> Array:
     """The rates of a field, with an error if its jumps are not those of the first."""
     leaves = [jtu.tree_leaves(f.jumps) for f in (first, field)]
-    kinds = [(jtu.tree_structure(f.jumps), struct(a)) for f, a in zip((first, field), leaves)]
+    kinds = [
+        (jtu.tree_structure(f.jumps), struct(arrays))
+        for f, arrays in zip((first, field), leaves, strict=True)
+    ]
     message = (
         "Lindblad fields that are added must have the same jumps: these may not depend on time or "
         "state, except for cfjax.Kraus4, where they may depend on time."

@@ -101,8 +101,8 @@ def expm_minus_one_multiply(
 
     Source: Al-Mohy & Higham, Computing the action of the matrix exponential, SIAM J. Sci. Comput.
     33 (2011), doi:10.1137/100788860; for skew operators Tal-Ezer & Kosloff, J. Chem. Phys. 81
-    (1984), doi:10.1063/1.448136; for the numerical range Crouzeix & Palencia, The numerical range is
-    a (1 + sqrt 2)-spectral set, SIAM J. Matrix Anal. Appl. 38 (2017), doi:10.1137/17M1116672.
+    (1984), doi:10.1063/1.448136; for the strip Crouzeix & Palencia, The numerical range is a
+    (1 + sqrt 2)-spectral set, SIAM J. Matrix Anal. Appl. 38 (2017), doi:10.1137/17M1116672.
     """
     norm = max_over_batch(lax.stop_gradient(norm).astype(jnp.finfo(x.dtype).dtype))
     steps = _steps(norm, is_skew)
