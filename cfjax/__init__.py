@@ -84,6 +84,7 @@ if TYPE_CHECKING:
     from ._solvers.exponential import ETDRK4 as ETDRK4
     from ._solvers.exponential import ExponentialRungeKutta as ExponentialRungeKutta
     from ._solvers.implicit_midpoint import ImplicitMidpoint as ImplicitMidpoint
+    from ._solvers.kraus import Kraus4 as Kraus4
     from ._solvers.low_storage import BWRRK33 as BWRRK33
     from ._solvers.low_storage import BWRRK53 as BWRRK53
     from ._solvers.low_storage import CFEES25 as CFEES25
@@ -148,6 +149,7 @@ _NAMES_LATER = {
     "_solvers.composition": ("Composition",),
     "_solvers.exponential": ("ETD43", "ETD54", "ETDRK4", "ExponentialRungeKutta"),
     "_solvers.implicit_midpoint": ("ImplicitMidpoint",),
+    "_solvers.kraus": ("Kraus4",),
     "_solvers.low_storage": (
         "BWRRK33",
         "BWRRK53",
