@@ -107,7 +107,8 @@ class Lindblad(AbstractFrozenField):
         It is `-i h - sum_k rates_k L_k^H L_k / 2` without the trace of h, which has no effect. For
         a field without leading axes.
         """
-        h, loss = promoted(-1j * _traceless(self.h), _gram(self.rates, self.jumps) / 2)
+        h = _traceless(self.h).astype(np.promote_types(self.h.dtype, np.complex64))
+        h, loss = promoted(-1j * h, _gram(self.rates, self.jumps) / 2)
         return h - loss
 
     def jump(self, x: Inexact[Array, "n n"]) -> Inexact[Array, "n n"]:
@@ -181,7 +182,7 @@ class Lindblad(AbstractFrozenField):
         # It has no trace but for rounding.
         return _traceless(change)
 
-    def _matrix(self) -> Real[Array, "n*n n*n"]:
+    def _matrix(self) -> Real[Array, "n2 n2"]:
         """The matrix that moves the coordinates of a Hermitian matrix."""
         dtype = self.rates.dtype
         turning = jnp.asarray(hermitian.commutators(self.h.shape[-1]), dtype)
@@ -314,7 +315,7 @@ def _two_norm(a: Array) -> Array:
 
 def _traceless(x: Array) -> Array:
     n = x.shape[-1]
-    return x - jnp.trace(x).real / n * jnp.eye(n, dtype=x.dtype)
+    return x - scaled(jnp.trace(x).real / n, jnp.eye(n, dtype=x.dtype))
 
 
 def _hermitian_part(x: Array) -> Array:

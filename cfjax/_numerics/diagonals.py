@@ -76,7 +76,7 @@ def times(a: Matrix, x: Inexact[Array, "n m"]) -> Inexact[Array, "n m"]:
 def times_adjoint(x: Inexact[Array, "m n"], a: Matrix) -> Inexact[Array, "m n"]:
     """`x @ a^H`, as `times`."""
     if not isinstance(a, Diagonals):
-        return small_product(*promoted(x, jnp.asarray(a).conj().T))
+        return small_product(*promoted(x, jnp.asarray(adjoint(a))))
     return times(a, x.conj().T).conj().T
 
 

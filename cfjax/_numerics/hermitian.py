@@ -12,20 +12,20 @@ from jaxtyping import Array, Complex, Float, Inexact
 from .vectors import pack
 
 
-def coordinates(x: Complex[Array, "n n"]) -> Float[Array, " n*n"]:
+def coordinates(x: Inexact[Array, "n n"]) -> Float[Array, " n*n"]:
     """The coordinates of the Hermitian part of x. The first is the trace over sqrt(n)."""
     n = x.shape[0]
     diagonal = [x[i, i].real for i in range(n)]
     mixed = [sum(float(w) * d for w, d in zip(row, diagonal, strict=True)) for row in _diagonal(n)]
-    above = [(x[i, j] + x[j, i].conj()) / np.sqrt(2) for i, j in _pairs(n)]
+    above = [(x[i, j] + x[j, i].conj()) / 2**0.5 for i, j in _pairs(n)]
     return pack([*mixed, *(z.real for z in above), *(z.imag for z in above)])
 
 
-def matrix(r: Float[Array, " n*n"]) -> Complex[Array, "n n"]:
+def matrix(r: Float[Array, " n2"]) -> Complex[Array, "n n"]:
     """The matrix with these coordinates, Hermitian to the last bit."""
     n = int(np.sqrt(len(r)))
     pairs = _pairs(n)
-    real, imag = np.sqrt(0.5) * r[n : n + len(pairs)], np.sqrt(0.5) * r[n + len(pairs) :]
+    real, imag = 0.5**0.5 * r[n : n + len(pairs)], 0.5**0.5 * r[n + len(pairs) :]
     columns = _diagonal(n).T
     entries = {}
     for i, row in enumerate(columns):
@@ -38,7 +38,7 @@ def matrix(r: Float[Array, " n*n"]) -> Complex[Array, "n n"]:
 
 
 @functools.cache
-def basis(n: int) -> Complex[np.ndarray, "n*n n n"]:
+def basis(n: int) -> Complex[np.ndarray, "n2 n n"]:
     """The basis."""
     pairs, root = _pairs(n), np.sqrt(0.5)
     matrices = np.zeros((n * n, n, n), complex)
@@ -50,7 +50,7 @@ def basis(n: int) -> Complex[np.ndarray, "n*n n n"]:
 
 
 @functools.cache
-def commutators(n: int) -> Float[np.ndarray, "n*n n*n n*n"]:
+def commutators(n: int) -> Float[np.ndarray, "n2 n2 n2"]:
     """For each matrix b of the basis that of `x -> -i [b, x]` in coordinates."""
     b = basis(n)
     images = np.einsum("aij,cjk->acik", b, b) - np.einsum("cij,ajk->acik", b, b)
@@ -61,7 +61,8 @@ def dissipator(a: Inexact[Array | np.ndarray, "n n"]) -> Float[Array | np.ndarra
     """The matrix of `x -> a x a^H - (a^H a x + x a^H a) / 2` in coordinates."""
     # A matrix that is known is made once.
     numpy: Any = jnp if isinstance(a, Tracer) else np
-    a, b = numpy.asarray(a), numpy.asarray(basis(a.shape[-1]))
+    b = numpy.asarray(basis(a.shape[-1]), np.promote_types(a.dtype, np.complex64))
+    a = numpy.asarray(a, b.dtype)
     loss = a.conj().T @ a / 2
     images = a @ b @ a.conj().T - loss @ b - b @ loss
     return numpy.einsum("bki,cik->bc", b, images).real

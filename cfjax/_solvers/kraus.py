@@ -12,14 +12,15 @@ import jax.tree_util as jtu
 from jax import lax
 from jaxtyping import Array, Complex, PyTree, Real
 
-from .._field import is_field
+from .._field import Rest, is_field
 from .._fields.elementwise import each
 from .._fields.lindblad import Lindblad
 from .._numerics.checks import Fault
 from .._numerics.diagonals import dense
 from .._numerics.expm import expm
 from .._numerics.matmul import small_product
-from .._numerics.operators import added
+from .._numerics.operators import added, scaled
+from .._term import product
 from .base import State, check_choice
 from .dense import AbstractPath
 from .magnus import AbstractOfTime
@@ -72,9 +73,11 @@ class Kraus4(AbstractOfTime, diffrax.AbstractAdaptiveSolver):
 
     def start(self, terms, t0, t1, y0, args) -> tuple[State, Fault]:
         self.for_terms(terms)
-        field = eqx.filter_eval_shape(terms.vf, t0, y0, args)
-        for part in [field] if isinstance(terms, diffrax.MultiTerm) else [(field,)]:
-            _check_fields(part)
+        control = terms.contr(t0, t1)
+        field = eqx.filter_eval_shape(lambda y: product(terms, terms.vf(t0, y, args), control), y0)
+        for path, part in jtu.tree_leaves_with_path(field, is_leaf=is_field):
+            if not isinstance(part, Lindblad):
+                raise TypeError(_is_no_lindblad(jtu.keystr(path), part))
         return super().start(terms, t0, t1, y0, args)
 
     def step_in(self, chart):
@@ -107,16 +110,15 @@ class _Path(AbstractPath):
         return jtu.tree_map(jnp.add, self.start, increment)
 
 
-def _check_fields(fields: tuple[PyTree, ...]) -> None:
-    for field in fields:
-        for path, part in jtu.tree_leaves_with_path(field, is_leaf=is_field):
-            if not isinstance(part, Lindblad):
-                name = type(part).__name__ if is_field(part) else "an array"
-                raise TypeError(
-                    "Kraus4 takes density matrices alone: the field must be cfjax.Lindblad for "
-                    f"each part of the state, got {name} for y{jtu.keystr(path)}. Use a "
-                    "commutator-free method, for example cfjax.CF4()."
-                )
+def _is_no_lindblad(place: str, part: Any) -> str:
+    name = type(part).__name__ if is_field(part) else "a translation"
+    if isinstance(part, Rest):
+        name = "None"
+    return (
+        "Kraus4 takes density matrices alone: the field of each part of the state must be "
+        f"cfjax.Lindblad, and for y{place} it is {name}. Use a commutator-free method, for example "
+        "cfjax.CF4()."
+    )
 
 
 def _lagrange(c: Real[Array, ""]) -> list[Any]:
@@ -136,7 +138,7 @@ def _interpolated(weights: Sequence[Any], theta: Any, *fields: Lindblad) -> Lind
     def mix(*values: Array) -> Array:
         if all(x is values[0] for x in values):
             return values[0]
-        return added(w.astype(dtype) * x for w, x in zip(weights, values, strict=True))
+        return added(scaled(w.astype(dtype), x) for w, x in zip(weights, values, strict=True))
 
     def jump(*values: Any) -> Any:
         if len({jtu.tree_structure(x) for x in values}) > 1:
@@ -148,7 +150,7 @@ def _interpolated(weights: Sequence[Any], theta: Any, *fields: Lindblad) -> Lind
     rates = jnp.where(rates * added(f.rates for f in fields) < 0, 0, rates)
     length = theta.astype(dtype)
     parts = (
-        length * mix(*(f.h for f in fields)),
+        scaled(length, mix(*(f.h for f in fields))),
         length * rates,
         tuple(jump(*x) for x in zip(*(f.jumps for f in fields), strict=True)),
     )
@@ -202,13 +204,13 @@ def _increment(
     (s,) = jax.linear_transpose(lambda x: stages(x)[0], x)(eye)
     s = _hermitian_part(s.T)
     shift = lax.stop_gradient(4 * len(x) * jnp.finfo(x.dtype).eps * jnp.max(jnp.sum(jnp.abs(s), 1)))
-    factor = jnp.linalg.cholesky(s + shift * eye)
+    factor = jnp.linalg.cholesky(s + scaled(shift, eye))
     solve = functools.partial(lax.linalg.triangular_solve, factor, lower=True)
     y = solve(solve(x, left_side=True, transpose_a=True, conjugate_a=True), left_side=False)
     end, a1, j2, j3, j4 = stages(y)
-    increment = _hermitian_part(end + shift * y) - x
+    increment = _hermitian_part(end + scaled(shift, y)) - x
     # It has no trace but for rounding.
-    increment = increment - jnp.trace(increment).real / len(x) * eye
+    increment = increment - scaled(jnp.trace(increment).real / len(x), eye)
     if not estimate:
         return increment, None
     # Of the jumps: with a stage at a quarter the weights 0, 4/9, 1/9, 2/9, 2/9 are of order 3. The
