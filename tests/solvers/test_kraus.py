@@ -266,11 +266,13 @@ def test_the_estimate_sees_the_error(problem):
         assert 3.6 < slope < 4.5
 
 
-def test_the_estimate_sees_the_error_of_stiff_steps():
-    step = stepper(stiff)
+@pytest.mark.parametrize("start", [0.0, 0.5])
+def test_the_estimate_sees_the_error_of_stiff_steps(start):
+    """Also where the fast levels are at rest."""
+    step, rho = stepper(stiff), exact(stiff, 0.0, start) if start else pure(20)
     for h in (0.2, 0.05):
-        end, estimate = step(0.0, h, pure(20))
-        error = np.abs(end - exact(stiff, 0.0, h)).max()
+        end, estimate = step(start, h, rho)
+        error = np.abs(end - exact(stiff, 0.0, start + h)).max()
         assert error < np.abs(estimate).max() < 20 * error
 
 
