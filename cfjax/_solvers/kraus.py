@@ -35,7 +35,8 @@ class Kraus4(AbstractOfTime, diffrax.AbstractAdaptiveSolver):
 
     **A step is completely positive and keeps the trace**, to rounding, however long it is, for all
     rates that are not negative. Rates and jumps may depend on t. A large h and stiff dissipation
-    do not shorten the step either. It is the classical Runge-Kutta method in the frame of the
+    need no short steps, though with stiff dissipation the observed order is below 4. It is the
+    classical Runge-Kutta method in the frame of the
     motion without jumps, which is computed by exponentials; a congruence then corrects the trace.
 
     The estimate of the error, with an embedded method of order 3, costs some 40% more.

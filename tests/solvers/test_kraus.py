@@ -268,12 +268,12 @@ def test_the_estimate_sees_the_error(problem):
 
 @pytest.mark.parametrize("start", [0.0, 0.5])
 def test_the_estimate_sees_the_error_of_stiff_steps(start):
-    """Also where the fast levels are at rest."""
+    """Also where the fast levels are at rest: there it is the error itself, but for a tenth."""
     step, rho = stepper(stiff), exact(stiff, 0.0, start) if start else pure(20)
     for h in (0.2, 0.05):
         end, estimate = step(start, h, rho)
         error = np.abs(end - exact(stiff, 0.0, start + h)).max()
-        assert error < np.abs(estimate).max() < 20 * error
+        assert 0.8 * error < np.abs(estimate).max() < 20 * error
 
 
 @pytest.mark.filterwarnings("ignore:Complex dtype support in Diffrax")
