@@ -56,6 +56,7 @@ if TYPE_CHECKING:
     from ._fields.affine import Affine as Affine
     from ._fields.conjugation import Congruence as Congruence
     from ._fields.conjugation import Conjugation as Conjugation
+    from ._fields.lindblad import Lindblad as Lindblad
     from ._fields.linear_affine import LinearAffine as LinearAffine
     from ._fields.low_rank import BorderedSkew as BorderedSkew
     from ._fields.low_rank import LowRankSkew as LowRankSkew
@@ -83,6 +84,7 @@ if TYPE_CHECKING:
     from ._solvers.exponential import ETDRK4 as ETDRK4
     from ._solvers.exponential import ExponentialRungeKutta as ExponentialRungeKutta
     from ._solvers.implicit_midpoint import ImplicitMidpoint as ImplicitMidpoint
+    from ._solvers.kraus import Kraus4 as Kraus4
     from ._solvers.low_storage import BWRRK33 as BWRRK33
     from ._solvers.low_storage import BWRRK53 as BWRRK53
     from ._solvers.low_storage import CFEES25 as CFEES25
@@ -122,6 +124,7 @@ _NAMES_LATER = {
     "_fields.affine": ("Affine",),
     "_testing": ("check_field", "check_terms"),
     "_fields.conjugation": ("Congruence", "Conjugation"),
+    "_fields.lindblad": ("Lindblad",),
     "_fields.linear_affine": ("LinearAffine",),
     "_fields.low_rank": ("BorderedSkew", "LowRankSkew"),
     "_fields.operator_sum": ("OperatorSum",),
@@ -146,6 +149,7 @@ _NAMES_LATER = {
     "_solvers.composition": ("Composition",),
     "_solvers.exponential": ("ETD43", "ETD54", "ETDRK4", "ExponentialRungeKutta"),
     "_solvers.implicit_midpoint": ("ImplicitMidpoint",),
+    "_solvers.kraus": ("Kraus4",),
     "_solvers.low_storage": (
         "BWRRK33",
         "BWRRK53",

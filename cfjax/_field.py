@@ -131,6 +131,14 @@ class AbstractFrozenField(eqx.Module):
         del point
         return None
 
+    def faults(self) -> Sequence[tuple[Bool[Array, ""], str]]:
+        """What may be wrong with the values of this field: whether it is, and what must hold.
+
+        By default nothing. A solve calls it for the fields at its start, and raises an error where
+        one of these is true.
+        """
+        return ()
+
     def to_chart(self, point: Any, earlier: Sequence[Any]) -> tuple["AbstractFrozenField", Any]:
         """This field and the point where it is frozen, in the chart of the step.
 

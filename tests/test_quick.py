@@ -32,6 +32,11 @@ def of_time(t, y, args):
     return cfjax.Rotation(args * jnp.asarray(ON_SPHERE) + t)
 
 
+def decay(t, y, args):
+    """Of density matrices, and not of the state."""
+    return cfjax.Lindblad(jnp.diag(args * t), [args[:, None] * np.eye(3, k=1)])
+
+
 def linear(t, y, args):
     """The rotation of a vector, as a linear part and no rest."""
     return cfjax.LinearAffine(jnp.cross(args * y + t, jnp.eye(3), axisb=1, axisc=1).T, 0 * y)
@@ -62,7 +67,9 @@ def term_for(takes):
         return diffrax.MultiTerm(cfjax.LieTerm(unit), cfjax.LieControlTerm(noise, path))
     if takes == "terms":
         return diffrax.MultiTerm(*(cfjax.LieTerm(about(axis)) for axis in range(3)))
-    return cfjax.LieTerm({"linear part": linear, "time only": of_time}.get(takes, unit))
+    return cfjax.LieTerm(
+        {"linear part": linear, "time only": of_time, "density matrices": decay}.get(takes, unit)
+    )
 
 
 FIELDS = {
@@ -148,7 +155,8 @@ def check(solver, term, y0, has_gradient):
 @pytest.mark.parametrize("name", SOLVERS)
 def test_every_solver(name):
     row = SOLVERS[name]
-    y0 = FRAME if row.takes == "columns" else ON_SPHERE
+    starts = {"columns": FRAME, "density matrices": np.full((3, 3), 1 / 3 + 0j)}
+    y0 = starts.get(row.takes, ON_SPHERE)
     check(row.make(), term_for(row.takes), y0, has_gradient=False)
 
 

@@ -15,6 +15,7 @@ import cfjax
 ROWS = SOLVERS | COMMUTATOR_FREE | MUNTHE_KAAS
 by_name = pytest.mark.parametrize("name", ROWS)
 START = jnp.array([0.5, 0.7])
+DENSITY = jnp.eye(2, dtype=complex) / 2
 
 
 def test_the_table_has_every_solver():
@@ -48,6 +49,9 @@ PATH = diffrax.UnsafeBrownianPath((), jax.random.key(0), levy_area=diffrax.Space
 TRANSLATION = cfjax.LieTerm(translation)
 TERMS = {
     "time only": cfjax.LieTerm(lambda t, y, args: marked(t * jnp.ones(2))),
+    "density matrices": cfjax.LieTerm(
+        lambda t, y, args: cfjax.Lindblad(marked(t) * jnp.eye(2), [jnp.eye(2)])
+    ),
     "terms": diffrax.MultiTerm(TRANSLATION, cfjax.LieTerm(beside_it)),
     "noise": diffrax.MultiTerm(
         TRANSLATION, cfjax.LieControlTerm(lambda t, y, args, dw: y * dw, PATH)
@@ -74,6 +78,7 @@ def num_marked(jaxpr, used=None):
 def test_evaluations_of_a_step(name):
     row = ROWS[name]
     solver, term = row.make(), TERMS.get(row.takes, TRANSLATION)
+    y0 = DENSITY if row.takes == "density matrices" else START
 
     def start(y0):
         return solver.init(term, 0.0, 0.1, y0, None)
@@ -83,8 +88,8 @@ def test_evaluations_of_a_step(name):
         return y1, error, state
 
     with cfjax.rewriting(False):
-        first, state = jax.make_jaxpr(start, return_shape=True)(START)
-        later, (_, error, _) = jax.make_jaxpr(step, return_shape=True)(START, state)
+        first, state = jax.make_jaxpr(start, return_shape=True)(y0)
+        later, (_, error, _) = jax.make_jaxpr(step, return_shape=True)(y0, state)
     assert (error is None) == (row.embedded is None)
     assert num_marked(first.jaxpr) == row.first
     if row.evaluations is not None:

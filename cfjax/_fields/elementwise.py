@@ -38,7 +38,7 @@ def each(fun: Callable[..., PyTree], num_axes: int) -> Callable[..., PyTree]:
         forwarded: list[int | None] = []
         out_treedef: Any = None
 
-        def of_distinct(*elements: Array) -> list[Array]:
+        def of_distinct(*elements: Any) -> list[Any]:
             nonlocal forwarded, out_treedef
             args = treedef.unflatten([elements[index[id(x)]] for x in leaves])
             outputs, out_treedef = jtu.tree_flatten(inner(*args))
@@ -187,6 +187,16 @@ class Elementwise(AbstractFrozenField):
 
         sizes = self._each(defect)(point)
         return None if requirement is None else (jnp.max(sizes, initial=0), requirement)
+
+    def faults(self) -> Sequence[tuple[Bool[Array, ""], str]]:
+        conditions = []
+
+        def values(field: Any) -> list[Any]:
+            conditions[:] = [condition for _, condition in field.faults()]
+            return [holds for holds, _ in field.faults()]
+
+        holds = self._each(values)(self.field)
+        return [(jnp.any(x), condition) for x, condition in zip(holds, conditions, strict=True)]
 
     def to_chart(self, point: Any, earlier: Sequence[Any]) -> tuple[AbstractFrozenField, Any]:
         each = self._each(lambda field, point, *earlier: field.to_chart(point, earlier))

@@ -38,15 +38,21 @@ def row_for(norm: Real[Array, ""], largest: np.ndarray) -> Int[Array, ""]:
     return jnp.sum(norm > largest[:-1].astype(norm.dtype))
 
 
-def chebyshev_of_exp_minus_one(length: float, tolerance: float) -> list[float]:
-    """`c_0 / 2, c_1, c_2, ..` of `exp(z) - 1`, without a tail that adds up to the tolerance."""
+def chebyshev_of_exp_minus_one(length: float, tolerance: float, growth: float = 1.0) -> list[float]:
+    """`c_0 / 2, c_1, c_2, ..` of `exp(z) - 1`, without a tail that adds up to the tolerance.
+
+    `R_k` is at most `growth^k`: by default on the interval itself.
+    """
     with localcontext(_DECIMALS):
         first, *others = _chebyshev_of_exp(Decimal(length))
         coefficients = [first / 2 - 1, *others]
-        tail = Decimal(0)
-        while tail + abs(coefficients[-1]) <= tolerance:
-            tail += abs(coefficients.pop())
-        return [float(c) for c in coefficients]
+        tail, growth_ = Decimal(0), Decimal(growth)
+        while True:
+            last = abs(coefficients[-1]) * growth_ ** (len(coefficients) - 1)
+            if tail + last > tolerance:
+                return [float(c) for c in coefficients]
+            tail += last
+            coefficients.pop()
 
 
 def powers_of_phi_2(length: float, degree: int) -> list[float]:

@@ -13,7 +13,7 @@ from jax import lax
 from jaxtyping import Array, Bool, PyTree, Real
 
 from .._control_term import fault_of_increments, is_driven
-from .._field import combine, is_field
+from .._field import AbstractFrozenField, combine, is_field
 from .._methods.order_conditions import order
 from .._numerics.checks import Fault
 from .._term import product, velocity
@@ -80,6 +80,7 @@ class AbstractLieSolver(AbstractSolver):
         compensation = Sums(y0, compensation).zeros()
         first = terms.vf(t0, y0, args) if self.first_same_as_last else None
         fault = fault_of_start(t0, t1, (field,), y0)
+        fault = fault_of_fields(fault, (field,), terms, t0, y0, args)
         fault = fault_of_increments(fault, terms, t0, t1, y0, args)
         return State(compensation, first, None), fault
 
@@ -200,6 +201,24 @@ def fault_of_start(t0: Any, t1: Any, fields: Sequence[PyTree], y0: PyTree) -> Fa
         parts, treedef = jtu.tree_flatten_with_path(field, is_leaf=is_field)
         for (path, part), point in zip(parts, treedef.flatten_up_to(y0), strict=True):
             fault = _off_manifold(fault, part, jtu.keystr(path), point)
+    return fault
+
+
+def fault_of_fields(
+    fault: Fault, fields: Sequence[PyTree], terms: Any, t0: Any, y0: PyTree, args: PyTree
+) -> Fault:
+    """What fields say of their values. `fields` are the same, by shape."""
+    parts = filter(is_field, jtu.tree_leaves(fields, is_leaf=is_field))
+    default = AbstractFrozenField.faults
+    if all(type(part).faults is default for part in parts):
+        return fault
+    for term in terms.terms if isinstance(terms, diffrax.MultiTerm) else (terms,):
+        # Not their products with the step, whose sign may be another.
+        value = lax.stop_gradient(term.vf(t0, y0, args))
+        for path, part in jtu.tree_leaves_with_path(value, is_leaf=is_field):
+            for holds, condition in part.faults() if is_field(part) else ():
+                place = f"{type(part).__name__} for y{jtu.keystr(path)}"
+                fault = fault.with_case(holds, f"{place} at the start: {condition}.")
     return fault
 
 

@@ -21,7 +21,32 @@ from .stacked import can_roll, rolled_flows
 from .step import AbstractChartSolver, Chart, Step
 
 
-class AbstractMagnus(AbstractChartSolver):
+class AbstractOfTime(AbstractChartSolver):
+    """A method for fields that depend on t but not on y."""
+
+    is_of_state: ClassVar[bool] = False
+
+    def for_terms(self, terms):
+        if is_driven(terms):
+            raise TypeError(
+                f"{type(self).__name__} takes fields at several times of a step, but a path that "
+                "drives a term has one increment for it: use another method, for example "
+                "cfjax.CF4() or, with noise, cfjax.WeakOrder2()."
+            )
+        return self
+
+    def start(self, terms, t0, t1, y0, args) -> tuple[State, Fault]:
+        self.for_terms(terms)
+
+        def field(y):
+            return product(terms, terms.vf(t0, y, args), terms.contr(t0, t1))
+
+        if dependent := state_dependent(field, y0):
+            raise TypeError(_depends_on_state(type(self).__name__, *dependent[0]))
+        return super().start(terms, t0, t1, y0, args)
+
+
+class AbstractMagnus(AbstractOfTime):
     """Flows of linear combinations of the fields at some times within the step.
 
     For `y' = A(t) y`, and any other field whose coordinates depend on t but not on y.
@@ -41,7 +66,6 @@ class AbstractMagnus(AbstractChartSolver):
     to a function of the host; `ValueError` for another `estimate` or `unroll`.
     """
 
-    is_of_state: ClassVar[bool] = False
     tableau: eqx.AbstractVar[MagnusTableau]
     estimate: Literal["group"] | None = eqx.field(static=True, default="group", kw_only=True)
     # Whether the stages stand one by one in the program instead of in a loop. None: what is faster.
@@ -65,25 +89,6 @@ class AbstractMagnus(AbstractChartSolver):
     def error_order(self, terms) -> int | None:
         order = self.tableau.embedded_order
         return None if order is None else order + 1
-
-    def for_terms(self, terms):
-        if is_driven(terms):
-            raise TypeError(
-                f"{type(self).__name__} takes fields at several times of a step, but a path that "
-                "drives a term has one increment for it: use another method, for example "
-                "cfjax.CF4() or, with noise, cfjax.WeakOrder2()."
-            )
-        return self
-
-    def start(self, terms, t0, t1, y0, args) -> tuple[State, Fault]:
-        self.for_terms(terms)
-
-        def field(y):
-            return product(terms, terms.vf(t0, y, args), terms.contr(t0, t1))
-
-        if dependent := state_dependent(field, y0):
-            raise TypeError(_depends_on_state(type(self).__name__, *dependent[0]))
-        return super().start(terms, t0, t1, y0, args)
 
     @property
     def first_time(self) -> float:

@@ -13,7 +13,7 @@ from .._control_term import fault_of_increments, is_driven
 from .._field import Rest, combine, is_field
 from .._methods.splitting import BLANES_MOAN_4, BLANES_MOAN_6, STRANG, splitting_order
 from .._term import product
-from .base import AbstractLieSolver, State, fault_of_start, time_at
+from .base import AbstractLieSolver, State, fault_of_fields, fault_of_start, time_at
 from .compiled import control_of, scan_list
 from .dense import AbstractPath, Interpolation
 from .dependence import time_dependent, unknown_dependence
@@ -95,6 +95,7 @@ class AbstractSplitting(AbstractLieSolver, diffrax.AbstractStratonovichSolver):
         compensation = Sums(y0, compensation).zeros()
         first = terms.terms[0].vf(t0, y0, args)
         fault = fault_of_start(t0, t1, fields, y0)
+        fault = fault_of_fields(fault, fields, terms, t0, y0, args)
         fault = fault_of_increments(fault, terms, t0, t1, y0, args)
         return State(compensation, first, None), fault
 
