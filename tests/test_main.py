@@ -214,12 +214,15 @@ def test_scenes_solve_with_the_method_that_readme_recommends():
             assert chosen == "RKMK8", name
         elif "`ETD54`" in kinds:
             assert chosen == "ETD54", name
+        elif any("`Kraus4`" in str(kind) for kind in kinds):
+            levels = jtu.tree_leaves(problem["y0"])[0].shape[-1]
+            assert chosen == ("Magnus4" if levels <= 4 else "Kraus4"), name
         else:
             assert kinds <= {"Magnus or CF", "CF"}, (name, kinds)
             # A Magnus method refuses fields that depend on the state.
             assert chosen in ("CF4", "Magnus6"), name
         seen.add(chosen)
-    assert seen == {"CF4", "ETD54", "Magnus6", "RKMK8"}
+    assert seen == {"CF4", "ETD54", "Kraus4", "Magnus4", "Magnus6", "RKMK8"}
 
 
 # What solvers keep to their order alone: relative to the start, to 1e-3 with the steps below, of

@@ -2,7 +2,9 @@
 
 from . import allen_cahn as allen_cahn
 from . import annealing as annealing
+from . import cat as cat
 from . import covariance as covariance
+from . import damped_qubit as damped_qubit
 from . import gray_scott as gray_scott
 from . import heat as heat
 from . import heavy_top as heavy_top

@@ -1,0 +1,133 @@
+"""The cat: its Wigner function, the state in which it ends, the reference and the fringes."""
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from scipy.integrate import solve_ivp
+
+import cfjax
+from cfjax.scenes import cat
+from cfjax.scenes.cat import Oscillator
+
+TERM = cfjax.LieTerm(cat.field)
+SMALL = Oscillator(size=1.2, loss=0.3)
+
+
+def end(solver, num_steps, args, t1, levels):
+    y0 = cat.y0(levels)
+    return np.asarray(cfjax.integrate(TERM, solver, 0.0, t1, y0, args, num_steps=num_steps).ys[-1])
+
+
+def test_the_reference_against_matrices():
+    """The one goes by elements, and this one by products with one jump `a^2 - x`."""
+    n, start = 10, cat.coherent(0.5 + 0.3j, 10)
+    lower = np.diag(np.sqrt(np.arange(1.0, n)), 1)
+
+    def dissipator(jump, rho):
+        loss = jump.conj().T @ jump / 2
+        return jump @ rho @ jump.conj().T - loss @ rho - rho @ loss
+
+    def rate(t, flat):
+        rho = flat.reshape(n, n)
+        x = SMALL.size**2 * (1 - np.exp(-t / SMALL.rise))
+        jump = lower @ lower - x * np.eye(n)
+        change = SMALL.pairs * dissipator(jump, rho) + SMALL.loss * dissipator(lower, rho)
+        return change.ravel()
+
+    solution = solve_ivp(rate, (0.0, 0.5), start.ravel(), "DOP853", rtol=1e-12, atol=1e-12)
+    want = solution.y[:, -1].reshape(n, n)
+    # Some hundred steps of that tolerance.
+    np.testing.assert_allclose(cat.reference(0.5, SMALL, start), want, rtol=0, atol=1e-10)
+
+
+def test_the_velocity_is_that_of_the_field():
+    y = jnp.asarray(cat.coherent(0.5 + 0.3j, 10))
+    found = cfjax.tangent(cat.field(0.3, y, SMALL), y)
+    # Entries up to 1, and jumps of norm up to 70.
+    np.testing.assert_allclose(cat.velocity(0.3, y, SMALL), found, rtol=0, atol=1e-14)
+
+
+def test_it_ends_in_an_even_superposition():
+    args = Oscillator(size=1.2)
+    late = cat.reference(12.0, args, cat.y0(20))
+    # What is left falls by a factor of 36 in two units.
+    np.testing.assert_allclose(late, cat.superposition(1.2, 20), rtol=0, atol=1e-8)
+    np.testing.assert_allclose(cat.parity(late), 1, rtol=0, atol=1e-12)
+
+
+def test_the_wigner_function_of_known_states():
+    points = np.linspace(-2.5, 2.5, 21)
+    points = points + 1j * points[:, None]
+    field, amplitude = cat.coherent(0.8 + 0.5j), 0.8 + 0.5j
+    want = 2 / np.pi * np.exp(-2 * np.abs(points - amplitude) ** 2)
+    # With 24 levels the field has lost 1e-12.
+    np.testing.assert_allclose(cat.wigner(field, points), want, rtol=0, atol=1e-11)
+    # Two fields, and fringes with the phase 4 size times the imaginary part.
+    size, both = 1.3, 0.0
+    for sign in (1, -1):
+        both = both + np.exp(-2 * np.abs(points - sign * size) ** 2)
+    fringes = 2 * np.exp(-2 * np.abs(points) ** 2) * np.cos(4 * size * points.imag)
+    want = 2 / np.pi * (both + fringes) / (2 + 2 * np.exp(-2 * size**2))
+    np.testing.assert_allclose(cat.wigner(cat.superposition(1.3), points), want, atol=1e-9)
+
+
+def test_negativity():
+    assert cat.negativity(cat.coherent(1.0)) < 1e-12
+    # A single photon: 2 exp(-1/2) - 1, over a grid of 2/15.
+    photon = np.zeros((24, 24), complex)
+    photon[1, 1] = 1
+    np.testing.assert_allclose(cat.negativity(photon), 2 * np.exp(-0.5) - 1, rtol=0, atol=2e-3)
+
+
+# A step over which damping is strong: 0.05 times the rate of 90.
+@pytest.mark.representatives(1)
+@pytest.mark.parametrize(
+    ("solver", "num_steps", "least"), [(cfjax.CF4(), 10, 10), (cfjax.Kraus4(), 40, 6)]
+)
+def test_order(solver, num_steps, least):
+    exact = cat.reference(0.5, SMALL, cat.y0(10))
+    errors = [
+        np.abs(end(solver, n, SMALL, 0.5, 10) - exact).max() for n in (num_steps, 2 * num_steps)
+    ]
+    # Stiffness takes some of the order of Kraus4 in steps as long as these.
+    assert least < errors[0] / errors[1] < 1.4 * 2**4
+    assert errors[1] < 1e-4
+
+
+def test_loss_washes_the_fringes_out():
+    kept, lost = (
+        cat.negativity(cat.reference(1.0, Oscillator(size=1.2, loss=loss), cat.y0(16)))
+        for loss in (0.0, 0.5)
+    )
+    assert kept > 2 * lost > 1e-3
+
+
+def test_stays_positive():
+    y = end(cfjax.Kraus4(), 5, SMALL, 0.5, 10)
+    # A few roundings, of eigenvalues that are zero.
+    assert np.linalg.eigvalsh(y)[0] > -1e-14
+    np.testing.assert_allclose(np.trace(y), 1, rtol=0, atol=1e-14)
+
+
+def test_the_derivative_in_the_loss():
+    def fringes(loss):
+        args = SMALL._replace(loss=loss)
+        sol = cfjax.integrate(TERM, cfjax.Kraus4(), 0.0, 0.5, cat.y0(10), args, num_steps=80)
+        return cat.parity(sol.ys[-1])
+
+    # The parity of a mixture falls by twice the loss of photons from either kind of states.
+    exact = [
+        float(cat.parity(cat.reference(0.5, SMALL._replace(loss=0.3 + h), cat.y0(10))))
+        for h in (-1e-3, 1e-3)
+    ]
+    np.testing.assert_allclose(
+        jax.grad(fringes)(0.3), (exact[1] - exact[0]) / 2e-3, rtol=0, atol=1e-4
+    )
+
+
+def test_picture():
+    figure = cat.picture()
+    # Three maps, their colours, and a chart.
+    assert len(figure.axes) == 5
+    figure.draw_without_rendering()
