@@ -1,0 +1,70 @@
+"""The spectral radius of a field on a manifold, by power iteration."""
+
+from typing import Any
+
+import diffrax
+import jax
+import jax.numpy as jnp
+import jax.tree_util as jtu
+from jax import lax
+from jaxtyping import Array, PyTree, Real
+
+from .._term import velocity
+
+# An iteration from a random start reaches some 9 tenths of the radius in so many rounds.
+FIRST_ITERATIONS = 30
+
+
+def spectral_radius(
+    term: diffrax.AbstractTerm, t: Any, y: PyTree, args: PyTree = None
+) -> Real[Array, ""]:
+    """The spectral radius of the field at a point: the largest modulus of an eigenvalue.
+
+    The eigenvalues are those of the derivative of the field's coordinates with respect to the
+    state, with the frame of the point: what a step must be short against in an explicit method, and
+    how many stages `cfjax.RKL2` takes. It is found by 30 power iterations from a random start,
+    which is always the same. The result is too small rather than too large, usually by a few
+    hundredths.
+
+    **Arguments:** as in `cfjax.integrate`, at a time `t` and a state `y`.
+
+    **Cost:** 30 evaluations of the field and its derivative in one direction.
+    """
+    return iterated(term, t, y, args, start_vector(y), FIRST_ITERATIONS)[0]
+
+
+def start_vector(y: PyTree) -> PyTree:
+    """A vector of length one, shaped like the state, with a part in every direction."""
+    leaves, treedef = jtu.tree_flatten(y)
+    keys = jax.random.split(jax.random.key(0), max(len(leaves), 1))
+    random = [
+        jax.random.normal(key, jnp.shape(x), jnp.result_type(x))
+        for key, x in zip(keys, leaves, strict=False)
+    ]
+    return _normalised(treedef.unflatten(random))[1]
+
+
+def iterated(
+    term: diffrax.AbstractTerm, t: Any, y: PyTree, args: PyTree, vector: PyTree, number: int
+) -> tuple[Real[Array, ""], PyTree]:
+    """The growth in the last of so many iterations, and the vector after it."""
+    y, args = lax.stop_gradient((y, args))
+
+    def velocity_at(z: PyTree) -> PyTree:
+        # Along the frame of the point y: that is DF T, with the eigenvalues of T DF.
+        return velocity(term, term.vf(t, z, args), y)
+
+    def iteration(carry: Any, _: None) -> Any:
+        _, vector = carry
+        return _normalised(jax.jvp(velocity_at, (y,), (vector,))[1]), None
+
+    dtype = jnp.finfo(jtu.tree_leaves(y)[0].dtype).dtype
+    return lax.scan(iteration, (jnp.zeros((), dtype), vector), length=number)[0]
+
+
+def _normalised(x: PyTree) -> tuple[Real[Array, ""], PyTree]:
+    """The length, and the vector of length one in its direction, or zero."""
+    squares = [jnp.sum(jnp.real(a * jnp.conj(a))) for a in jtu.tree_leaves(x)]
+    length = jnp.sqrt(sum(squares, start=jnp.zeros(())))
+    safe = jnp.where(length > 0, length, 1)
+    return length, jtu.tree_map(lambda a: a / safe.astype(jnp.finfo(a.dtype).dtype), x)
