@@ -107,11 +107,11 @@ if TYPE_CHECKING:
     from ._solvers.pieces import WeakOrder2 as WeakOrder2
     from ._solvers.retraction import CayleyRK4 as CayleyRK4
     from ._solvers.richardson import Richardson as Richardson
+    from ._solvers.spectral_radius import spectral_radius as spectral_radius
     from ._solvers.splitting import BlanesMoan4 as BlanesMoan4
     from ._solvers.splitting import BlanesMoan6 as BlanesMoan6
     from ._solvers.splitting import Splitting as Splitting
     from ._solvers.splitting import Strang as Strang
-    from ._solvers.spectral_radius import spectral_radius as spectral_radius
     from ._solvers.stabilised import RKG2 as RKG2
     from ._solvers.stabilised import RKL2 as RKL2
     from ._solvers.stabilised import RKL3 as RKL3
