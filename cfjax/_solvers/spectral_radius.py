@@ -58,13 +58,20 @@ def iterated(
         _, vector = carry
         return _normalised(jax.jvp(velocity_at, (y,), (vector,))[1]), None
 
-    dtype = jnp.finfo(jtu.tree_leaves(y)[0].dtype).dtype
-    return lax.scan(iteration, (jnp.zeros((), dtype), vector), length=number)[0]
+    zero = jnp.zeros((), _dtype(vector))
+    return lax.scan(iteration, (zero, vector), length=number)[0]
 
 
 def _normalised(x: PyTree) -> tuple[Real[Array, ""], PyTree]:
     """The length, and the vector of length one in its direction, or zero."""
-    squares = [jnp.sum(jnp.real(a * jnp.conj(a))) for a in jtu.tree_leaves(x)]
-    length = jnp.sqrt(sum(squares, start=jnp.zeros(())))
-    safe = jnp.where(length > 0, length, 1)
-    return length, jtu.tree_map(lambda a: a / safe.astype(jnp.finfo(a.dtype).dtype), x)
+    dtype = _dtype(x)
+    squares = [jnp.sum(jnp.real(a * jnp.conj(a))).astype(dtype) for a in jtu.tree_leaves(x)]
+    length = jnp.sqrt(sum(squares, start=jnp.zeros((), dtype)))
+    factor = 1 / jnp.where(length > 0, length, 1)
+    return length, jtu.tree_map(lambda a: a * factor.astype(a.dtype), x)
+
+
+def _dtype(x: PyTree) -> Any:
+    """The highest precision in it."""
+    dtypes = [jnp.finfo(a.dtype).dtype for a in jtu.tree_leaves(x)]
+    return max(dtypes, key=lambda dtype: dtype.itemsize, default=jnp.result_type(float))

@@ -2,7 +2,7 @@
 
 import abc
 from collections.abc import Callable
-from typing import Any, ClassVar, NamedTuple
+from typing import Any, ClassVar, NamedTuple, cast
 
 import diffrax
 import equinox as eqx
@@ -12,6 +12,8 @@ import jax.numpy as jnp
 import jax.tree_util as jtu
 import numpy as np
 from jax import lax
+from jax.extend.core import Primitive
+from jax.interpreters import ad, batching, mlir
 from jaxtyping import Array, PyTree, Real
 
 from .._control_term import is_driven
@@ -81,8 +83,8 @@ class AbstractStabilised(AbstractChartSolver, diffrax.AbstractAdaptiveSolver):
     stages: int | None = eqx.field(static=True)
     spectral_radius: Any
     max_stages: int = eqx.field(static=True)
-    # The length of the step at hand times the radius, where that decides.
-    stiffness: Any
+    # The length of the step at hand times the radius, where that decides. NaN if it is too large.
+    stiffness: Real[Array, ""] | None
 
     # Twice the index of the Gegenbauer polynomials.
     twice_index: eqx.AbstractClassVar[int]
@@ -159,6 +161,13 @@ class AbstractStabilised(AbstractChartSolver, diffrax.AbstractAdaptiveSolver):
 
     def _start(self, terms, t0, t1, y0, args) -> tuple[_State, Fault]:
         state, fault = super().start(terms, t0, t1, y0, args)
+        if callable(self.spectral_radius):
+            radius = self._radius(terms, t0, y0, args, None)
+            fault = fault.with_case(
+                ~(radius >= 0),
+                "spectral_radius must not be negative, and returned a negative number or NaN for "
+                "the start.",
+            )
         iteration = None
         if self.stages is None and self.spectral_radius is None:
             vector = start_vector(y0)
@@ -179,8 +188,9 @@ class AbstractStabilised(AbstractChartSolver, diffrax.AbstractAdaptiveSolver):
             radius = jnp.maximum(radius, _LEAST_RATIO * iteration.radius)
             iteration = _Iteration(radius, vector)
         if self.stages is None:
-            radius = self._radius(terms, t0, y0, args, iteration)
-            solver = self._with(stiffness=jnp.abs(t1 - t0) * radius)
+            z = jnp.abs(t1 - t0) * self._radius(terms, t0, y0, args, iteration)
+            is_possible = _stages_for(z, self.twice_index) <= self.max_stages
+            solver: Any = self._with(stiffness=jnp.where(is_possible, z, jnp.nan))
         y1, error, dense_info, state, result = AbstractChartSolver.step(
             solver, terms, t0, t1, y0, args, solver_state, made_jump
         )
@@ -196,10 +206,11 @@ class AbstractStabilised(AbstractChartSolver, diffrax.AbstractAdaptiveSolver):
         value = chart.value_at(1.0, end)
         last = chart.frozen(value, end, [chart.first_field])
         error = tangent(elements.error(last), chart.state(end))
-        # NaN is an infinite error to diffrax, so that the step is taken again, shorter.
-        y1, error = jtu.tree_map(
-            lambda x: x + elements.zero.astype(jnp.finfo(x.dtype).dtype), (chart.end(end), error)
-        )
+        y1 = chart.end(end)
+        if self.stiffness is not None:
+            # NaN is an infinite error to diffrax, so that the step is taken again, shorter.
+            zero = jnp.where(jnp.isnan(self.stiffness), jnp.nan, 0.0)
+            y1, error = jtu.tree_map(lambda x: x + zero.astype(x.dtype), (y1, error))
         path = Path.of(
             self.continuous_extension,
             chart.origin,
@@ -207,71 +218,61 @@ class AbstractStabilised(AbstractChartSolver, diffrax.AbstractAdaptiveSolver):
         )
         return Step(y1, path, error, value)
 
+    def _number(self, length: float) -> tuple[Any, Any]:
+        """How many stages such a part of the step has, and whether it is possible."""
+        l = self.twice_index  # noqa: E741
+        if self.stages is None:
+            number = _stages_for(length * cast(Array, self.stiffness), l)
+            is_possible = ~jnp.isnan(number)
+            return jnp.where(is_possible, number, 3), is_possible
+        # As many as reach as far, in a part of it.
+        return self.stages if length == 1 else _stages_for(length * _reach(self.stages, l), l), True
+
     def _element(
         self, chart: Chart, first: PyTree, point: PyTree, c: float = 0.0, length: float = 1.0
-    ) -> "_Element":
+    ) -> PyTree:
         """The element that leads from a point, at time c and with the field `first`, over such a
         part of the step.
         """
         l = self.twice_index  # noqa: E741
-        first = combine((length,), (first,)) if length != 1 else first
-        is_chosen = self.stages is None
-        if is_chosen:
-            wanted = _stages_for(length * self.stiffness, l)
-            is_possible = wanted <= self.max_stages
-            # Otherwise no stage.
-            number: Any = jnp.where(is_possible, wanted, 1)
-            zero = jnp.where(is_possible, jnp.zeros(()), jnp.nan)
-        else:
-            # As many as reach as far, in a part of the step.
-            number = self.stages
-            if length != 1:
-                number = _stages_for(length * _reach(number, l), l)
-            zero = jnp.zeros(())
+        first = _times(length, first)
+        number, is_possible = self._number(length)
 
         def stage(j: Any, carry: Any) -> Any:
             u, u_before, time, time_before = carry
             field = chart.field(c + length * time, chart.flow(u, point), [chart.first_field])
-            field = combine((length,), (field,)) if length != 1 else field
             weights = _weights(j, number, l)
-            new = combine(weights, (u, u_before, cast_like(first, field), first))
+            new = combine(weights, (u, u_before, cast_like(first, _times(length, field)), first))
             new_time = weights[0] * time + weights[1] * time_before + weights[2] + weights[3]
             return cast_like(first, new), u, new_time, time
 
-        w = _first_weight(number, l)
-        zeros = jnp.zeros_like(w)
-        carry = combine((w,), (first,)), combine((zeros,), (first,)), w, zeros
-        if not is_chosen:
+        # The time of the first stage, and the weight of the first field there. An impossible step
+        # has zeros and no stage, so that its derivative is finite.
+        w = jnp.where(is_possible, (l + 1) / (2 * (l + 2)) * _slope(number, l), 0.0)
+        zero = jnp.zeros_like(w)
+        carry = combine((w,), (first,)), combine((zero,), (first,)), w, zero
+        if self.stages is not None:
             turns = np.arange(2.0, number + 1)
-            carry, _ = over_stages(lambda carry, j: (stage(j, carry), None), carry, turns)
-            return _Element(carry[0], zero)
+            (u, *_), _ = over_stages(lambda carry, j: (stage(j, carry), None), carry, turns)
+            return u
         # A loop of no more turns than there are stages.
-        j = jnp.full_like(w, 2)
-        _, carry = eqxi.while_loop(
-            lambda value: value[0] <= number,
+        _, (u, *_) = eqxi.while_loop(
+            lambda value: is_possible & (value[0] <= number),
             lambda value: (value[0] + 1, stage(*value)),
-            (j, carry),
+            (jnp.full_like(w, 2), jtu.tree_map(_reverse_mode_only, carry)),
             max_steps=self.max_stages,
             kind="checkpointed",
         )
-        return _Element(carry[0], zero)
-
-
-class _Element(NamedTuple):
-    """An element of the algebra, and a zero, which is NaN if it takes too many stages."""
-
-    element: PyTree
-    zero: Real[Array, ""]
+        return u
 
 
 class _Elements(NamedTuple):
-    """Elements along which a step moves, one after the other; the element of the estimate, from
-    the field at the end; and a zero, which is NaN if the step takes too many stages.
+    """Elements along which a step moves, one after the other, and the element of the estimate, from
+    the field at the end.
     """
 
     flows: list[PyTree]
     error: Callable[[PyTree], PyTree]
-    zero: Real[Array, ""]
 
 
 class _OneElement(AbstractStabilised):
@@ -282,15 +283,17 @@ class _OneElement(AbstractStabilised):
     order 2 on the manifold.
     """
 
-    continuous_extension: ClassVar[ContinuousExtension] = (((1, 0, 0), (-2, 3, -1), (1, -2, 1)),)
+    continuous_extension: ClassVar[ContinuousExtension] = (
+        ((1.0, 0.0, 0.0), (-2.0, 3.0, -1.0), (1.0, -2.0, 1.0)),
+    )
 
     def order(self, terms) -> int:
         return 2
 
     def elements(self, chart):
         first = chart.first_field
-        u, zero = self._element(chart, first, chart.start)
-        return _Elements([u], lambda last: combine((-0.8, 0.4, 0.4), (u, first, last)), zero)
+        u = self._element(chart, first, chart.start)
+        return _Elements([u], lambda last: combine((-0.8, 0.4, 0.4), (u, first, last)))
 
 
 class RKL2(_OneElement):
@@ -342,8 +345,8 @@ class RKL3(AbstractStabilised):
 
     twice_index: ClassVar[int] = 1
     continuous_extension: ClassVar[ContinuousExtension] = (
-        ((1, 0, 0, 0), (-2, 3, 0, -1), (1, -2, 0, 1)),
-        ((0, 0, 0, 0), (0, 0, 3, 0), (0, 0, -2, 0)),
+        ((1.0, 0.0, 0.0, 0.0), (-2.0, 3.0, 0.0, -1.0), (1.0, -2.0, 0.0, 1.0)),
+        ((0.0, 0.0, 0.0, 0.0), (0.0, 0.0, 3.0, 0.0), (0.0, 0.0, -2.0, 0.0)),
     )
 
     def order(self, terms) -> int:
@@ -351,14 +354,14 @@ class RKL3(AbstractStabilised):
 
     def elements(self, chart):
         first, start = chart.first_field, chart.start
-        u, zero = self._element(chart, first, start)
-        v1, zero1 = self._element(chart, first, start, 0.0, 0.5)
+        u = self._element(chart, first, start)
+        v1 = self._element(chart, first, start, 0.0, 0.5)
         middle = chart.flow(v1, start)
         field = chart.field(0.5, middle, [first])
-        v2, zero2 = self._element(chart, field, middle, 0.5, 0.5)
+        v2 = self._element(chart, field, middle, 0.5, 0.5)
         flows = [combine((4 / 3, -1 / 6), (v, u)) for v in (v1, v2)]
         error = combine((1 / 3, 1 / 3, -1 / 3), (v1, v2, u))
-        return _Elements(flows, lambda last: error, zero + zero1 + zero2)
+        return _Elements(flows, lambda last: error)
 
 
 def _check_fields(solver: AbstractStabilised, chart: Chart) -> None:
@@ -380,6 +383,10 @@ def _check_fields(solver: AbstractStabilised, chart: Chart) -> None:
         )
 
 
+def _times(length: float, field: PyTree) -> PyTree:
+    return field if length == 1 else combine((length,), (field,))
+
+
 def _weights(j: Any, s: Any, l: int) -> tuple[Any, Any, Any, Any]:  # noqa: E741
     """Those of the two elements before, the field there and the first field, in stage j of s."""
 
@@ -391,11 +398,6 @@ def _weights(j: Any, s: Any, l: int) -> tuple[Any, Any, Any, Any]:  # noqa: E741
     nu = -(j - 1) / (j + l - 1) * b(j) / b(j - 2)
     of_field = mu * _slope(s, l)
     return mu, nu, of_field, (b(j - 1) - 1) * of_field
-
-
-def _first_weight(s: Any, l: int) -> Array:  # noqa: E741
-    """The time of the first stage, and the weight of the first field there."""
-    return jnp.asarray((l + 1) / (2 * (l + 2)) * _slope(s, l), float)
 
 
 def _slope(s: Any, l: int) -> Any:  # noqa: E741
@@ -414,3 +416,29 @@ def _stages_for(z: Any, l: int) -> Any:  # noqa: E741
     s = numpy.maximum(numpy.ceil((root - l) / 2), 3)
     s = s + (1 - s % 2)
     return lax.stop_gradient(s) if numpy is jnp else int(s)
+
+
+@jax.custom_jvp
+def _reverse_mode_only(x: Array) -> Array:
+    """The same array. Forward mode through it is an error."""
+    return x
+
+
+@_reverse_mode_only.defjvp
+def _(primals, tangents):
+    return primals[0], _only_transposed_p.bind(tangents[0])
+
+
+def _raise(*_, **__):
+    raise TypeError(
+        "Forward mode needs a number of stages, for example cfjax.RKL2(stages=9), as it has no "
+        "rule for a loop whose length is chosen in each step. Reverse mode has one."
+    )
+
+
+_only_transposed_p = Primitive("cfjax_only_transposed")
+_only_transposed_p.def_impl(_raise)
+_only_transposed_p.def_abstract_eval(lambda x: x)
+ad.deflinear2(_only_transposed_p, lambda cotangent, _: [cotangent])
+batching.defvectorized(_only_transposed_p)
+mlir.register_lowering(_only_transposed_p, _raise)
