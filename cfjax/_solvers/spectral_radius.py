@@ -48,15 +48,19 @@ def iterated(
     term: diffrax.AbstractTerm, t: Any, y: PyTree, args: PyTree, vector: PyTree, number: int
 ) -> tuple[Real[Array, ""], PyTree]:
     """The growth in the last of so many iterations, and the vector after it."""
-    y, args = lax.stop_gradient((y, args))
 
     def velocity_at(z: PyTree) -> PyTree:
         # Along the frame of the point y: that is DF T, with the eigenvalues of T DF.
         return velocity(term, term.vf(t, z, args), y)
 
+    # Without a derivative of its own, which would make programs of derivatives longer.
+    velocity_at, constants = jax.closure_convert(velocity_at, y)
+    y, constants = lax.stop_gradient((y, constants))
+
     def iteration(carry: Any, _: None) -> Any:
         _, vector = carry
-        return _normalised(jax.jvp(velocity_at, (y,), (vector,))[1]), None
+        tangent = jax.jvp(lambda z: velocity_at(z, *constants), (y,), (vector,))[1]
+        return _normalised(tangent), None
 
     zero = jnp.zeros((), _dtype(vector))
     return lax.scan(iteration, (zero, vector), length=number)[0]

@@ -42,7 +42,7 @@ def test_power_iteration_finds_a_mode_that_the_first_field_has_no_part_in():
     """From a symmetric state all fields are symmetric, and the stiffest mode is antisymmetric."""
     n = 16
     field = conductivity(n)
-    y = (jnp.arange(n) - (n - 1) / 2) ** 2
+    y = (jnp.arange(float(n)) - (n - 1) / 2) ** 2
     first = field(0.0, y, None)
     np.testing.assert_allclose(first, first[::-1], rtol=0, atol=1e-12)
     # Of the symmetric modes the stiffest has (n - 2)(n - 1), which is 0.875 of it.
