@@ -78,7 +78,7 @@ def spins(t, y, args):
 
 
 def test_spectral_radius_on_a_manifold():
-    """Of aligned spins: a Laplacian, whose radius is 8; the frame has more coordinates than that."""
+    """Of aligned spins: a Laplacian, whose radius is 8; the frame has more coordinates."""
     up = jnp.zeros((6, 6, 3)).at[..., 2].set(1.0)
     assert LOW < found(spins, up, jnp.asarray(1.0)) / 8 < HIGH
 
