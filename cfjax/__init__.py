@@ -109,10 +109,14 @@ if TYPE_CHECKING:
     from ._solvers.pieces import WeakOrder2 as WeakOrder2
     from ._solvers.retraction import CayleyRK4 as CayleyRK4
     from ._solvers.richardson import Richardson as Richardson
+    from ._solvers.spectral_radius import spectral_radius as spectral_radius
     from ._solvers.splitting import BlanesMoan4 as BlanesMoan4
     from ._solvers.splitting import BlanesMoan6 as BlanesMoan6
     from ._solvers.splitting import Splitting as Splitting
     from ._solvers.splitting import Strang as Strang
+    from ._solvers.stabilised import RKG2 as RKG2
+    from ._solvers.stabilised import RKL2 as RKL2
+    from ._solvers.stabilised import RKL3 as RKL3
     from ._testing import check_field as check_field
     from ._testing import check_terms as check_terms
 
@@ -166,6 +170,8 @@ _NAMES_LATER = {
     "_solvers.pieces": ("ShiftedNoise", "WeakOrder2"),
     "_solvers.retraction": ("CayleyRK4",),
     "_solvers.richardson": ("Richardson",),
+    "_solvers.spectral_radius": ("spectral_radius",),
+    "_solvers.stabilised": ("RKG2", "RKL2", "RKL3"),
     "_solvers.splitting": ("BlanesMoan4", "BlanesMoan6", "Splitting", "Strang"),
 }
 _LATER = {name: f".{module}" for module, names in _NAMES_LATER.items() for name in names}

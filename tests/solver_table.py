@@ -20,6 +20,7 @@ Kind = Literal[
     "Magnus",
     "Kraus",
     "exponential",
+    "stabilised",
     "retraction",
     "splitting",
     "implicit",
@@ -112,6 +113,10 @@ SOLVERS = {
         lambda: cfjax.ExponentialRungeKutta(cfjax.ETD43.tableau),
         *("exponential", 4, 3, 5, 1, 3, "linear part"),
     ),
+    # With 5 stages; the halves of RKL3 have 5 and 5 of their own.
+    "RKL2": Row(lambda: cfjax.RKL2(5), "stabilised", 2, 2, 5, 1, 2),
+    "RKG2": Row(lambda: cfjax.RKG2(5), "stabilised", 2, 2, 5, 1, 2),
+    "RKL3": Row(lambda: cfjax.RKL3(5), "stabilised", 3, 2, 14, 1, 2),
     "CayleyRK4": Row(cfjax.CayleyRK4, "retraction", 4, None, 4, 0, 3, "columns"),
     "Strang": Row(cfjax.Strang, "splitting", 2, None, 1, 1, None, "terms", True),
     "BlanesMoan4": Row(cfjax.BlanesMoan4, "splitting", 4, None, 6, 1, None, "terms", True),

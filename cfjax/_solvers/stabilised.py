@@ -1,0 +1,466 @@
+"""Stabilised methods: explicit, with as many stages as large diffusion or relaxation takes."""
+
+import abc
+from collections.abc import Callable
+from typing import Any, ClassVar, NamedTuple, cast
+
+import diffrax
+import equinox as eqx
+import equinox.internal as eqxi
+import jax
+import jax.numpy as jnp
+import jax.tree_util as jtu
+import numpy as np
+from jax import lax
+from jax.extend.core import Primitive
+from jax.interpreters import ad, batching, mlir
+from jax.scipy.special import digamma
+from jaxtyping import Array, PyTree, Real
+
+from .._control_term import is_driven
+from .._field import combine, is_field, tangent
+from .._fields.semilinear import AbstractSemilinearField
+from .._methods.tableau import ContinuousExtension
+from .._numerics.checks import Fault
+from .base import State
+from .compiled import over_stages
+from .dense import Path
+from .spectral_radius import FIRST_ITERATIONS, iterated, start_vector
+from .stacked import cast_like
+from .stages import is_uniform
+from .step import AbstractChartSolver, Chart, Step
+
+# Power iteration converges from below, and a radius that is too small by 2 % makes 41 stages
+# unstable.
+_SAFETY = 1.1
+# The least ratio of the radius to that of the step before.
+_LEAST_RATIO = 0.9
+
+
+class _Iteration(NamedTuple):
+    """The spectral radius, and the vector that the next power iteration begins with."""
+
+    radius: Real[Array, ""]
+    vector: PyTree
+
+
+class _State(State):
+    # None where the radius is not estimated.
+    iteration: _Iteration | None
+
+
+class AbstractStabilised(AbstractChartSolver, diffrax.AbstractAdaptiveSolver):
+    """A Runge-Kutta method of many stages, each of which is one flow from the start of the step.
+
+    With s stages a step is stable for eigenvalues on the negative axis up to some `s^2 / 2`, or
+    `s^2 / 3` for `RKG2`, over the step, where other explicit methods with s evaluations reach to
+    some 0.7 s. So it is for fields with large diffusion or relaxation, and no large imaginary
+    eigenvalues, whose solution is smooth after a while. The stages move along sums of frozen
+    fields, without a commutator, and stay on the manifold however long a step is.
+
+    **Arguments:**
+
+    - `stages`: the number of stages of every step, at least 3; an odd number damps what is stiffest
+      most. None, the default, chooses it in each step from the step size and the spectral radius.
+    - `spectral_radius`: the spectral radius of the field, or a bound on it (see
+      `cfjax.spectral_radius`): a number, or a function `(t, y, args)`. If it is too small, steps
+      are unstable, which error control sees. None, the default, estimates it with one power
+      iteration a step, and 30 at the start.
+    - `max_stages`: a step that needs more fails, before it evaluates a stage. Error control then
+      takes it again, shorter. In float32 use some 50, as rounding errors grow with the square of
+      the stages.
+
+    Output within a step has order 2 and stays on the manifold. The last evaluation of a step is the
+    first one of the next. A step keeps six arrays like the state, or eight for `RKL3`, whatever
+    the number of stages. Reverse mode works by checkpoints; forward mode needs `stages`, as it has
+    no rule for a loop whose length is chosen.
+
+    **Raises** `TypeError` or `ValueError` for an argument of another kind or value, or `stages`
+    together with `spectral_radius`. When the program is traced, `TypeError` for fields whose sums
+    grow, such as `cfjax.LowRankSkew`, for fields with an exact stiff part, such as `cfjax.Affine`,
+    and for terms that a path drives.
+    """
+
+    stages: int | None = eqx.field(static=True)
+    spectral_radius: Any
+    max_stages: int = eqx.field(static=True)
+    # The length of the step at hand times the radius, where that decides. NaN if it is too large.
+    stiffness: Real[Array, ""] | None
+
+    # Twice the index of the Gegenbauer polynomials.
+    twice_index: eqx.AbstractClassVar[int]
+    # Of the combination of the elements of a step that leads to points within it.
+    continuous_extension: eqx.AbstractClassVar[ContinuousExtension]
+
+    def __init__(
+        self,
+        stages: int | None = None,
+        *,
+        spectral_radius: float | Callable[[Any, PyTree, PyTree], Any] | None = None,
+        max_stages: int = 200,
+    ):
+        for name, value in (("stages", stages), ("max_stages", max_stages)):
+            if value is None and name == "stages":
+                continue
+            if not isinstance(value, int) or isinstance(value, bool):
+                raise TypeError(f"{name} must be an int, got {value!r}.")
+            if value < 3:
+                raise ValueError(f"{name} must be at least 3, got {value}.")
+        if stages is not None and spectral_radius is not None:
+            raise ValueError(
+                "stages and spectral_radius must not be given together, as the radius decides "
+                f"how many stages a step has: got {stages} and {spectral_radius!r}."
+            )
+        if (
+            isinstance(spectral_radius, int | float | np.generic)
+            and not float(spectral_radius) >= 0
+        ):
+            raise ValueError(f"spectral_radius must not be negative, got {spectral_radius}.")
+        self.stages = stages
+        self.spectral_radius = spectral_radius
+        self.max_stages = max_stages
+        self.stiffness = None
+
+    @abc.abstractmethod
+    def elements(self, chart: Chart) -> "_Elements":
+        """The elements of the algebra along which a step moves."""
+
+    @property
+    def first_same_as_last(self) -> bool:
+        return True
+
+    def error_order(self, terms) -> int:
+        return 3
+
+    def for_terms(self, terms):
+        if is_driven(terms):
+            raise TypeError(
+                f"{type(self).__name__} is for ordinary differential equations, but a path drives "
+                "one of the terms: use another method, for example cfjax.CF4()."
+            )
+        return self
+
+    def init(self, terms, t0, t1, y0, args) -> _State:
+        state, fault = self._start(terms, t0, t1, y0, args)
+        zero = fault.error(jnp.zeros((), jnp.result_type(t0)))
+        return _State(state.compensation, state.first, zero, state.iteration)
+
+    def start(self, terms, t0, t1, y0, args):
+        state, fault = self._start(terms, t0, t1, y0, args)
+        if self.stages is None:
+            # Nothing shortens an equal step.
+            radius = self._radius(terms, t0, y0, args, state.iteration)
+            number = _stages_for(jnp.abs(t1 - t0) * radius, self.twice_index)
+            for level in (1, 2, 5, 10, 100, 1000):
+                limit = level * self.max_stages
+                fault = fault.with_case(
+                    number > limit,
+                    f"max_stages={self.max_stages} is too small: the first step takes more than "
+                    f"{limit} stages. Take more steps or, with max_stages, more stages.",
+                )
+        return state, fault
+
+    def _start(self, terms, t0, t1, y0, args) -> tuple[_State, Fault]:
+        state, fault = super().start(terms, t0, t1, y0, args)
+        if callable(self.spectral_radius):
+            radius = self._radius(terms, t0, y0, args, None)
+            fault = fault.with_case(
+                ~(radius >= 0),
+                "spectral_radius must not be negative, and returned a negative number or NaN for "
+                "the start.",
+            )
+        iteration = None
+        if self.stages is None and self.spectral_radius is None:
+            vector = start_vector(y0)
+            iteration = _Iteration(*iterated(terms, t0, y0, args, vector, FIRST_ITERATIONS))
+        return _State(state.compensation, state.first, None, iteration), fault
+
+    def _radius(self, terms, t0, y0, args, iteration: _Iteration | None) -> Real[Array, ""]:
+        if iteration is not None:
+            return _SAFETY * iteration.radius
+        radius = self.spectral_radius
+        return lax.stop_gradient(jnp.asarray(radius(t0, y0, args) if callable(radius) else radius))
+
+    def step(self, terms, t0, t1, y0, args, solver_state, made_jump):
+        self.for_terms(terms)
+        solver, iteration = self, solver_state.iteration
+        if iteration is not None:
+            radius, vector = iterated(terms, t0, y0, args, iteration.vector, 1)
+            radius = jnp.maximum(radius, _LEAST_RATIO * iteration.radius)
+            iteration = _Iteration(radius, vector)
+        if self.stages is None:
+            z = jnp.abs(t1 - t0) * self._radius(terms, t0, y0, args, iteration)
+            is_possible = _stages_for(z, self.twice_index) <= self.max_stages
+            solver: Any = self._with(stiffness=jnp.where(is_possible, z, jnp.nan))
+        y1, error, dense_info, state, result = AbstractChartSolver.step(
+            solver, terms, t0, t1, y0, args, solver_state, made_jump
+        )
+        state = _State(state.compensation, state.first, state.zero, iteration)
+        return y1, error, dense_info, state, result
+
+    def step_in(self, chart):
+        _check_fields(self, chart)
+        elements = self.elements(chart)
+        end = chart.start
+        for element in elements.flows:
+            end = chart.flow(element, end)
+        value = chart.value_at(1.0, end)
+        last = chart.frozen(value, end, [chart.first_field])
+        error = tangent(elements.error(last), chart.state(end))
+        y1 = chart.end(end)
+        if self.stiffness is not None:
+            # NaN is an infinite error to diffrax, so that the step is taken again, shorter.
+            zero = jnp.where(jnp.isnan(self.stiffness), jnp.nan, 0.0)
+            y1, error = jtu.tree_map(lambda x: x + zero.astype(x.dtype), (y1, error))
+        path = Path.of(
+            self.continuous_extension,
+            chart.origin,
+            [chart.first_field, *elements.flows, last],
+        )
+        return Step(y1, path, error, value)
+
+    def _number(self, length: float) -> tuple[Any, Any]:
+        """How many stages such a part of the step has, and whether it is possible."""
+        l = self.twice_index  # noqa: E741
+        if self.stages is None:
+            number = _stages_for(length * cast(Array, self.stiffness), l)
+            is_possible = ~jnp.isnan(number)
+            return jnp.where(is_possible, number, 3), is_possible
+        # As many as reach as far, in a part of it.
+        return self.stages if length == 1 else _stages_for(length * _reach(self.stages, l), l), True
+
+    def _element(
+        self,
+        chart: Chart,
+        first: PyTree,
+        point: PyTree,
+        c: float = 0.0,
+        length: float = 1.0,
+        ratio: Any = 1.0,
+    ) -> PyTree:
+        """The element that leads from a point, at time c and with the field `first`, over such a
+        part of the step. The first stage is at `ratio` times its usual time.
+        """
+        l = self.twice_index  # noqa: E741
+        first = _times(length, first)
+        number, is_possible = self._number(length)
+
+        def stage(j: Any, carry: Any) -> Any:
+            u, u_before, time, time_before = carry
+            field = chart.field(c + length * time, chart.flow(u, point), [chart.first_field])
+            weights = _weights(j, number, l, ratio)
+            new = combine(weights, (u, u_before, cast_like(first, _times(length, field)), first))
+            new_time = weights[0] * time + weights[1] * time_before + weights[2] + weights[3]
+            return cast_like(first, new), u, new_time, time
+
+        # The time of the first stage, and the weight of the first field there. An impossible step
+        # has zeros and no stage, so that its derivative is finite.
+        w = jnp.where(is_possible, (l + 1) / (2 * (l + 2)) * ratio * _slope(number, l), 0.0)
+        zero = jnp.zeros_like(w)
+        carry = combine((w,), (first,)), combine((zero,), (first,)), w, zero
+        if self.stages is not None:
+            turns = np.arange(2.0, number + 1)
+            (u, *_), _ = over_stages(lambda carry, j: (stage(j, carry), None), carry, turns)
+            return u
+        # A loop of no more turns than there are stages.
+        _, (u, *_) = eqxi.while_loop(
+            lambda value: is_possible & (value[0] <= number),
+            lambda value: (value[0] + 1, stage(*value)),
+            (jnp.full_like(w, 2), jtu.tree_map(_reverse_mode_only, carry)),
+            max_steps=self.max_stages,
+            kind="checkpointed",
+        )
+        return u
+
+
+class _Elements(NamedTuple):
+    """Elements along which a step moves, one after the other, and the element of the estimate, from
+    the field at the end.
+    """
+
+    flows: list[PyTree]
+    error: Callable[[PyTree], PyTree]
+
+
+class _OneElement(AbstractStabilised):
+    """The step `exp(u) y0` with u from the recursion: order 2, on every manifold.
+
+    Let `u' = dexpinv_u F` be the equation in the algebra and `v' = F` the one without its
+    commutators. Then `u - v = -h^3 / 12 [F, F'] + O(h^4)`, so a method of order 2 for v is one of
+    order 2 on the manifold.
+    """
+
+    continuous_extension: ClassVar[ContinuousExtension] = (
+        ((1.0, 0.0, 0.0), (-2.0, 3.0, -1.0), (1.0, -2.0, 1.0)),
+    )
+
+    def order(self, terms) -> int:
+        return 2
+
+    def elements(self, chart):
+        first = chart.first_field
+        u = self._element(chart, first, chart.start)
+        return _Elements([u], lambda last: combine((-0.8, 0.4, 0.4), (u, first, last)))
+
+
+class RKL2(_OneElement):
+    """Order 2, stable up to `(s - 1)(s + 2) / 2` with s stages: s evaluations, s flows.
+
+    Runge-Kutta-Legendre, for relative errors of some 1e-2 to 1e-3. The estimate comes at no extra
+    cost. It is large where stiff parts are not smooth yet.
+
+    Source: Meyer, Balsara & Aslam, A stabilized Runge-Kutta-Legendre method for explicit
+    super-time-stepping of parabolic and mixed equations, J. Comput. Phys. 257 (2014),
+    doi:10.1016/j.jcp.2013.08.021; the estimate as in Sommeijer, Shampine & Verwer, RKC: an explicit
+    solver for parabolic PDEs, J. Comput. Appl. Math. 88 (1998),
+    doi:10.1016/S0377-0427(97)00219-7.
+    """
+
+    twice_index: ClassVar[int] = 1
+
+
+class RKG2(_OneElement):
+    """Order 2, stable up to `(s - 1)(s + 4) / 3` with s stages: s evaluations, s flows.
+
+    Runge-Kutta-Gegenbauer. It takes 1.2 times the stages of `RKL2`, and is stable in a wider region
+    about the negative axis: for spectra with an imaginary part, as of advection or precession.
+
+    Source: the recursion of `RKL2` with Gegenbauer polynomials of index 3/2; for these methods
+    Skaras, Saxton, Meyer & Aslam, Super-time-stepping schemes for parabolic equations with boundary
+    conditions, J. Comput. Phys. 425 (2021), doi:10.1016/j.jcp.2020.109879.
+    """
+
+    twice_index: ClassVar[int] = 3
+
+
+class RKL3(AbstractStabilised):
+    """Order 3, stable on the whole range of `RKL2`: 2.4 times its evaluations, 2 flows at the end.
+
+    For relative errors of some 1e-4 to 1e-6. It extrapolates `RKL2`: with its elements u of the
+    whole step and v1, v2 of the halves, which take fewer stages, the step is
+    `exp(p v2 + q v1 + e u) exp(p v1 + q v2 + e u) y0`. The estimate, a multiple of `v1 + v2 - u`,
+    comes at no extra cost, and stays small in stiff parts.
+
+    Order 3 without a commutator: u is off by `h^3 (c A + d B + [F, F'] / 12)`, see
+    `RKL2`, with A the third derivative of v, B the part of it with F's second derivative, and c and
+    d that depend on the number of stages. In the halves c is r times that of u, and the
+    time of their first stage is such that d is as well. So `a (v1 + v2) + (1 - a) u` has neither
+    if `a = 4 / (4 - r)`. Two half steps have the logarithm `v1 + v2 + [v2, v1]/2`, with the sign of
+    an action from the left. As `h^3 [F, F'] = -8 [v2, v1]`, the exact logarithm is this sum and
+    `2/3 [v2, v1]`, up to `O(h^4)`. With `p + q = a`, `2 e = 1 - a` and `p - q = 4/3` the two flows
+    have the sum and, as `u = v1 + v2 + O(h^3)`, the bracket `(p - q)/2 [v2, v1]`.
+
+    Source: derived for this package; it was not found in print.
+    """
+
+    twice_index: ClassVar[int] = 1
+    continuous_extension: ClassVar[ContinuousExtension] = (
+        ((1.0, 0.0, 0.0, 0.0), (-2.0, 3.0, 0.0, -1.0), (1.0, -2.0, 0.0, 1.0)),
+        ((0.0, 0.0, 0.0, 0.0), (0.0, 0.0, 3.0, 0.0), (0.0, 0.0, -2.0, 0.0)),
+    )
+
+    def order(self, terms) -> int:
+        return 3
+
+    def elements(self, chart):
+        first, start = chart.first_field, chart.start
+        (s, _), (m, _) = self._number(1.0), self._number(0.5)
+        # c is -(1 + 2 w) / 18, and d is -3 b_1 times what follows.
+        ws, wm = (_slope(number, 1) for number in (s, m))
+        ds, dm = (
+            w**2
+            * (digamma(jnp.asarray(number + 1, float)) + np.euler_gamma - 1)
+            / (number**2 + number)
+            for w, number in ((ws, s), (wm, m))
+        )
+        r = (1 + 2 * wm) / (1 + 2 * ws)
+        a, ratio = 4 / (4 - r), r * ds / dm
+        u = self._element(chart, first, start)
+        v1 = self._element(chart, first, start, 0.0, 0.5, ratio)
+        middle = chart.flow(v1, start)
+        field = chart.field(0.5, middle, [first])
+        v2 = self._element(chart, field, middle, 0.5, 0.5, ratio)
+        weights = a / 2 + 2 / 3, a / 2 - 2 / 3, (1 - a) / 2
+        flows = [combine(weights, (v1, v2, u)), combine(weights, (v2, v1, u))]
+        error = combine((a - 1, a - 1, 1 - a), (v1, v2, u))
+        return _Elements(flows, lambda last: error)
+
+
+def _check_fields(solver: AbstractStabilised, chart: Chart) -> None:
+    name, names = type(solver).__name__, []
+    fields = chart.product(chart.first_value)
+    for part in filter(is_field, jtu.tree_leaves(fields, is_leaf=is_field)):
+        names.append(type(part).__name__)
+        if isinstance(part, AbstractSemilinearField):
+            raise TypeError(
+                f"{name} does not take {type(part).__name__}, whose flow has an exact stiff part: "
+                "use an exponential method, for example cfjax.ETD54()."
+            )
+    if not is_uniform(chart):
+        raise TypeError(
+            f"{name} adds up the fields of all stages, and sums of "
+            f"{', '.join(names) or 'these fields'} grow with their number: use cfjax.LeftMatrix "
+            "for few rows, cfjax.BorderedSkew for orthonormal columns, or another method, for "
+            "example cfjax.CF4()."
+        )
+
+
+def _times(length: float, field: PyTree) -> PyTree:
+    return field if length == 1 else combine((length,), (field,))
+
+
+def _weights(j: Any, s: Any, l: int, ratio: Any) -> tuple[Any, Any, Any, Any]:  # noqa: E741
+    """Those of the two elements before, the field there and the first field, in stage j of s."""
+
+    def b(j: Any) -> Any:
+        factor, j = jnp.where(j == 1, ratio, 1.0), jnp.maximum(j, 2)
+        return factor * (l + 1) * (j - 1) * (j + l + 1) / ((l + 3) * j * (j + l))
+
+    mu = (2 * j + l - 2) / (j + l - 1) * b(j) / b(j - 1)
+    nu = -(j - 1) / (j + l - 1) * b(j) / b(j - 2)
+    of_field = mu * _slope(s, l)
+    return mu, nu, of_field, (b(j - 1) - 1) * of_field
+
+
+def _slope(s: Any, l: int) -> Any:  # noqa: E741
+    return (l + 3) / ((s - 1) * (s + l + 1))
+
+
+def _reach(s: Any, l: int) -> Any:  # noqa: E741
+    """How far s stages are stable on the negative axis."""
+    return 2 / _slope(s, l)
+
+
+def _stages_for(z: Any, l: int) -> Any:  # noqa: E741
+    """The number of stages that reach to -z: odd, as then what is stiffest is damped most."""
+    numpy: Any = jnp if isinstance(z, jax.Array) else np
+    root = numpy.sqrt((l + 2) ** 2 + 2 * z * (l + 3))
+    s = numpy.maximum(numpy.ceil((root - l) / 2), 3)
+    s = s + (1 - s % 2)
+    return lax.stop_gradient(s) if numpy is jnp else int(s)
+
+
+@jax.custom_jvp
+def _reverse_mode_only(x: Array) -> Array:
+    """The same array. Forward mode through it is an error."""
+    return x
+
+
+@_reverse_mode_only.defjvp
+def _(primals, tangents):
+    return primals[0], _only_transposed_p.bind(tangents[0])
+
+
+def _raise(*_, **__):
+    raise TypeError(
+        "Forward mode needs a number of stages, for example cfjax.RKL2(stages=9), as it has no "
+        "rule for a loop whose length is chosen in each step. Reverse mode has one."
+    )
+
+
+_only_transposed_p = Primitive("cfjax_only_transposed")
+_only_transposed_p.def_impl(_raise)
+_only_transposed_p.def_abstract_eval(lambda x: x)
+ad.deflinear2(_only_transposed_p, lambda cotangent, _: [cotangent])
+batching.defvectorized(_only_transposed_p)
+mlir.register_lowering(_only_transposed_p, _raise)
