@@ -149,7 +149,7 @@ class Lindblad(AbstractFrozenField):
         with_axes = [len(a.shape) > 2 for a in self.jumps]
         own = [a for a, holds in zip(self.jumps, with_axes, strict=True) if holds]
 
-        def of_one(h: Array, rates: Array, own: list[Array], x: Array) -> Array:
+        def of_one(h: Array, rates: Array, own: list[Any], x: Array) -> Array:
             own = own[::-1]
             jumps = [
                 own.pop() if holds else a for a, holds in zip(self.jumps, with_axes, strict=True)
@@ -157,7 +157,9 @@ class Lindblad(AbstractFrozenField):
             field = eqx.tree_at(lambda f: (f.h, f.rates, f.jumps), self, (h, rates, tuple(jumps)))
             return fun(field, x)
 
-        return each(of_one, num_axes)(self.h, self.rates, own, point)
+        # `jax.vmap` may have returned arrays of NumPy.
+        arrays = jtu.tree_map(jnp.asarray, (self.h, self.rates, own, point))
+        return each(of_one, num_axes)(*arrays)
 
     def _right_hand_side(self) -> Callable[[Array], Array]:
         """The velocity at a Hermitian matrix."""

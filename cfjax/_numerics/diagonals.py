@@ -44,7 +44,7 @@ def compact(a: Inexact[Array | np.ndarray, "*batch n n"]) -> Matrix:
     Another matrix that is known becomes one of NumPy, so that it stays known.
     """
     if isinstance(a, Tracer) or a.ndim != 2:
-        return a
+        return jnp.asarray(a)
     known = np.asarray(a)
     rows, columns = np.nonzero(known)
     offsets = sorted({*(columns - rows).tolist()}) or [0]

@@ -76,8 +76,7 @@ def test_what_is_not_known_or_small_or_has_many_diagonals_stays_dense():
         return a
 
     traced(jnp.eye(N))
-    batch = np.zeros((2, N, N))
-    assert compact(batch) is batch
+    assert isinstance(compact(np.zeros((2, N, N))), jax.Array)
 
 
 def test_a_product_has_no_product_of_matrices():
