@@ -16,10 +16,10 @@ from .._arrays import Weight, describe, struct
 from .._field import AbstractFrozenField, combine
 from .._numerics import hermitian
 from .._numerics.checks import differ, error_where
-from .._numerics.diagonals import Matrix, adjoint, compact, dense, times, times_adjoint
+from .._numerics.diagonals import Matrix, adjoint, compact, dense, gram, times, times_adjoint
 from .._numerics.expm import expm_parts
 from .._numerics.expm_multiply import Strip, expm_minus_one_multiply, row_norm
-from .._numerics.matmul import promoted, small_product
+from .._numerics.matmul import small_product
 from .._numerics.operators import added, scaled
 from .._numerics.transforms import DTYPES
 from .elementwise import check_point, each
@@ -86,17 +86,18 @@ class Lindblad(AbstractFrozenField):
                 "jumps must be a sequence of at least one matrix, for one jump [a], got "
                 f"{describe(jumps)}. Without jumps use cfjax.Congruence(-1j * h)."
             )
-        array = jnp.asarray(h)
-        num_axes = max(array.ndim - 2, jnp.ndim(rates) - 1 if rates is not None else 0)
-        self.h = _hamiltonian(h, array, num_axes)
-        self.rates = _rates(rates, self.h, len(jumps))
+        h_, rates_ = jnp.asarray(h), None if rates is None else jnp.asarray(rates)
+        num_axes = max(h_.ndim - 2, 0 if rates_ is None else rates_.ndim - 1)
+        self.h = _hamiltonian(h, h_, num_axes)
+        self.rates = _rates(rates, rates_, self.h, len(jumps))
         self.jumps = tuple(_jump(k, a, self.h) for k, a in enumerate(jumps))
 
     def flow(self, point: Complex[Array, "*batch n n"]) -> Complex[Array, "*batch n n"]:
         return self._each(lambda field, x: _hermitian_part(x) + field._change(x), point)
 
     def increment(self, point: Complex[Array, "*batch n n"]) -> Complex[Array, "*batch n n"]:
-        return self._each(lambda field, x: field._change(x), point)
+        # What is not Hermitian is lost, as in a flow.
+        return self._each(lambda field, x: field._change(x) + (_hermitian_part(x) - x), point)
 
     def tangent(self, point: Complex[Array, "*batch n n"]) -> Complex[Array, "*batch n n"]:
         return self._each(lambda field, x: field._right_hand_side()(_hermitian_part(x)), point)
@@ -107,9 +108,9 @@ class Lindblad(AbstractFrozenField):
         It is `-i h - sum_k rates_k L_k^H L_k / 2` without the trace of h, which has no effect. For
         a field without leading axes.
         """
-        h = _traceless(self.h).astype(np.promote_types(self.h.dtype, np.complex64))
-        h, loss = promoted(-1j * h, _gram(self.rates, self.jumps) / 2)
-        return h - loss
+        h = _traceless(self.h)
+        turning = -1j * (h if jnp.iscomplexobj(h) else lax.complex(h, jnp.zeros_like(h)))
+        return added([turning, -_gram(self.rates, self.jumps) / 2])
 
     def jump(self, x: Inexact[Array, "n n"]) -> Inexact[Array, "n n"]:
         """`sum_k rates_k L_k x L_k^H`, for a field without leading axes."""
@@ -148,7 +149,7 @@ class Lindblad(AbstractFrozenField):
         with_axes = [len(a.shape) > 2 for a in self.jumps]
         own = [a for a, holds in zip(self.jumps, with_axes, strict=True) if holds]
 
-        def of_one(h: Array, rates: Array, own: list[Array], x: Array) -> Array:
+        def of_one(h: Array, rates: Array, own: list[Any], x: Array) -> Array:
             own = own[::-1]
             jumps = [
                 own.pop() if holds else a for a, holds in zip(self.jumps, with_axes, strict=True)
@@ -156,7 +157,9 @@ class Lindblad(AbstractFrozenField):
             field = eqx.tree_at(lambda f: (f.h, f.rates, f.jumps), self, (h, rates, tuple(jumps)))
             return fun(field, x)
 
-        return each(of_one, num_axes)(self.h, self.rates, own, point)
+        # `jax.vmap` may have returned arrays of NumPy.
+        arrays = jtu.tree_map(jnp.asarray, (self.h, self.rates, own, point))
+        return each(of_one, num_axes)(*arrays)
 
     def _right_hand_side(self) -> Callable[[Array], Array]:
         """The velocity at a Hermitian matrix."""
@@ -182,13 +185,13 @@ class Lindblad(AbstractFrozenField):
         # It has no trace but for rounding.
         return _traceless(change)
 
-    def _matrix(self) -> Real[Array, "n2 n2"]:
+    def _matrix(self) -> Real[Array, "d d"]:
         """The matrix that moves the coordinates of a Hermitian matrix."""
         dtype = self.rates.dtype
         turning = jnp.asarray(hermitian.commutators(self.h.shape[-1]), dtype)
         a = jnp.tensordot(hermitian.coordinates(self.h), turning, 1)
         for rate, jump in zip(self.rates, self.jumps, strict=True):
-            a = a + rate * jnp.asarray(hermitian.dissipator(jump), dtype)
+            a = a + rate * jnp.asarray(hermitian.dissipator(dense(jump)), dtype)
         # The trace, the first coordinate, is constant.
         return jnp.pad(a[1:], ((1, 0), (0, 0)))
 
@@ -209,7 +212,7 @@ def _hamiltonian(h: Any, array: Array, num_axes: int) -> Array:
         raise ValueError(f"h must have shape (n, n) or (*batch, n, n), got {array.shape}.")
     if array.dtype.name not in DTYPES:
         raise TypeError(f"h must be one of {', '.join(DTYPES)}, got {array.dtype}.")
-    if not isinstance(array, Tracer) or not isinstance(h, Tracer):
+    if _is_known(h):
         size, skew = _sizes(np.asarray(h), np)
         if skew > _threshold(array.dtype) * size:
             raise ValueError(
@@ -219,11 +222,10 @@ def _hamiltonian(h: Any, array: Array, num_axes: int) -> Array:
     return array.reshape(*[1] * (num_axes + 2 - array.ndim), *array.shape)
 
 
-def _rates(rates: Any, h: Array, m: int) -> Array:
+def _rates(rates: Any, array: Array | None, h: Array, m: int) -> Array:
     num_axes, precision = h.ndim - 2, jnp.finfo(h.dtype).dtype
-    if rates is None:
+    if array is None:
         return jnp.ones((*[1] * num_axes, m), precision)
-    array = jnp.asarray(rates)
     if array.ndim == 0 or array.shape[-1] != m:
         raise ValueError(
             f"rates must be one for each of the {m} jumps, shape ({m},) or (*batch, {m}), got "
@@ -231,15 +233,23 @@ def _rates(rates: Any, h: Array, m: int) -> Array:
         )
     if jnp.iscomplexobj(array):
         raise TypeError(f"rates must be real, got {array.dtype}.")
-    if jnp.issubdtype(array.dtype, jnp.inexact) and array.dtype != precision:
-        raise TypeError(f"rates must have the precision of h, {precision}, got {array.dtype}.")
-    if not isinstance(rates, Tracer) and np.min(np.asarray(rates), initial=0) < 0:
+    # Python's numbers take the precision of h.
+    for dtype in (jnp.result_type(x) for x in jtu.tree_leaves(rates) if hasattr(x, "dtype")):
+        if jnp.issubdtype(dtype, jnp.inexact) and dtype != precision:
+            raise TypeError(f"rates must have the precision of h, {precision}, got {dtype}.")
+    if _is_known(rates) and np.min(np.asarray(rates), initial=0) < 0:
         raise ValueError(f"rates must not be negative, got {np.asarray(rates)}.")
     array = array.astype(precision)
     return array.reshape(*[1] * (num_axes + 1 - array.ndim), *array.shape)
 
 
-def _jump(k: int, jump: Any, h: Array) -> Any:
+def _is_known(x: Any) -> bool:
+    """Whether the values of an array, or of lists of numbers, are known in a trace."""
+    # As they were given: in a trace `jnp.asarray` returns a tracer for what is known.
+    return not any(isinstance(leaf, Tracer) for leaf in jtu.tree_leaves(x))
+
+
+def _jump(k: int, jump: Any, h: Array) -> Matrix:
     if not isinstance(jump, jax.Array | np.ndarray):
         raise TypeError(f"jumps[{k}] must be an array, got {describe(jump)}.")
     n, num_axes = h.shape[-1], h.ndim - 2
@@ -293,9 +303,7 @@ def _of_jumps(rates: Array, jumps: Sequence[Matrix], x: Array) -> Array:
 
 def _gram(rates: Array, jumps: Sequence[Matrix]) -> Array:
     """`sum_k rates_k L_k^H L_k`."""
-    return added(
-        scaled(rate, times(adjoint(a), dense(a))) for rate, a in zip(rates, jumps, strict=True)
-    )
+    return added(scaled(rate, gram(a)) for rate, a in zip(rates, jumps, strict=True))
 
 
 def _sizes(h: Any, numpy: Any) -> tuple[Any, Any]:
@@ -315,7 +323,8 @@ def _two_norm(a: Array) -> Array:
 
 def _traceless(x: Array) -> Array:
     n = x.shape[-1]
-    return x - scaled(jnp.trace(x).real / n, jnp.eye(n, dtype=x.dtype))
+    mean = jnp.trace(x).real / n
+    return x - jnp.diag(jnp.full(n, mean.astype(x.dtype)))
 
 
 def _hermitian_part(x: Array) -> Array:

@@ -17,32 +17,39 @@ _LEAST_ROWS = 5
 
 
 class Diagonals(eqx.Module):
-    """The matrix a with `a[i, i + offsets[k]] = entries[k, i]`, and zeros elsewhere."""
+    """The matrix a with `a[i, i + offsets[k]] = entries[k, i]`, and zeros elsewhere.
 
-    entries: Inexact[Array | np.ndarray, "k n"]
+    `jax.vmap` may return it with leading axes.
+    """
+
+    entries: Inexact[Array | np.ndarray, "*batch k n"]
     offsets: tuple[int, ...] = eqx.field(static=True)
 
     @property
-    def shape(self) -> tuple[int, int]:
-        return self.entries.shape[1], self.entries.shape[1]
+    def shape(self) -> tuple[int, ...]:
+        *leading, _, n = self.entries.shape
+        return *leading, n, n
 
     @property
     def dtype(self) -> Any:
         return self.entries.dtype
 
 
-Matrix = Inexact[Array | np.ndarray, "n n"] | Diagonals
+Matrix = Inexact[Array | np.ndarray, "*leading n n"] | Diagonals
 
 
-def compact(a: Inexact[Array | np.ndarray, "*batch n n"]) -> Any:
-    """The matrix by its diagonals, if these are few and known when the program is traced."""
-    if isinstance(a, Tracer) or a.ndim != 2 or len(a) < _LEAST_ROWS:
-        return a
+def compact(a: Inexact[Array | np.ndarray, "*batch n n"]) -> Matrix:
+    """The matrix by its diagonals, if these are few and known when the program is traced.
+
+    Another matrix that is known becomes one of NumPy, so that it stays known.
+    """
+    if isinstance(a, Tracer) or a.ndim != 2:
+        return jnp.asarray(a)
     known = np.asarray(a)
     rows, columns = np.nonzero(known)
     offsets = sorted({*(columns - rows).tolist()}) or [0]
-    if len(offsets) > _MOST_DIAGONALS:
-        return a
+    if len(known) < _LEAST_ROWS or len(offsets) > _MOST_DIAGONALS:
+        return known
     entries = np.zeros((len(offsets), len(known)), known.dtype)
     for k, offset in enumerate(offsets):
         diagonal = np.diagonal(known, offset)
@@ -80,8 +87,20 @@ def times_adjoint(x: Inexact[Array, "m n"], a: Matrix) -> Inexact[Array, "m n"]:
     return times(a, x.conj().T).conj().T
 
 
-def dense(a: Matrix) -> Inexact[Array, "n n"]:
-    """The matrix with all its entries."""
+def dense(a: Matrix) -> Inexact[Array | np.ndarray, "n n"]:
+    """The matrix with all its entries. One that is known stays known."""
     if not isinstance(a, Diagonals):
-        return jnp.asarray(a)
-    return times(a, jnp.eye(a.shape[0], dtype=a.dtype))
+        return a
+    n = a.shape[-1]
+    total: Any = 0
+    for e, k in zip(a.entries, a.offsets, strict=True):
+        total = total + e[:, None] * np.eye(n, k=k, dtype=e.dtype)
+    return total
+
+
+def gram(a: Matrix) -> Inexact[Array, "n n"]:
+    """`a^H @ a`."""
+    whole = dense(a)
+    if isinstance(whole, np.ndarray):
+        return jnp.asarray(whole.conj().T @ whole)
+    return times(adjoint(a), whole)

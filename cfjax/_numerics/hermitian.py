@@ -1,6 +1,7 @@
 """Hermitian matrices as real vectors, in an orthonormal basis whose first is the identity."""
 
 import functools
+import math
 from typing import Any
 
 import jax.numpy as jnp
@@ -11,25 +12,26 @@ from jaxtyping import Array, Complex, Float, Inexact
 
 from .vectors import pack
 
+_ROOT = 0.5**0.5
 
-def coordinates(x: Inexact[Array, "n n"]) -> Float[Array, " n*n"]:
+
+def coordinates(x: Inexact[Array, "n n"]) -> Float[Array, " d"]:
     """The coordinates of the Hermitian part of x. The first is the trace over sqrt(n)."""
     n = x.shape[0]
     diagonal = [x[i, i].real for i in range(n)]
-    mixed = [sum(float(w) * d for w, d in zip(row, diagonal, strict=True)) for row in _diagonal(n)]
-    above = [(x[i, j] + x[j, i].conj()) / 2**0.5 for i, j in _pairs(n)]
+    mixed = [_weighted(row, diagonal) for row in _diagonal(n)]
+    above = [_ROOT * (x[i, j] + x[j, i].conj()) for i, j in _pairs(n)]
     return pack([*mixed, *(z.real for z in above), *(z.imag for z in above)])
 
 
-def matrix(r: Float[Array, " n2"]) -> Complex[Array, "n n"]:
+def matrix(r: Float[Array, " d"]) -> Complex[Array, "n n"]:
     """The matrix with these coordinates, Hermitian to the last bit."""
-    n = int(np.sqrt(len(r)))
+    n = math.isqrt(len(r))
     pairs = _pairs(n)
-    real, imag = 0.5**0.5 * r[n : n + len(pairs)], 0.5**0.5 * r[n + len(pairs) :]
-    columns = _diagonal(n).T
+    real, imag = _ROOT * r[n : n + len(pairs)], _ROOT * r[n + len(pairs) :]
     entries = {}
-    for i, row in enumerate(columns):
-        d = sum(float(w) * r[k] for k, w in enumerate(row))
+    for i, row in enumerate(_diagonal(n).T):
+        d = _weighted(row, [r[k] for k in range(n)])
         entries[i, i] = lax.complex(d, jnp.zeros_like(d))
     for k, (i, j) in enumerate(pairs):
         entries[i, j] = lax.complex(real[k], imag[k])
@@ -38,34 +40,42 @@ def matrix(r: Float[Array, " n2"]) -> Complex[Array, "n n"]:
 
 
 @functools.cache
-def basis(n: int) -> Complex[np.ndarray, "n2 n n"]:
+def basis(n: int) -> Complex[np.ndarray, "d n n"]:
     """The basis."""
-    pairs, root = _pairs(n), np.sqrt(0.5)
+    pairs = _pairs(n)
     matrices = np.zeros((n * n, n, n), complex)
     matrices[:n, range(n), range(n)] = _diagonal(n)
     for k, (i, j) in enumerate(pairs, n):
-        matrices[k, [i, j], [j, i]] = root
-        matrices[k + len(pairs), [i, j], [j, i]] = 1j * root, -1j * root
+        matrices[k, [i, j], [j, i]] = _ROOT
+        matrices[k + len(pairs), [i, j], [j, i]] = 1j * _ROOT, -1j * _ROOT
     return matrices
 
 
 @functools.cache
-def commutators(n: int) -> Float[np.ndarray, "n2 n2 n2"]:
+def commutators(n: int) -> Float[np.ndarray, "d d d"]:
     """For each matrix b of the basis that of `x -> -i [b, x]` in coordinates."""
     b = basis(n)
     images = np.einsum("aij,cjk->acik", b, b) - np.einsum("cij,ajk->acik", b, b)
     return np.einsum("bki,acik->abc", b, -1j * images).real
 
 
-def dissipator(a: Inexact[Array | np.ndarray, "n n"]) -> Float[Array | np.ndarray, "n*n n*n"]:
+def dissipator(a: Inexact[Array | np.ndarray, "n n"]) -> Float[Array | np.ndarray, "d d"]:
     """The matrix of `x -> a x a^H - (a^H a x + x a^H a) / 2` in coordinates."""
     # A matrix that is known is made once.
     numpy: Any = jnp if isinstance(a, Tracer) else np
-    b = numpy.asarray(basis(a.shape[-1]), np.promote_types(a.dtype, np.complex64))
-    a = numpy.asarray(a, b.dtype)
+    dtype = np.promote_types(a.dtype, np.complex64)
+    a, b = numpy.asarray(a, dtype), numpy.asarray(basis(a.shape[-1]), dtype)
     loss = a.conj().T @ a / 2
     images = a @ b @ a.conj().T - loss @ b - b @ loss
     return numpy.einsum("bki,cik->bc", b, images).real
+
+
+def _weighted(weights: np.ndarray, x: list[Array]) -> Array:
+    total = float(weights[0]) * x[0]
+    for w, term in zip(weights[1:], x[1:], strict=True):
+        if w != 0:
+            total = total + float(w) * term
+    return total
 
 
 @functools.cache

@@ -1,0 +1,105 @@
+"""Matrices of few diagonals: what is stored of them, and their products."""
+
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from matrices import DTYPES, random
+
+from cfjax._numerics.diagonals import Diagonals, adjoint, compact, dense, gram, times, times_adjoint
+
+N = 6
+
+
+def of_diagonals(*offsets, dtype=complex):
+    a = random((N, N), len(offsets), dtype)
+    kept = np.isin(np.subtract.outer(np.arange(N), np.arange(N)), [-k for k in offsets])
+    return np.where(kept, a, 0)
+
+
+KINDS = {
+    "upper": of_diagonals(1),
+    "lower": of_diagonals(-2),
+    "corner": of_diagonals(N - 1),
+    "other corner": of_diagonals(1 - N),
+    "main": of_diagonals(0),
+    "four": of_diagonals(-3, 0, 1, 2),
+    "zero": np.zeros((N, N)),
+    "dense": random((N, N), 1, complex),
+}
+
+
+@pytest.mark.parametrize("kind", KINDS)
+@pytest.mark.parametrize("dtype", [float, complex])
+def test_products_are_those_of_the_dense_matrix(kind, dtype):
+    a, x = KINDS[kind], random((N, N), 2, dtype)
+    stored = compact(a)
+    assert isinstance(stored, Diagonals) == (kind != "dense")
+    np.testing.assert_array_equal(dense(stored), a)
+    np.testing.assert_array_equal(dense(adjoint(stored)), a.conj().T)
+    assert stored.shape == a.shape and stored.dtype == a.dtype
+    # Sums of six products of numbers of size 1 to 10.
+    close = lambda found, expected: np.testing.assert_allclose(found, expected, 0, 1e-14)  # noqa: E731
+    for known in (True, False):
+        # Entries that are arguments of a program are not known in it, and their places are.
+        found = (lambda f: f) if known else jax.jit
+        close(found(times)(stored, jnp.asarray(x)), a @ x)
+        close(found(times_adjoint)(jnp.asarray(x), stored), x @ a.conj().T)
+        close(found(gram)(stored), a.conj().T @ a)
+        close(found(gram)(adjoint(stored)), a @ a.conj().T)
+
+
+@pytest.mark.parametrize("dtype", DTYPES)
+def test_the_precision_of_a_product(dtype):
+    a = compact(of_diagonals(1, -1, dtype=dtype))
+    assert times(a, jnp.ones((N, N), dtype)).dtype == gram(a).dtype == dtype
+    wide = np.result_type(dtype, np.complex64)
+    assert times(a, jnp.ones((N, N), wide)).dtype == wide
+
+
+def test_a_matrix_of_other_columns():
+    a, x = of_diagonals(1, -2), random((N, 3), 1)
+    np.testing.assert_allclose(times(compact(a), jnp.asarray(x)), a @ x, rtol=0, atol=1e-14)
+
+
+def test_what_is_not_known_or_small_or_has_many_diagonals_stays_dense():
+    assert isinstance(compact(of_diagonals(0, 1, 2, 3, 4)), np.ndarray)
+    assert isinstance(compact(np.eye(3)), np.ndarray)
+    # Known, wherever it is: NumPy's.
+    assert isinstance(compact(jnp.ones((N, N))), np.ndarray)
+
+    @jax.jit
+    def traced(a):
+        assert compact(a) is a
+        return a
+
+    traced(jnp.eye(N))
+    assert isinstance(compact(np.zeros((2, N, N))), jax.Array)
+
+
+def test_a_product_has_no_product_of_matrices():
+    a = compact(of_diagonals(1, -1))
+    text = str(jax.make_jaxpr(lambda x: times_adjoint(times(a, x), a))(jnp.eye(N)))
+    assert "dot_general" not in text
+
+
+def test_derivatives_of_products_by_diagonals():
+    a, x, d = of_diagonals(1, -2), random((N, N), 1, complex), random((N, N), 2, complex)
+    stored: Any = compact(a)
+    found = jax.jvp(lambda x: times_adjoint(times(stored, x), stored), (x,), (d,))[1]
+    np.testing.assert_allclose(found, a @ d @ a.conj().T, rtol=0, atol=1e-13)
+
+    def of_entries(entries):
+        return times(Diagonals(entries, stored.offsets), jnp.asarray(x))
+
+    way = 1j * stored.entries
+    found = jax.jvp(of_entries, (jnp.asarray(stored.entries),), (jnp.asarray(way),))[1]
+    np.testing.assert_allclose(found, 1j * a @ x, rtol=0, atol=1e-13)
+
+
+def test_leading_axes_of_entries_by_vmap():
+    stored = compact(of_diagonals(1, -2))
+    many = jax.vmap(lambda s: jax.tree.map(lambda e: s * e, stored))(np.arange(3) + 0j)
+    assert many.shape == (3, N, N)
