@@ -4,6 +4,7 @@ from . import allen_cahn as allen_cahn
 from . import annealing as annealing
 from . import covariance as covariance
 from . import gray_scott as gray_scott
+from . import harmonic_maps as harmonic_maps
 from . import heat as heat
 from . import heavy_top as heavy_top
 from . import hmc as hmc
@@ -11,6 +12,7 @@ from . import imu as imu
 from . import kuramoto_sivashinsky as kuramoto_sivashinsky
 from . import landau_zener as landau_zener
 from . import macrospin as macrospin
+from . import porous_medium as porous_medium
 from . import rigid_body as rigid_body
 from . import rotational_diffusion as rotational_diffusion
 from . import spacecraft as spacecraft
