@@ -87,7 +87,7 @@ def test_the_degree_and_the_energy_of_a_lump():
     assert np.abs(np.sum(harmonic_maps.degree(y))) == pytest.approx(1, abs=1e-12)
     mirrored = np.sum(harmonic_maps.degree(y[::-1]))
     assert mirrored == pytest.approx(-np.sum(harmonic_maps.degree(y)), abs=1e-12)
-    # Within the rim, outside of which there is the square of 4 / 32, and squares of a cell of 1 / 4.
+    # Outside of the rim is the square of 4 / 32; errors of a cell are squares of 1 / 4.
     inside = harmonic_maps.density(jnp.asarray(y))[1:-1, 1:-1]
     assert float(jnp.sum(inside)) == pytest.approx(4 * np.pi, rel=0.05)
 
