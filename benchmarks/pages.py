@@ -32,6 +32,7 @@ PICTURES = {
     "energy": 120,
     "noise": 120,
     "peers": 120,
+    "stabilised": 100,
     "stability": 100,
     "stiff": 100,
     "tolerances": 120,
@@ -1009,6 +1010,69 @@ def stiff_dispersion() -> list[list[str]]:
         cells = ["overflow" if e is None else f"{e:.1e}".replace("e-0", "e-") for e in errors]
         table.append([STIFF[program], *(c.replace("e+00", "") for c in cells)])
     return table
+
+
+STABILISED = {
+    "RKL2": "`RKL2`",
+    "RKL2, radius estimated": "`RKL2`, radius estimated",
+    "RKL3": "`RKL3`",
+    "CF43": "`CF43`",
+    "Luscher3": "`Luscher3`",
+    "ETD54": "`ETD54`",
+    "Tsit5": "diffrax, Tsit5",
+}
+
+
+def _stabilised() -> dict[tuple[str, float], list[Row]]:
+    """The rows of each problem and error."""
+    rows = [row for row in load("stabilised")["rows"] if "to" in row]
+    return {
+        (problem, target): pick(rows, problem=problem, to=target)
+        for problem in values(rows, "problem")
+        for target in values(pick(rows, problem=problem), "to")
+    }
+
+
+@table
+def diffusion_evaluations() -> list[list[str]]:
+    def text(row: Row) -> str:
+        return str(row["evaluations"]) if "evaluations" in row else "not reached"
+
+    table = [["", "error", *STABILISED.values()]]
+    for (problem, target), rows in _stabilised().items():
+        cells = ["".join(map(text, pick(rows, program=name))) for name in STABILISED]
+        table.append([problem, _exact(target), *cells])
+    return table
+
+
+@table
+def diffusion_times() -> list[list[str]]:
+    bases = {
+        "CF43": "over `CF43`",
+        "Tsit5": "Tsit5",
+        "Kvaerno5": "Kvaerno5",
+        "Luscher3": "`Luscher3`",
+        "ETD54": "`ETD54`",
+    }
+    table = [["", "error", "", "time", *bases.values()]]
+    for (problem, target), rows in _stabilised().items():
+        for row in (r for r in rows if r["program"] in ("RKL2", "RKL3") and "seconds" in r):
+            over = [row[f"over {base}"] for base in bases]
+            table.append(
+                [
+                    problem,
+                    _exact(target),
+                    f"`{row['program']}`",
+                    in_units(row["seconds"][2]),
+                    *(cell(spread) if spread else "" for spread in over),
+                ]
+            )
+    return table
+
+
+def _exact(error: float) -> str:
+    """As 2e-3 or 1.5e-4."""
+    return f"{error:.1e}".replace(".0e", "e").replace("e-0", "e-")
 
 
 _TOO_LARGE = "top, large steps"

@@ -1,9 +1,10 @@
 """Where methods fail: regions of stability, and errors of steps that are too large or too close.
 
-The picture has a panel for each.
+The picture has a panel for each. A second one has the regions of stabilised methods.
 """
 
 import itertools
+import math
 from collections.abc import Iterator
 from typing import Any
 
@@ -42,7 +43,60 @@ def draw() -> dict[str, Figure]:
         axes.title.set_fontsize(10)
         axes.grid(color="0.9", linewidth=0.6)
         axes.set_axisbelow(True)
-    return {"stability": figure}
+    return {"stability": figure, "regions": stabilised_regions()}
+
+
+def stabilised_regions(s: int = 11) -> Figure:
+    """Where a step does not grow, on the same axes, with as many stages."""
+    z = np.linspace(-85, 5, 1800) + 1j * np.linspace(-13, 13, 520)[:, None]
+    # The halves of a step need as many stages as reach half as far.
+    half = next(m for m in range(3, s + 1, 2) if _reach(m, 1) >= _reach(s, 1) / 2)
+    of_halves = _stabilised(half, 1, z / 2) ** 2
+    growths = {
+        f"RKL2, {s} evaluations": _stabilised(s, 1, z),
+        f"RKG2, {s} evaluations": _stabilised(s, 3, z),
+        f"RKL3, {s + 2 * half - 1} evaluations": (4 * of_halves - _stabilised(s, 1, z)) / 3,
+        f"RKC, {s} evaluations, not in cfjax": _chebyshev(s, z),
+        "CF4, 4 evaluations": sum(z**k / math.factorial(k) for k in range(5)),
+    }
+    figure = Figure(figsize=(10, 9), layout="constrained")
+    colors = (BLUE, GREEN, RED, PINK, GREY)
+    panels = figure.subplots(len(growths), 1, sharex=True)
+    for axes, color, (name, growth) in zip(panels, colors, growths.items(), strict=True):
+        axes.contourf(z.real, z.imag, np.abs(growth), levels=[0, 1], colors=[color], alpha=0.25)
+        axes.contour(z.real, z.imag, np.abs(growth), levels=[1], colors=[color], linewidths=1.2)
+        for sign in (-1, 1):
+            wedge = np.array([0, -85]), np.array([0, sign * 85 * np.tan(np.radians(5))])
+            axes.plot(*wedge, ":", color="0.5", linewidth=0.8)
+        axes.set(aspect="equal", ylabel="Im z")
+        axes.set_title(name, fontsize=10)
+    panels[-1].set(xlabel="Re z, where z is an eigenvalue times the step; dotted: a wedge of 5°")
+    return figure
+
+
+def _reach(s: int, l: int) -> float:  # noqa: E741
+    """How far s stages are stable on the negative axis, with twice the index of the polynomials."""
+    return (s - 1) * (s + l + 1) * 2 / (l + 3)
+
+
+def _stabilised(s: int, l: int, z: np.ndarray) -> np.ndarray:  # noqa: E741
+    """The growth of a step of RKL2, for which l is 1, or RKG2, for which it is 3."""
+    b = (l + 1) * (s - 1) * (s + l + 1) / ((l + 3) * s * (s + l))
+    x = 1 + 2 * z / _reach(s, l)
+    # The polynomials of Gegenbauer that are 1 at 1.
+    before, now = np.ones_like(x), x
+    for j in range(2, s + 1):
+        before, now = now, ((2 * j + l - 2) * x * now - (j - 1) * before) / (j + l - 1)
+    return 1 - b + b * now
+
+
+def _chebyshev(s: int, z: np.ndarray) -> np.ndarray:
+    """The growth of a step of RKC, with the damping 2/13 of its authors."""
+    shift = 1 + 2 / 13 / s**2
+    t = np.polynomial.Chebyshev.basis(s)
+    first, second = t.deriv()(shift), t.deriv(2)(shift)
+    b = second / first**2
+    return 1 - b * t(shift) + b * t(shift + first / second * z)
 
 
 def curves(panel: str) -> Curves:

@@ -13,6 +13,7 @@ from jaxtyping import Array, Float, PyTree
 
 from .._field import AbstractAlgebraElement, bracket, combine, flow, is_field, tangent
 from .._solvers.base import AbstractLieSolver
+from .._solvers.stabilised import AbstractStabilised
 from .flops import count_flops
 
 
@@ -50,8 +51,10 @@ def cost_of_steps(problem: Problem, is_adaptive: bool) -> Cost:
     solver = problem.solver
     while isinstance(solver, diffrax.AbstractWrappedSolver):
         solver = solver.solver
-    if isinstance(solver, diffrax.AbstractImplicitSolver):
-        # The iterations of its steps depend on a tolerance that the controller may set.
+    chooses_stages = isinstance(solver, AbstractStabilised) and solver.stages is None
+    if isinstance(solver, diffrax.AbstractImplicitSolver) or chooses_stages:
+        # The iterations of its steps depend on a tolerance that the controller may set, the stages
+        # on the length of a step.
         unknown = np.full(3, np.nan)
         return Cost(unknown, unknown)
     # First: it raises its errors before anything is compiled.

@@ -6,6 +6,7 @@ from . import cat as cat
 from . import covariance as covariance
 from . import damped_qubit as damped_qubit
 from . import gray_scott as gray_scott
+from . import harmonic_maps as harmonic_maps
 from . import heat as heat
 from . import heavy_top as heavy_top
 from . import hmc as hmc
@@ -13,6 +14,7 @@ from . import imu as imu
 from . import kuramoto_sivashinsky as kuramoto_sivashinsky
 from . import landau_zener as landau_zener
 from . import macrospin as macrospin
+from . import porous_medium as porous_medium
 from . import rigid_body as rigid_body
 from . import rotational_diffusion as rotational_diffusion
 from . import spacecraft as spacecraft
