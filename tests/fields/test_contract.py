@@ -610,6 +610,9 @@ WITH_DEXPINV = {
 }
 
 
+SLOW_SERIES = ("InertialMotion of matrices", "LeftMatrix", "LinearAffine")
+
+
 def structure_constants(case):
     """`c[k, i, j]`: the bracket of the coordinates i and j, from the generators' commutators."""
     names = case.draw()
@@ -651,10 +654,7 @@ def exact_dexpinv(constants, u, v):
 @pytest.mark.parametrize("dtype", [np.float32, np.float64])
 @pytest.mark.parametrize(
     "name",
-    [
-        pytest.param(name, marks=[pytest.mark.slow] * (name in ("LeftMatrix", "LinearAffine")))
-        for name in WITH_DEXPINV
-    ],
+    [pytest.param(name, marks=[pytest.mark.slow] * (name in SLOW_SERIES)) for name in WITH_DEXPINV],
 )
 def test_the_inverse_derivative_of_the_exponential(name, dtype):
     """And its first and second derivative, by differences of 50 digits."""
@@ -689,7 +689,7 @@ def test_the_inverse_derivative_of_the_exponential(name, dtype):
     found = everything(*sets[:2], sets[2], sets[3])
     constants = structure_constants(case)
     flat = [
-        [np.concatenate([np.ravel(x[k]) for x in s.values()]) for k in range(len(sizes))]
+        [np.concatenate([np.ravel(s[key][k]) for key in base]) for k in range(len(sizes))]
         for s in (*sets, *found)
     ]
     with mpmath.workdps(50):
