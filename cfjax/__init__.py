@@ -56,6 +56,8 @@ if TYPE_CHECKING:
     from ._fields.affine import Affine as Affine
     from ._fields.conjugation import Congruence as Congruence
     from ._fields.conjugation import Conjugation as Conjugation
+    from ._fields.extended_motion import ExtendedMotion as ExtendedMotion
+    from ._fields.inertial_motion import InertialMotion as InertialMotion
     from ._fields.lindblad import Lindblad as Lindblad
     from ._fields.linear_affine import LinearAffine as LinearAffine
     from ._fields.low_rank import BorderedSkew as BorderedSkew
@@ -128,6 +130,8 @@ _NAMES_LATER = {
     "_fields.affine": ("Affine",),
     "_testing": ("check_field", "check_terms"),
     "_fields.conjugation": ("Congruence", "Conjugation"),
+    "_fields.extended_motion": ("ExtendedMotion",),
+    "_fields.inertial_motion": ("InertialMotion",),
     "_fields.lindblad": ("Lindblad",),
     "_fields.linear_affine": ("LinearAffine",),
     "_fields.low_rank": ("BorderedSkew", "LowRankSkew"),

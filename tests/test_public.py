@@ -22,6 +22,8 @@ PROMISED = [
     "quaternion_rotate",
     "RigidMotion",
     "PlanarMotion",
+    "ExtendedMotion",
+    "InertialMotion",
     "LeftMatrix",
     "RightMatrix",
     "Conjugation",

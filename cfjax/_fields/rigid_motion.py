@@ -1,145 +1,39 @@
 """Rigid motions of space and of the plane: the Lie algebras se(3) and se(2)."""
 
 from dataclasses import KW_ONLY
-from functools import partial
 from typing import Any, ClassVar, Literal
 
 import equinox as eqx
 import jax.numpy as jnp
-from jaxtyping import Array, Bool, Float, Real
+from jaxtyping import Array, Float
 
-from .._field import AbstractAlgebraElement
 from .._numerics import planar_motion, rigid_motion
-from .._numerics.matmul import matmul
 from .._numerics.quaternion import Frame
-from .elementwise import check_other, check_point, check_real, each
+from .elementwise import check_point
+from .motion import AbstractFramedMotion
 
 Layout = Literal["wxyz_xyz", "xyz_xyzw", "xyzw_xyz", "xyz_wxyz"]
 PlanarLayout = Literal["unit_complex_xy", "xy_unit_complex"]
 
 
-class AbstractMotion(AbstractAlgebraElement):
-    """A motion of space or of the plane."""
+class AbstractPointMotion(AbstractFramedMotion):
+    """A motion of poses with a position, and of points."""
 
-    omega: eqx.AbstractVar[Array]
-    v: eqx.AbstractVar[Array]
-    frame: eqx.AbstractVar[Frame]
-    layout: eqx.AbstractVar[Any]
+    num_vectors: ClassVar[int] = 1
+    coordinates: ClassVar[tuple[str, ...]] = ("omega", "v")
 
-    dimension: ClassVar[int]
-    # A pose in one vector is a unit number of so many entries, and a position.
-    number: ClassVar[str]
-    number_size: ClassVar[int]
-    # The indices of the entries of the number, then of the position, in a pose in one vector.
-    layouts: ClassVar[dict[str, tuple[int, ...]]]
-    conventions: ClassVar[str]
-    # The module with its tangent, increment, bracket, dexpinv and has_dexpinv.
-    numerics: ClassVar[Any]
-
-    def __check_init__(self):
-        n = self.dimension
-        if self.v.ndim < 1 or self.v.shape[-1] != n:
-            raise ValueError(f"v must have shape ({n},) or (*batch, {n}), got {self.v.shape}.")
-        expected = self.v.shape if n == 3 else self.v.shape[:-1]
-        if self.omega.shape != expected:
+    def _check_point(self, point: Array) -> None:
+        axes, poses, core = self._num_axes, self._pose_shapes, (self.dimension,)
+        if self.frame == "body" and point.shape[axes:] == core:
             raise ValueError(
-                f"omega must have shape {expected} where v has {self.v.shape}, got "
-                f"{self.omega.shape}."
+                f'{type(self).__name__} with frame="body" moves poses, shapes {poses[0]} and '
+                f"{poses[1]}: a point has no frame of its own, got shape {point.shape}. Use "
+                'frame="fixed".'
             )
-        for name, x in (("omega", self.omega), ("v", self.v)):
-            check_real(name, x)
-        if self.omega.dtype != self.v.dtype:
-            raise TypeError(
-                f"omega and v must have one dtype, got {self.omega.dtype} and {self.v.dtype}."
-            )
-        if self.frame not in ("body", "fixed"):
-            raise ValueError(f'frame must be "body" or "fixed", got {self.frame!r}.')
-        if self.layout is not None and self.layout not in tuple(self.layouts):
-            raise ValueError(f"layout must be one of {tuple(self.layouts)}, got {self.layout!r}.")
-
-    def flow(self, point: Float[Array, "..."]) -> Float[Array, "..."]:
-        return point + self._each(partial(self.numerics.increment, leads_back=False), point)
-
-    def increment(self, point: Float[Array, "..."]) -> Float[Array, "..."]:
-        return self._each(partial(self.numerics.increment, leads_back=True), point)
-
-    def tangent(self, point: Float[Array, "..."]) -> Float[Array, "..."]:
-        return self._each(self.numerics.tangent, point)
-
-    def bracket(self, other: Any) -> "AbstractMotion":
-        return self._with(self.numerics.bracket, other)
-
-    def dexpinv(self, other: Any, degree: int) -> "AbstractMotion":
-        """Exact, whatever the degree, for angles below a full turn, whatever `v` is."""
-        return self._with(self.numerics.dexpinv, other)
-
-    def has_dexpinv(self) -> Bool[Array, ""]:
-        return self.numerics.has_dexpinv(self.omega)
-
-    def _with(self, fun: Any, other: Any) -> "AbstractMotion":
-        check_other(self, other)
-        if (other.frame, other.layout) != (self.frame, self.layout):
-            raise ValueError(
-                f"{type(self).__name__} has a bracket with a motion of the same frame and layout "
-                f"only, got frame={self.frame!r}, layout={self.layout!r} and "
-                f"frame={other.frame!r}, layout={other.layout!r}."
-            )
-        # In the frame of the body flows compose in the reverse order, as those of minus the motions
-        # in the fixed frame.
-        sign = 1 if self.frame == "fixed" else -1
-        fun = each(fun, self._num_axes)
-        omega, v = fun(sign * self.omega, sign * self.v, other.omega, other.v)
-        return type(self)(omega=omega, v=v, frame=self.frame, layout=self.layout)
-
-    def defect(self, point: Float[Array, "..."]) -> tuple[Real[Array, ""], str] | None:
-        n, core = self.dimension, point.shape[self._num_axes :]
-        if core == (n,):
-            return None
-        if len(core) == 2:
-            row = (0,) * n + (1,)
-            expected = f"a rotation, of determinant 1, before its last column and row {row}"
-            defect = each(_defect, self._num_axes)(point)
-        else:
-            indices = self._indices[: self.number_size]
-            end = "first" if 0 in indices else "last"
-            expected = f"{self.number} in its {end} {len(indices)} entries"
-            defect = jnp.abs(sum(point[..., k] ** 2 for k in indices) - 1)
-        return jnp.max(defect, initial=0), expected
-
-    @property
-    def _indices(self) -> tuple[int, ...]:
-        if self.layout is None:
-            raise TypeError(
-                f"{type(self).__name__} needs a layout for poses of shape "
-                f"({self.number_size + self.dimension},): {self.conventions}. There is no default, "
-                "as a wrong guess would go unnoticed."
-            )
-        return self.layouts[self.layout]
-
-    @property
-    def _num_axes(self) -> int:
-        return self.v.ndim - 1
-
-    def _each(self, fun: Any, point: Array) -> Array:
-        n, axes = self.dimension, self._num_axes
-        name, poses = type(self).__name__, [(n + 1, n + 1), (self.number_size + n,)]
-        if self.frame == "body" and point.shape[axes:] == (n,):
-            raise ValueError(
-                f'{name} with frame="body" moves poses, shapes {poses[0]} and {poses[1]}: a point '
-                f'has no frame of its own, got shape {point.shape}. Use frame="fixed".'
-            )
-        check_point(self, "v", axes, poses + [(n,)] * (self.frame == "fixed"), point)
-        if point.dtype != self.v.dtype:
-            raise TypeError(
-                f"{name} with v in {self.v.dtype} acts on points in {self.v.dtype}, got "
-                f"{point.dtype}."
-            )
-        is_vector = point.shape[axes:] == poses[1]
-        fun = partial(fun, frame=self.frame, indices=self._indices if is_vector else ())
-        return each(fun, axes)(self.omega, self.v, point)
+        check_point(self, self.vector, axes, poses + [core] * (self.frame == "fixed"), point)
 
 
-class RigidMotion(AbstractMotion):
+class RigidMotion(AbstractPointMotion):
     """A rigid motion of space: an angular velocity `omega` and a velocity `v`.
 
     It acts on
@@ -194,7 +88,7 @@ class RigidMotion(AbstractMotion):
         "xyzw_xyz": (3, 0, 1, 2, 4, 5, 6),
         "xyz_wxyz": (3, 4, 5, 6, 0, 1, 2),
     }
-    conventions: ClassVar[str] = (
+    layouts_in_words: ClassVar[str] = (
         'layout="wxyz_xyz" (a quaternion, then a position, as in jaxlie.SE3), '
         'layout="xyz_xyzw" (a position, then a quaternion, as in ROS geometry_msgs/Pose), '
         '"xyzw_xyz" or "xyz_wxyz"'
@@ -202,7 +96,7 @@ class RigidMotion(AbstractMotion):
     numerics: ClassVar[Any] = rigid_motion
 
 
-class PlanarMotion(AbstractMotion):
+class PlanarMotion(AbstractPointMotion):
     """A rigid motion of the plane: an angular velocity `omega` and a velocity `v`.
 
     It acts on
@@ -236,16 +130,8 @@ class PlanarMotion(AbstractMotion):
         "unit_complex_xy": (0, 1, 2, 3),
         "xy_unit_complex": (2, 3, 0, 1),
     }
-    conventions: ClassVar[str] = (
+    layouts_in_words: ClassVar[str] = (
         'layout="unit_complex_xy" (cosine and sine, then a position, as in jaxlie.SE2) or '
         'layout="xy_unit_complex" (a position first, as in Pinocchio\'s planar joint)'
     )
     numerics: ClassVar[Any] = planar_motion
-
-
-def _defect(matrix: Float[Array, "n n"]) -> Float[Array, ""]:
-    rotation, last = matrix[:-1, :-1], matrix[-1]
-    eye = jnp.eye(len(matrix), dtype=matrix.dtype)
-    gram = matmul(rotation.T, rotation)
-    defects = (gram - eye[:-1, :-1], jnp.linalg.det(rotation) - 1, last - eye[-1])
-    return jnp.max(jnp.asarray([jnp.max(jnp.abs(x)) for x in defects]))

@@ -3,10 +3,14 @@
 With a the matrix of the cross product with w, and Stumpff functions c_n of |w|^2,
 
     exp([[a, v], [0, 0]]) = [[R, V v], [0, 1]],  R = I + c_1 a + c_2 a^2,  V = I + c_2 a + c_3 a^2.
+
+`increments` takes several velocities too, for as many positions that turn together: see
+`extended_motion`.
 """
 
 import functools
-from collections.abc import Callable
+import itertools
+from collections.abc import Callable, Sequence
 from typing import Any
 
 import jax
@@ -31,7 +35,7 @@ def tangent(
 
     A pose in one vector has w, x, y, z of its quaternion and x, y, z of its position at `indices`.
     """
-    return _increment(entries(w), entries(v), x, frame, indices)
+    return increments(entries(w), [entries(v)], x, frame, indices)
 
 
 @functools.partial(jax.jit, static_argnames=("frame", "indices", "leads_back"))
@@ -48,17 +52,7 @@ def increment(
     If `leads_back`, it also corrects the length of a quaternion towards 1.
     """
     ws = entries(w)
-    if x.shape != (7,):
-        exponential = stumpff_1_to_3_apart(dot(ws, ws))
-        return _increment(ws, entries(v), x, frame, indices, exponential)
-    # A quaternion turns by half of the angle.
-    s = dot(half(ws), half(ws))
-    of_half = stumpff_1_to_3_apart(s)
-
-    def turn(q: Vector, velocity: Vector) -> Vector:
-        return of_half.turned(s, q, velocity, leads_back)
-
-    return _increment(ws, entries(v), x, frame, indices, _doubled(s, of_half), turn)
+    return increments(ws, [entries(v)], x, frame, indices, *exponential(ws, x, leads_back))
 
 
 @jax.jit
@@ -87,42 +81,85 @@ def dexpinv(
 has_dexpinv = rotate.has_dexpinv
 
 
-def _increment(
+# A quaternion and its velocity to its increment.
+Turn = Callable[[Vector, Vector], Vector]
+
+
+def exponential(w: Vector, x: Array, leads_back: bool) -> tuple[Exponential, Turn]:
+    """The exponential of w, and what turns the quaternion of a pose `x` in one vector."""
+    if x.ndim != 1 or x.shape == (3,):
+        return stumpff_1_to_3_apart(dot(w, w)), _velocity
+    s, of_half = half_exponential(w)
+    return doubled(s, of_half), turn_by(s, of_half, leads_back)
+
+
+def half_exponential(w: Vector) -> tuple[Array, Exponential]:
+    """The exponential of half of w, by which a quaternion turns, after the square of its angle."""
+    s = dot(half(w), half(w))
+    return s, stumpff_1_to_3_apart(s)
+
+
+def turn_by(s: Array, of_half: Exponential, leads_back: bool) -> Turn:
+    return lambda q, velocity: of_half.turned(s, q, velocity, leads_back)
+
+
+def _velocity(q: Vector, velocity: Vector) -> Vector:
+    return velocity
+
+
+def increments(
     w: Vector,
-    v: Vector,
+    vs: Sequence[Vector],
     x: Array,
     frame: str,
     indices: tuple[int, ...],
     exponential: Exponential | None = None,
-    turn: Callable[[Vector, Vector], Vector] = lambda q, velocity: velocity,
+    turn: Turn = _velocity,
 ) -> Array:
     """The increment of `x` in unit time, or its velocity if there is no exponential.
 
-    `turn` takes a quaternion and its velocity to its increment.
+    A pose has one position for each of the velocities `vs`: shape `(3 + k, 3 + k)` or
+    `(4 + 3 k,)`, in which the entries of the quaternion and of the positions are at `indices`.
     """
     if x.shape == (3,):
-        return pack(_along_screw(exponential, w, v, entries(x), 1), sums=True)
+        return pack(_along_screw(exponential, w, vs, entries(x), [1]), sums=True)
     if x.ndim == 1:
-        q, position = [x[k] for k in indices[:4]], [x[k] for k in indices[4:]]
+        q, *positions = pose_parts(x, indices)
         if frame == "fixed":
-            displacement = _along_screw(exponential, w, v, position, 1)
+            pairs = zip(vs, positions, strict=True)
+            displacements = [_along_screw(exponential, w, [v], y, [1]) for v, y in pairs]
         else:
-            displacement = _rotated(q, _of_origin(exponential, w, v))
+            displacements = [rotated(q, of_origin(exponential, w, v)) for v in vs]
         rotation = turn(q, product(half(w), q, frame))
-        return pack(placed([*rotation, *displacement], indices), sums=True)
+        return pose([rotation, *displacements], indices)
     if frame == "fixed":
-        *rows, last = entries(x)
-        displacement = _along_screw(exponential, w, v, rows, last)
-        return pack([*displacement, jnp.zeros_like(last)], sums=True)
-    *columns, _ = entries(x.T)
+        rows = entries(x)
+        displacement = _along_screw(exponential, w, vs, rows[:3], rows[3:])
+        return pack([*displacement, *(jnp.zeros_like(row) for row in rows[3:])], sums=True)
+    columns = entries(x.T)[:3]
+    rotation = of_columns(exponential, w, columns)
+    positions = [dot(columns, of_origin(exponential, w, v)) for v in vs]
+    return pack([*rotation, *positions], axis=1, sums=True)
+
+
+def pose_parts(x: Array, indices: tuple[int, ...]) -> list[Vector]:
+    """The quaternion and the positions of a pose in one vector."""
+    ends = [0, *range(4, len(indices) + 1, 3)]
+    return [[x[k] for k in indices[i:j]] for i, j in itertools.pairwise(ends)]
+
+
+def pose(parts: Sequence[Vector], indices: tuple[int, ...]) -> Array:
+    """The inverse of `pose_parts`."""
+    return pack(placed([a for part in parts for a in part], indices), sums=True)
+
+
+def of_columns(exponential: Exponential | None, w: Vector, columns: Vector) -> Vector:
+    """The increment of the columns of a rotation R to `R exp(a)`."""
     rotation = cross(columns, w)
-    if exponential is not None:
-        rotation = exponential.increment(rotation, cross(rotation, w))
-    position = dot(columns, _of_origin(exponential, w, v))
-    return pack([*rotation, position], axis=1, sums=True)
+    return rotation if exponential is None else exponential.increment(rotation, cross(rotation, w))
 
 
-def _doubled(s: Array, exponential: Exponential) -> Exponential:
+def doubled(s: Array, exponential: Exponential) -> Exponential:
     """The exponential of twice the angle, where s is the square of the angle.
 
     By `c_1(4s) = c_0 c_1`, `c_2(4s) = c_1^2 / 2` and `c_3(4s) = (c_2 + c_0 c_3) / 4`.
@@ -136,21 +173,29 @@ def _doubled(s: Array, exponential: Exponential) -> Exponential:
 
 
 def _along_screw(
-    exponential: Exponential | None, w: Vector, v: Vector, x: Vector, weight: Any
+    exponential: Exponential | None,
+    w: Vector,
+    vs: Sequence[Vector],
+    x: Vector,
+    weights: Sequence[Any],
 ) -> Vector:
-    """The increment of a point in homogeneous coordinates, the last of which is the weight.
+    """The increment of a point in homogeneous coordinates, which end with the weights of `vs`.
 
-    With the velocity u of the point it is `c_1 u + c_2 a u + c_3 (w . v) w`.
+    With the velocity u of the point it is `c_1 u + c_2 a u + c_3 (w . v) w`, where v is the sum of
+    the weighted `vs`.
     """
-    velocity = plus(cross(w, x), [weight * b for b in v])
+    pairs = list(zip(vs, weights, strict=True))
+    velocity = functools.reduce(plus, ([m * b for b in v] for v, m in pairs), cross(w, x))
     if exponential is None:
         return velocity
     displacement = exponential.increment(velocity, cross(w, velocity))
-    pitch = (exponential.c3 * dot(w, v)) * weight
-    return plus(displacement, [pitch * b for b in w])
+    for v, weight in pairs:
+        pitch = (exponential.c3 * dot(w, v)) * weight
+        displacement = plus(displacement, [pitch * b for b in w])
+    return displacement
 
 
-def _of_origin(exponential: Exponential | None, w: Vector, v: Vector) -> Vector:
+def of_origin(exponential: Exponential | None, w: Vector, v: Vector) -> Vector:
     """`V v`, the increment of the origin."""
     if exponential is None:
         return v
@@ -160,7 +205,7 @@ def _of_origin(exponential: Exponential | None, w: Vector, v: Vector) -> Vector:
     return plus(v, cross(w, bent))
 
 
-def _rotated(q: Vector, y: Vector) -> Vector:
+def rotated(q: Vector, y: Vector) -> Vector:
     """The vector `q y q*`."""
     p, *x = q
     along, across = 2 * dot(x, y), cross(x, y)

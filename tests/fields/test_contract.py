@@ -78,6 +78,13 @@ def screw(a, v):
     return m
 
 
+def extended(a, f, v, time=0):
+    """A screw with two vectors, the second of which may move with the first."""
+    m = np.zeros((5, 5), v.dtype)
+    m[:3, :3], m[:3, 3], m[:3, 4], m[3, 4] = a, f, v, time
+    return m
+
+
 def block_diagonal(a, b):
     return np.block([[a, np.zeros((len(a), len(b)))], [np.zeros((len(b), len(a))), b]])
 
@@ -184,6 +191,50 @@ CASES = {
         lambda x, omega, v: (
             block_diagonal(omega * TURN, omega * TURN),
             np.concatenate([v, 0 * x[2:]]),
+        ),
+    ),
+    "ExtendedMotion of matrices, body": Case(
+        partial(cfjax.ExtendedMotion, frame="body"),
+        lambda: unit(omega=normal(3), a=normal(3), v=normal(3)),
+        normal(5, 5),
+        lambda x, omega, a, v: (rows(extended(hat(omega), a, v), 5), 0),
+    ),
+    "ExtendedMotion of matrices, fixed": Case(
+        partial(cfjax.ExtendedMotion, frame="fixed"),
+        lambda: unit(omega=normal(3), a=normal(3), v=normal(3)),
+        normal(5, 5),
+        lambda x, omega, a, v: (columns(extended(hat(omega), a, v), 5), 0),
+    ),
+    "ExtendedMotion of a quaternion and two vectors": Case(
+        partial(cfjax.ExtendedMotion, frame="fixed", layout="p_wxyz_v"),
+        lambda: unit(omega=normal(3), a=normal(3), v=normal(3)),
+        np.concatenate([normal(3), unit(q=normal(4))["q"], normal(3)]),
+        lambda x, omega, a, v: (
+            block_diagonal(
+                block_diagonal(hat(omega), quaternions(hat(omega), omega) / 2), hat(omega)
+            ),
+            np.concatenate([v, 0 * x[3:7], a]),
+        ),
+    ),
+    "InertialMotion of matrices": Case(
+        cfjax.InertialMotion,
+        lambda: unit(
+            **{name: normal(3) for name in ("omega", "force", "gravity")},
+            time=normal(),
+            **{name: normal(3) for name in ("body_shift", "fixed_shift")},
+        ),
+        normal(5, 5),
+        # The last two rows are at rest.
+        lambda x, omega, force, gravity, time, body_shift, fixed_shift: (
+            block_diagonal(
+                rows(extended(hat(omega), force, body_shift, time), 3), np.zeros((10, 10))
+            ),
+            np.concatenate(
+                [
+                    np.column_stack([np.zeros((3, 3)), gravity, fixed_shift]).ravel(),
+                    np.zeros(10),
+                ]
+            ),
         ),
     ),
     "LeftMatrix": Case(
@@ -549,11 +600,17 @@ WITH_DEXPINV = {
     "RigidMotion of a point": True,
     "PlanarMotion of matrices, body": True,
     "PlanarMotion of a complex number and a position": True,
+    "ExtendedMotion of matrices, body": True,
+    "ExtendedMotion of a quaternion and two vectors": True,
+    "InertialMotion of matrices": False,
     "LeftMatrix": False,
     "RightMatrix": False,
     "LinearAffine": False,
     "Scaling": True,
 }
+
+
+SLOW_SERIES = ("InertialMotion of matrices", "LeftMatrix", "LinearAffine")
 
 
 def structure_constants(case):
@@ -597,10 +654,7 @@ def exact_dexpinv(constants, u, v):
 @pytest.mark.parametrize("dtype", [np.float32, np.float64])
 @pytest.mark.parametrize(
     "name",
-    [
-        pytest.param(name, marks=[pytest.mark.slow] * (name in ("LeftMatrix", "LinearAffine")))
-        for name in WITH_DEXPINV
-    ],
+    [pytest.param(name, marks=[pytest.mark.slow] * (name in SLOW_SERIES)) for name in WITH_DEXPINV],
 )
 def test_the_inverse_derivative_of_the_exponential(name, dtype):
     """And its first and second derivative, by differences of 50 digits."""
@@ -635,7 +689,7 @@ def test_the_inverse_derivative_of_the_exponential(name, dtype):
     found = everything(*sets[:2], sets[2], sets[3])
     constants = structure_constants(case)
     flat = [
-        [np.concatenate([np.ravel(x[k]) for x in s.values()]) for k in range(len(sizes))]
+        [np.concatenate([np.ravel(s[key][k]) for key in base]) for k in range(len(sizes))]
         for s in (*sets, *found)
     ]
     with mpmath.workdps(50):

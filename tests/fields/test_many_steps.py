@@ -38,6 +38,16 @@ def motion(frame: Any) -> Any:
     )
 
 
+def extended(frame: Any) -> Any:
+    return lambda angle, y: cfjax.ExtendedMotion(
+        omega=angle * AXIS, a=V, v=EDGE, frame=frame, layout="wxyz_v_p"
+    )
+
+
+def inertial(angle: Any, y: Any) -> Any:
+    return cfjax.InertialMotion(omega=angle * AXIS, force=V, gravity=-V, layout="wxyz_v_p")
+
+
 def planar(frame: Any) -> Any:
     return lambda angle, y: cfjax.PlanarMotion(
         omega=angle, v=V[:2], frame=frame, layout="unit_complex_xy"
@@ -79,6 +89,14 @@ CASES = {
     "quaternion, body": Case(quaternion("body", "xyzw"), Q, length),
     "pose, fixed": Case(motion("fixed"), np.r_[Q, PLACE], lambda x: length(x[:4])),
     "pose, body": Case(motion("body"), np.r_[Q, PLACE], lambda x: length(x[:4])),
+    "extended pose, body": Case(extended("body"), np.r_[Q, EDGE, PLACE], lambda x: length(x[:4])),
+    "inertial": Case(inertial, np.r_[Q, EDGE, PLACE], lambda x: length(x[:4])),
+    "inertial matrix": Case(
+        inertial,
+        np.r_[np.c_[np.eye(3), EDGE, PLACE], np.eye(5)[3:]],
+        lambda x: orthonormal(x[:3, :3]),
+        per_step=8,
+    ),
     "planar pose, fixed": Case(
         planar("fixed"), np.r_[0.6, 0.8, PLACE[:2]], lambda x: length(x[:2])
     ),
