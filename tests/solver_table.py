@@ -46,7 +46,7 @@ class Row(NamedTuple):
     - `order`: of an ordinary equation. `embedded`: that of its embedded method, or None.
     - `evaluations`: of the field in a step, with the estimate and without output within the step.
       Of the first term of a splitting, and of the drift beside noise. None where an iteration
-      decides. `first`: how many more the first step has.
+      decides. `first`: how many more the first step has, or the checks before it.
     - `output`: the uniform order of output within a step, where the solver promises one.
     - `takes`: any field; fields with brackets; fields of time only; `Lindblad` of time only; those
       with a linear part; those that move orthonormal columns; a sum of terms; or terms with noise.
@@ -104,7 +104,7 @@ SOLVERS = {
     "Magnus6": Row(cfjax.Magnus6, "Magnus", 6, 4, 4, 1, 5, "time only", True),
     "Magnus8": Row(cfjax.Magnus8, "Magnus", 8, 6, 6, 1, 7, "time only", True),
     "Magnus10": Row(cfjax.Magnus10, "Magnus", 10, 6, 8, 1, 9, "time only", True),
-    "Kraus4": Row(cfjax.Kraus4, "Kraus", 4, 3, 5, 0, 4, "density matrices"),
+    "Kraus4": Row(cfjax.Kraus4, "Kraus", 4, 3, 5, 1, 4, "density matrices"),
     "ETDRK4": Row(cfjax.ETDRK4, "exponential", 4, None, 4, 0, 3, "linear part"),
     "ETD43": Row(cfjax.ETD43, "exponential", 4, 3, 5, 1, 3, "linear part"),
     "ETD54": Row(cfjax.ETD54, "exponential", 5, 4, 8, 0, 4, "linear part"),

@@ -15,7 +15,7 @@ import cfjax
 ROWS = SOLVERS | COMMUTATOR_FREE | MUNTHE_KAAS
 by_name = pytest.mark.parametrize("name", ROWS)
 START = jnp.array([0.5, 0.7])
-DENSITY = jnp.eye(2) / 2 + 0j
+DENSITY = jnp.eye(2, dtype=complex) / 2
 
 
 def test_the_table_has_every_solver():

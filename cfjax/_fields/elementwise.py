@@ -38,7 +38,7 @@ def each(fun: Callable[..., PyTree], num_axes: int) -> Callable[..., PyTree]:
         forwarded: list[int | None] = []
         out_treedef: Any = None
 
-        def of_distinct(*elements: Array) -> list[Array]:
+        def of_distinct(*elements: Any) -> list[Any]:
             nonlocal forwarded, out_treedef
             args = treedef.unflatten([elements[index[id(x)]] for x in leaves])
             outputs, out_treedef = jtu.tree_flatten(inner(*args))

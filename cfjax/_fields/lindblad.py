@@ -239,7 +239,7 @@ def _rates(rates: Any, h: Array, m: int) -> Array:
     return array.reshape(*[1] * (num_axes + 1 - array.ndim), *array.shape)
 
 
-def _jump(k: int, jump: Any, h: Array) -> Matrix:
+def _jump(k: int, jump: Any, h: Array) -> Any:
     if not isinstance(jump, jax.Array | np.ndarray):
         raise TypeError(f"jumps[{k}] must be an array, got {describe(jump)}.")
     n, num_axes = h.shape[-1], h.ndim - 2

@@ -34,7 +34,7 @@ class Diagonals(eqx.Module):
 Matrix = Inexact[Array | np.ndarray, "n n"] | Diagonals
 
 
-def compact(a: Inexact[Array | np.ndarray, "n n"]) -> Matrix:
+def compact(a: Inexact[Array | np.ndarray, "*batch n n"]) -> Any:
     """The matrix by its diagonals, if these are few and known when the program is traced."""
     if isinstance(a, Tracer) or a.ndim != 2 or len(a) < _LEAST_ROWS:
         return a
