@@ -126,6 +126,12 @@ def test_the_derivative_in_the_loss():
     )
 
 
+def test_an_unstable_solve_has_no_error():
+    one, other = cat.y0(4), cat.y0(4)[::-1, ::-1]
+    np.testing.assert_allclose(cat.error(one, other), 2**0.5, rtol=1e-15)
+    assert np.isnan(cat.error(1e100 * one, other))
+
+
 def test_picture():
     figure = cat.picture()
     # Three maps, their colours, and a chart.
