@@ -45,7 +45,7 @@ class AbstractMotion(AbstractAlgebraElement):
     def tangent(self, point: Float[Array, "..."]) -> Float[Array, "..."]:
         return self._each(self.numerics.tangent, point)
 
-    def bracket(self, other: Any) -> "AbstractMotion":
+    def bracket(self, other: Any) -> Any:
         return self._with(self.numerics.bracket, other)
 
     def has_dexpinv(self) -> Bool[Array, ""]:
@@ -86,7 +86,7 @@ class AbstractMotion(AbstractAlgebraElement):
         if len(dtypes) > 1:
             raise TypeError(f"{_listed(arrays)} must have one dtype, got {_listed(dtypes)}.")
 
-    def _with(self, fun: Any, other: Any) -> "AbstractMotion":
+    def _with(self, fun: Any, other: Any) -> Any:
         check_other(self, other)
         mine, its = ({k: getattr(x, k) for k in self.conventions} for x in (self, other))
         if mine != its:
@@ -170,7 +170,7 @@ class AbstractFramedMotion(AbstractMotion):
             raise ValueError(f'frame must be "body" or "fixed", got {self.frame!r}.')
         self._check_layout()
 
-    def dexpinv(self, other: Any, degree: int) -> "AbstractMotion":
+    def dexpinv(self, other: Any, degree: int) -> Any:
         """Exact, whatever the degree, for angles below a full turn, whatever the velocities are."""
         return self._with(self.numerics.dexpinv, other)
 
