@@ -81,45 +81,35 @@ class AbstractStabilised(AbstractChartSolver, diffrax.AbstractAdaptiveSolver):
     and for terms that a path drives.
     """
 
-    stages: int | None = eqx.field(static=True)
-    spectral_radius: Any
-    max_stages: int = eqx.field(static=True)
+    stages: int | None = eqx.field(static=True, default=None)
+    spectral_radius: float | Callable[[Any, PyTree, PyTree], Any] | None = eqx.field(
+        default=None, kw_only=True
+    )
+    max_stages: int = eqx.field(static=True, default=200, kw_only=True)
     # The length of the step at hand times the radius, where that decides. NaN if it is too large.
-    stiffness: Real[Array, ""] | None
+    stiffness: Real[Array, ""] | None = eqx.field(default=None, init=False)
 
     # Twice the index of the Gegenbauer polynomials.
     twice_index: eqx.AbstractClassVar[int]
     # Of the combination of the elements of a step that leads to points within it.
     continuous_extension: eqx.AbstractClassVar[ContinuousExtension]
 
-    def __init__(
-        self,
-        stages: int | None = None,
-        *,
-        spectral_radius: float | Callable[[Any, PyTree, PyTree], Any] | None = None,
-        max_stages: int = 200,
-    ):
-        for name, value in (("stages", stages), ("max_stages", max_stages)):
+    def __check_init__(self):
+        for name, value in (("stages", self.stages), ("max_stages", self.max_stages)):
             if value is None and name == "stages":
                 continue
             if not isinstance(value, int) or isinstance(value, bool):
                 raise TypeError(f"{name} must be an int, got {value!r}.")
             if value < 3:
                 raise ValueError(f"{name} must be at least 3, got {value}.")
-        if stages is not None and spectral_radius is not None:
+        radius = self.spectral_radius
+        if self.stages is not None and radius is not None:
             raise ValueError(
                 "stages and spectral_radius must not be given together, as the radius decides "
-                f"how many stages a step has: got {stages} and {spectral_radius!r}."
+                f"how many stages a step has: got {self.stages} and {radius!r}."
             )
-        if (
-            isinstance(spectral_radius, int | float | np.generic)
-            and not float(spectral_radius) >= 0
-        ):
-            raise ValueError(f"spectral_radius must not be negative, got {spectral_radius}.")
-        self.stages = stages
-        self.spectral_radius = spectral_radius
-        self.max_stages = max_stages
-        self.stiffness = None
+        if isinstance(radius, int | float | np.generic) and not float(radius) >= 0:
+            raise ValueError(f"spectral_radius must not be negative, got {radius}.")
 
     @abc.abstractmethod
     def elements(self, chart: Chart) -> "_Elements":
