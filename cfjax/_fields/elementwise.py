@@ -33,7 +33,10 @@ def each(fun: Callable[..., PyTree], num_axes: int) -> Callable[..., PyTree]:
         if len(lengths - {1}) > 1:
             raise ValueError(f"The leading axes must agree or be 1, got lengths {sorted(lengths)}.")
         axes = [None if len(lengths) > 1 and x.shape[0] == 1 else 0 for x in distinct]
-        operands = [x[0] if axis is None else x for x, axis in zip(distinct, axes, strict=True)]
+        # Those that `jax.vmap` has returned may be of NumPy.
+        operands = [
+            jnp.asarray(x[0] if axis is None else x) for x, axis in zip(distinct, axes, strict=True)
+        ]
         # For each output the operand that it is, or None.
         forwarded: list[int | None] = []
         out_treedef: Any = None

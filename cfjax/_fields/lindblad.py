@@ -25,7 +25,7 @@ from .._numerics.transforms import DTYPES
 from .elementwise import check_point, each
 
 # Up to so many levels the exponential of a matrix of n^2 x n^2 numbers is faster, as measured.
-_MOST_LEVELS_OF_MATRIX = 4
+_MOST_LEVELS_OF_MATRIX = 5
 
 
 class Lindblad(AbstractFrozenField):
@@ -58,7 +58,7 @@ class Lindblad(AbstractFrozenField):
 
     It acts on `(*batch, n, n)`, complex. An axis of 1 is broadcast.
 
-    **Cost:** Up to n = 4 a flow takes one exponential of a matrix of size n^2. Otherwise it takes
+    **Cost:** Up to n = 5 a flow takes one exponential of a matrix of size n^2. Otherwise it takes
     products of size n, `1 + 2 m` for each term of a series: 25 terms for a norm of 2.4 and 10 for
     each unit beyond, or 2.4 where damping is weak, less than some 0.5 for 28 of the norm. The norm
     is at most twice that of h and of `sum_k rates_k L_k^H L_k`. So stiff dissipation takes long:
@@ -157,9 +157,7 @@ class Lindblad(AbstractFrozenField):
             field = eqx.tree_at(lambda f: (f.h, f.rates, f.jumps), self, (h, rates, tuple(jumps)))
             return fun(field, x)
 
-        # `jax.vmap` may have returned arrays of NumPy.
-        arrays = jtu.tree_map(jnp.asarray, (self.h, self.rates, own, point))
-        return each(of_one, num_axes)(*arrays)
+        return each(of_one, num_axes)(self.h, self.rates, own, point)
 
     def _right_hand_side(self) -> Callable[[Array], Array]:
         """The velocity at a Hermitian matrix."""

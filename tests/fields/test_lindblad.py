@@ -680,12 +680,13 @@ def test_derivatives_through_a_solve(n):
 
     forward, pulled = found(p, way)
     # Truncation h^4 and rounding eps / h.
-    want = central_difference(jax.jit(value), p, way, 1e-3)
+    compiled = jax.jit(value)
+    want = float(central_difference(compiled, p, way, 1e-3))
     assert forward == pytest.approx(want, rel=1e-9, abs=1e-9)
     assert inner(pulled, way) == pytest.approx(float(forward), rel=1e-12)
     for name in p:
         part = {k: way[k] if k == name else jax.tree.map(jnp.zeros_like, way[k]) for k in way}
-        want = central_difference(jax.jit(value), p, part, 1e-3)
+        want = float(central_difference(compiled, p, part, 1e-3))
         assert inner(pulled[name], way[name]) == pytest.approx(want, rel=1e-9, abs=1e-9)
 
 
@@ -729,6 +730,8 @@ def saved(ts, args):
     ).ys
 
 
+# That of `diffrax`.
+@pytest.mark.filterwarnings("ignore:Complex dtype support")
 def test_derivatives_by_times_of_output():
     ts, args, w = jnp.asarray([0.23, 0.61]), jnp.asarray(1.0), random((2, 3, 3), 4, complex)
 
