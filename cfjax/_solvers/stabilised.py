@@ -116,6 +116,13 @@ class AbstractStabilised(AbstractChartSolver, diffrax.AbstractAdaptiveSolver):
             and not float(spectral_radius) >= 0
         ):
             raise ValueError(f"spectral_radius must not be negative, got {spectral_radius}.")
+        is_array = isinstance(spectral_radius, jax.Array) and not spectral_radius.shape
+        is_number = is_array or isinstance(spectral_radius, int | float | np.generic)
+        if spectral_radius is not None and not is_number and not callable(spectral_radius):
+            raise TypeError(
+                "spectral_radius must be a number, a function (t, y, args) or None, got "
+                f"{spectral_radius!r}."
+            )
         self.stages = stages
         self.spectral_radius = spectral_radius
         self.max_stages = max_stages
@@ -162,12 +169,11 @@ class AbstractStabilised(AbstractChartSolver, diffrax.AbstractAdaptiveSolver):
 
     def _start(self, terms, t0, t1, y0, args) -> tuple[_State, Fault]:
         state, fault = super().start(terms, t0, t1, y0, args)
-        if callable(self.spectral_radius):
+        if self.spectral_radius is not None:
             radius = self._radius(terms, t0, y0, args, None)
             fault = fault.with_case(
                 ~(radius >= 0),
-                "spectral_radius must not be negative, and returned a negative number or NaN for "
-                "the start.",
+                "spectral_radius must not be negative, got a negative number or NaN at the start.",
             )
         iteration = None
         if self.stages is None and self.spectral_radius is None:
