@@ -853,9 +853,20 @@ def test_both_modes_through_given_stages(name):
 @pytest.mark.parametrize("radius", [None, 50.0])
 def test_forward_mode_through_chosen_stages_names_what_has_it(radius):
     end = end_of_stiff(cfjax.RKL2(spectral_radius=radius))
-    for run in (lambda: jax.jvp(end, (5.0,), (1.0,)), lambda: jax.jit(jax.jacfwd(end))(5.0)):
+
+    def slope(rate):
+        return jax.jvp(end, (rate,), (1.0,))[1]
+
+    for run in (slope, jax.jit(slope)):
         with pytest.raises(TypeError, match=r"Forward mode needs .*RKL2\(stages=9\)"):
-            run()
+            run(5.0)
+    # JAX's own words come first in a batch of directions.
+    with pytest.raises(TypeError, match=r"(?i)forward.mode"):
+        jax.jacfwd(end)(5.0)
+    # Batches of reverse mode have nothing to do with that.
+    rates = jnp.array([3.0, 5.0])
+    found = jax.jit(jax.grad(lambda rates: jnp.sum(jax.vmap(end)(rates))))(rates)
+    np.testing.assert_allclose(found, jax.jit(jax.vmap(jax.grad(end)))(rates), rtol=1e-12)
 
 
 # Errors in words
@@ -876,6 +887,7 @@ def test_forward_mode_through_chosen_stages_names_what_has_it(radius):
     ],
 )
 @names
+@pytest.mark.usefixtures("no_shape_hook")
 def test_arguments_that_are_refused(name, error, match, kwargs):
     with pytest.raises(error, match=match):
         SOLVERS[name](**kwargs)
@@ -892,19 +904,21 @@ def test_a_radius_of_a_function_that_is_negative_or_nan_is_an_error(radius):
 
 A = np.random.default_rng(0).normal(size=(6, 6))
 COLUMNS = np.linalg.qr(A[:, :2])[0]
+UNIT = COLUMNS[:, 0]
+INSTEAD = "LeftMatrix.*BorderedSkew"
 REFUSED = {
-    "LowRankSkew": (lambda t, y, args: cfjax.LowRankSkew(A @ y), COLUMNS, "LeftMatrix.*BorderedSkew"),
-    "SphereRotation": (
-        lambda t, y, args: cfjax.SphereRotation(A @ y), COLUMNS[:, 0], "LeftMatrix.*BorderedSkew",
-    ),
-    "Affine": (
-        lambda t, y, args: cfjax.Affine(-jnp.ones(6), b=0 * y, spectrum=None), COLUMNS[:, 0], "ETD54",
+    "LowRankSkew": (lambda t, y, args: cfjax.LowRankSkew(A @ y), COLUMNS, INSTEAD),
+    "SphereRotation": (lambda t, y, args: cfjax.SphereRotation(A @ y), UNIT, INSTEAD),
+    "Affine": (lambda t, y, args: cfjax.Affine(-1.0, 0 * y, np.ones(6)), UNIT, "ETD54"),
+    "LinearAffine": (
+        lambda t, y, args: cfjax.LinearAffine(-jnp.eye(6), 0 * y), UNIT, "ETD54",
     ),
 }  # fmt: skip
 
 
 @pytest.mark.parametrize("kind", REFUSED)
 @names
+@pytest.mark.usefixtures("no_shape_hook")
 def test_fields_whose_sums_grow_are_refused(name, kind):
     field, y0, match = REFUSED[kind]
     for solver in (SOLVERS[name](), SOLVERS[name](5)):
@@ -935,7 +949,7 @@ def test_terms_that_a_path_drives_are_refused():
     path = diffrax.VirtualBrownianTree(0.0, 1.0, 1e-3, (), jax.random.key(0))
     noise = cfjax.LieControlTerm(lambda t, y, args, dw: y * dw, path)
     terms = diffrax.MultiTerm(cfjax.LieTerm(lambda t, y, args: -y), noise)
-    with pytest.raises(TypeError, match="ordinary differential equations.*CF4"):
+    with pytest.raises(TypeError, match=r"ordinary differential equations.*CF4"):
         cfjax.integrate(terms, cfjax.RKL2(5), 0.0, 1.0, jnp.ones(2), num_steps=2)
 
 
