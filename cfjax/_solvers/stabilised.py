@@ -71,8 +71,9 @@ class AbstractStabilised(AbstractChartSolver, diffrax.AbstractAdaptiveSolver):
       the stages.
 
     Output within a step has order 2 and stays on the manifold. The last evaluation of a step is the
-    first one of the next. A step keeps six arrays like the state, or eight for `RKL3`, whatever
-    the number of stages. Reverse mode works by checkpoints; forward mode needs `stages`, as it has
+    first one of the next. Besides what an evaluation takes, a step keeps six arrays like
+    the state, or eleven for `RKL3`, whatever the number of stages; with an estimated radius one
+    more. Reverse mode works by checkpoints; forward mode needs `stages`, as it has
     no rule for a loop whose length is chosen.
 
     **Raises** `TypeError` or `ValueError` for an argument of another kind or value, or `stages`
@@ -236,7 +237,6 @@ class AbstractStabilised(AbstractChartSolver, diffrax.AbstractAdaptiveSolver):
     def _element(self, chart: Chart, first: PyTree, point: PyTree, part: "_Part") -> PyTree:
         """The element that leads from a point with the field `first` over a part of the step."""
         l = self.twice_index  # noqa: E741
-        scaled = combine((part.length,), (first,))
         # An impossible step has zeros and no stage, so that its derivative is finite.
         is_possible = part.number == part.number
         number = part.number if self.stages else jnp.where(is_possible, part.number, 3)
@@ -245,8 +245,8 @@ class AbstractStabilised(AbstractChartSolver, diffrax.AbstractAdaptiveSolver):
             u, u_before, time, time_before = carry
             field = chart.field(part.start + part.length * time, chart.flow(u, point), [first])
             mu, nu, of_field, of_first = _weights(j, number, l, part.ratio)
-            weights = mu, nu, of_field * part.length, of_first
-            new = combine(weights, (u, u_before, cast_like(first, field), scaled))
+            weights = mu, nu, of_field * part.length, of_first * part.length
+            new = combine(weights, (u, u_before, cast_like(first, field), first))
             new_time = mu * time + nu * time_before + of_field + of_first
             return cast_like(first, new), u, new_time, time
 
@@ -254,7 +254,7 @@ class AbstractStabilised(AbstractChartSolver, diffrax.AbstractAdaptiveSolver):
         w = (l + 1) / (2 * (l + 2)) * part.ratio * _slope(number, l)
         w = jnp.where(is_possible, w if self.stages is None else jnp.asarray(w, float), 0.0)
         zero = jnp.zeros_like(w)
-        carry = combine((w,), (scaled,)), combine((zero,), (first,)), w, zero
+        carry = combine((w * part.length,), (first,)), combine((zero,), (first,)), w, zero
         if self.stages is not None:
             turns = np.arange(2.0, part.number + 1)
             (u, *_), _ = over_stages(lambda carry, j: (stage(j, carry), None), carry, turns)

@@ -461,7 +461,6 @@ def test_error_over_tolerance_by_exact_answers(problem, name):
     for tolerance in (1e-3, 1e-4, 1e-5):
         y, steps = run(jnp.asarray(tolerance))
         errors.append(np.abs(np.asarray(y) - answer).max())
-        print(problem, name, tolerance, errors[-1] / tolerance, steps)
         assert low < errors[-1] / tolerance < high
         # As rounding adds up over the steps.
         assert distance_from_manifold(problem, y) < 1e-14 * (10 + steps)
@@ -994,6 +993,6 @@ def test_memory_does_not_depend_on_the_stages(name):
         used(SOLVERS[name](*args, **kwargs))
         for args, kwargs in [((9,), {}), ((41,), {}), ((), dict(spectral_radius=100.0))]
     )
-    print(few, many, chosen)
     assert many < few + 0.1
-    assert max(few, chosen) < (8.5 if name == "RKL3" else 6.5)
+    # One more for an evaluation; elements of parts, and where the second half starts.
+    assert max(few, chosen) < (12.5 if name == "RKL3" else 7.5)
