@@ -1,11 +1,13 @@
 """The spectral radius of a field on a manifold, by power iteration."""
 
+import math
 from typing import Any
 
 import diffrax
 import jax
 import jax.numpy as jnp
 import jax.tree_util as jtu
+import numpy as np
 from jax import lax
 from jaxtyping import Array, PyTree, Real
 
@@ -36,12 +38,22 @@ def spectral_radius(
 def start_vector(y: PyTree) -> PyTree:
     """A vector of length one, shaped like the state, with a part in every direction."""
     leaves, treedef = jtu.tree_flatten(y)
-    keys = jax.random.split(jax.random.key(0), max(len(leaves), 1))
-    random = [
-        jax.random.normal(key, jnp.shape(x), jnp.result_type(x))
-        for key, x in zip(keys, leaves, strict=False)
-    ]
+    random = []
+    for k, x in enumerate(leaves):
+        shape, dtype = jnp.shape(x), jnp.finfo(x.dtype).dtype
+        real = _noise(shape, dtype, 2 * k)
+        is_complex = jnp.iscomplexobj(x)
+        random.append(lax.complex(real, _noise(shape, dtype, 2 * k + 1)) if is_complex else real)
     return _normalised(treedef.unflatten(random))[1]
+
+
+def _noise(shape: tuple[int, ...], dtype: Any, seed: int) -> Array:
+    """Numbers between -1 and 1, by the last rounds of MurmurHash3: its program is a short one."""
+    n = math.prod(shape)
+    x = lax.iota(jnp.uint32, n).reshape(shape) + np.uint32((seed + 1) * 0x9E3779B9 % 2**32)
+    for shift, factor in ((16, 0x85EBCA6B), (13, 0xC2B2AE35), (16, 1)):
+        x = (x ^ (x >> np.uint32(shift))) * np.uint32(factor)
+    return x.astype(dtype) / 2**31 - 1
 
 
 def iterated(

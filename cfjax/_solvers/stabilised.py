@@ -23,7 +23,7 @@ from .._fields.semilinear import AbstractSemilinearField
 from .._methods.tableau import ContinuousExtension
 from .._numerics.checks import Fault
 from .base import State
-from .compiled import over_stages
+from .compiled import chosen, over_stages, scan_list
 from .dense import Path
 from .spectral_radius import FIRST_ITERATIONS, iterated, start_vector
 from .stacked import cast_like
@@ -71,8 +71,9 @@ class AbstractStabilised(AbstractChartSolver, diffrax.AbstractAdaptiveSolver):
       the stages.
 
     Output within a step has order 2 and stays on the manifold. The last evaluation of a step is the
-    first one of the next. A step keeps six arrays like the state, or eight for `RKL3`, whatever
-    the number of stages. Reverse mode works by checkpoints; forward mode needs `stages`, as it has
+    first one of the next. Besides what an evaluation takes, a step keeps six arrays like
+    the state, or eleven for `RKL3`, whatever the number of stages; with an estimated radius one
+    more. Reverse mode works by checkpoints; forward mode needs `stages`, as it has
     no rule for a loop whose length is chosen.
 
     **Raises** `TypeError` or `ValueError` for an argument of another kind or value, or `stages`
@@ -107,6 +108,13 @@ class AbstractStabilised(AbstractChartSolver, diffrax.AbstractAdaptiveSolver):
             raise ValueError(
                 "stages and spectral_radius must not be given together, as the radius decides "
                 f"how many stages a step has: got {self.stages} and {radius!r}."
+            )
+        is_array = isinstance(radius, jax.Array) and not radius.shape
+        is_number = is_array or isinstance(radius, int | float | np.generic)
+        if radius is not None and not is_number and not callable(radius):
+            raise TypeError(
+                "spectral_radius must be a number, a function (t, y, args) or None, got "
+                f"{radius!r}."
             )
         if isinstance(radius, int | float | np.generic) and not float(radius) >= 0:
             raise ValueError(f"spectral_radius must not be negative, got {radius}.")
@@ -152,12 +160,11 @@ class AbstractStabilised(AbstractChartSolver, diffrax.AbstractAdaptiveSolver):
 
     def _start(self, terms, t0, t1, y0, args) -> tuple[_State, Fault]:
         state, fault = super().start(terms, t0, t1, y0, args)
-        if callable(self.spectral_radius):
+        if self.spectral_radius is not None:
             radius = self._radius(terms, t0, y0, args, None)
             fault = fault.with_case(
                 ~(radius >= 0),
-                "spectral_radius must not be negative, and returned a negative number or NaN for "
-                "the start.",
+                "spectral_radius must not be negative, got a negative number or NaN at the start.",
             )
         iteration = None
         if self.stages is None and self.spectral_radius is None:
@@ -209,47 +216,37 @@ class AbstractStabilised(AbstractChartSolver, diffrax.AbstractAdaptiveSolver):
         )
         return Step(y1, path, error, value)
 
-    def _number(self, length: float) -> tuple[Any, Any]:
-        """How many stages such a part of the step has, and whether it is possible."""
+    def _number(self, length: float) -> Any:
+        """How many stages such a part of the step has: NaN if it is impossible."""
         l = self.twice_index  # noqa: E741
         if self.stages is None:
-            number = _stages_for(length * cast(Array, self.stiffness), l)
-            is_possible = ~jnp.isnan(number)
-            return jnp.where(is_possible, number, 3), is_possible
+            return _stages_for(length * cast(Array, self.stiffness), l)
         # As many as reach as far, in a part of it.
-        return self.stages if length == 1 else _stages_for(length * _reach(self.stages, l), l), True
+        return self.stages if length == 1 else _stages_for(length * _reach(self.stages, l), l)
 
-    def _element(
-        self,
-        chart: Chart,
-        first: PyTree,
-        point: PyTree,
-        c: float = 0.0,
-        length: float = 1.0,
-        ratio: Any = 1.0,
-    ) -> PyTree:
-        """The element that leads from a point, at time c and with the field `first`, over such a
-        part of the step. The first stage is at `ratio` times its usual time.
-        """
+    def _element(self, chart: Chart, first: PyTree, point: PyTree, part: "_Part") -> PyTree:
+        """The element that leads from a point with the field `first` over a part of the step."""
         l = self.twice_index  # noqa: E741
-        first = _times(length, first)
-        number, is_possible = self._number(length)
+        # An impossible step has zeros and no stage, so that its derivative is finite.
+        is_possible = part.number == part.number
+        number = part.number if self.stages else jnp.where(is_possible, part.number, 3)
 
         def stage(j: Any, carry: Any) -> Any:
             u, u_before, time, time_before = carry
-            field = chart.field(c + length * time, chart.flow(u, point), [chart.first_field])
-            weights = _weights(j, number, l, ratio)
-            new = combine(weights, (u, u_before, cast_like(first, _times(length, field)), first))
-            new_time = weights[0] * time + weights[1] * time_before + weights[2] + weights[3]
+            field = chart.field(part.start + part.length * time, chart.flow(u, point), [first])
+            mu, nu, of_field, of_first = _weights(j, number, l, part.ratio)
+            weights = mu, nu, of_field * part.length, of_first * part.length
+            new = combine(weights, (u, u_before, cast_like(first, field), first))
+            new_time = mu * time + nu * time_before + of_field + of_first
             return cast_like(first, new), u, new_time, time
 
-        # The time of the first stage, and the weight of the first field there. An impossible step
-        # has zeros and no stage, so that its derivative is finite.
-        w = jnp.where(is_possible, (l + 1) / (2 * (l + 2)) * ratio * _slope(number, l), 0.0)
+        # The time of the first stage, and the weight of the first field there.
+        w = (l + 1) / (2 * (l + 2)) * part.ratio * _slope(number, l)
+        w = jnp.where(is_possible, w if self.stages is None else jnp.asarray(w, float), 0.0)
         zero = jnp.zeros_like(w)
-        carry = combine((w,), (first,)), combine((zero,), (first,)), w, zero
+        carry = combine((w * part.length,), (first,)), combine((zero,), (first,)), w, zero
         if self.stages is not None:
-            turns = np.arange(2.0, number + 1)
+            turns = np.arange(2.0, part.number + 1)
             (u, *_), _ = over_stages(lambda carry, j: (stage(j, carry), None), carry, turns)
             return u
         # A loop of no more turns than there are stages.
@@ -261,6 +258,15 @@ class AbstractStabilised(AbstractChartSolver, diffrax.AbstractAdaptiveSolver):
             kind="checkpointed",
         )
         return u
+
+
+class _Part(NamedTuple):
+    """A part of a step, with so many stages, of which the first is at `ratio` times its time."""
+
+    number: Any
+    start: Any = 0.0
+    length: Any = 1.0
+    ratio: Any = 1.0
 
 
 class _Elements(NamedTuple):
@@ -289,7 +295,7 @@ class _OneElement(AbstractStabilised):
 
     def elements(self, chart):
         first = chart.first_field
-        u = self._element(chart, first, chart.start)
+        u = self._element(chart, first, chart.start, _Part(self._number(1.0)))
         return _Elements([u], lambda last: combine((-0.8, 0.4, 0.4), (u, first, last)))
 
 
@@ -354,22 +360,39 @@ class RKL3(AbstractStabilised):
 
     def elements(self, chart):
         first, start = chart.first_field, chart.start
-        (s, _), (m, _) = self._number(1.0), self._number(0.5)
+        s, m = self._number(1.0), self._number(0.5)
         # c is -(1 + 2 w) / 18, and d is -3 b_1 times what follows.
-        ws, wm = (_slope(number, 1) for number in (s, m))
+        ws, wm = _slope(s, 1), _slope(m, 1)
         ds, dm = (
-            w**2
-            * (digamma(jnp.asarray(number + 1, float)) + np.euler_gamma - 1)
-            / (number**2 + number)
+            w**2 * (_harmonic(number) - 1) / (number**2 + number)
             for w, number in ((ws, s), (wm, m))
         )
         r = (1 + 2 * wm) / (1 + 2 * ws)
         a, ratio = 4 / (4 - r), r * ds / dm
-        u = self._element(chart, first, start)
-        v1 = self._element(chart, first, start, 0.0, 0.5, ratio)
-        middle = chart.flow(v1, start)
-        field = chart.field(0.5, middle, [first])
-        v2 = self._element(chart, field, middle, 0.5, 0.5, ratio)
+
+        def element(carry: Any, x: tuple[Any, _Part]) -> Any:
+            (first_there, point), (is_followed, part) = carry, x
+            if self.stages is None:
+                part = _Part(*(x.astype(s.dtype) for x in part))
+            else:
+                part = part._replace(number=m)
+            v = self._element(chart, first_there, point, part)
+
+            def after() -> Any:
+                middle = chart.flow(v, point)
+                return cast_like(first, chart.field(0.5, middle, [first])), middle
+
+            return chosen(is_followed, after, lambda: (first, start)), v
+
+        # One program for all elements whose number of stages may be traced.
+        halves = [_Part(m, 0.0, 0.5, ratio), _Part(m, 0.5, 0.5, ratio)]
+        if self.stages is None:
+            parts = zip((True, False, False), (*halves, _Part(s)), strict=True)
+            _, (v1, v2, u) = scan_list(element, (first, start), list(parts))
+        else:
+            parts = zip((True, False), halves, strict=True)
+            _, (v1, v2) = scan_list(element, (first, start), list(parts))
+            u = self._element(chart, first, start, _Part(s))
         weights = a / 2 + 2 / 3, a / 2 - 2 / 3, (1 - a) / 2
         flows = [combine(weights, (v1, v2, u)), combine(weights, (v2, v1, u))]
         error = combine((a - 1, a - 1, 1 - a), (v1, v2, u))
@@ -395,10 +418,6 @@ def _check_fields(solver: AbstractStabilised, chart: Chart) -> None:
         )
 
 
-def _times(length: float, field: PyTree) -> PyTree:
-    return field if length == 1 else combine((length,), (field,))
-
-
 def _weights(j: Any, s: Any, l: int, ratio: Any) -> tuple[Any, Any, Any, Any]:  # noqa: E741
     """Those of the two elements before, the field there and the first field, in stage j of s."""
 
@@ -410,6 +429,12 @@ def _weights(j: Any, s: Any, l: int, ratio: Any) -> tuple[Any, Any, Any, Any]:  
     nu = -(j - 1) / (j + l - 1) * b(j) / b(j - 2)
     of_field = mu * _slope(s, l)
     return mu, nu, of_field, (b(j - 1) - 1) * of_field
+
+
+def _harmonic(s: Any) -> Any:
+    if isinstance(s, int):
+        return float(np.sum(1 / np.arange(1, s + 1)))
+    return digamma(s + 1) + np.euler_gamma
 
 
 def _slope(s: Any, l: int) -> Any:  # noqa: E741

@@ -7,13 +7,16 @@ import jax
 import jax.numpy as jnp
 import mpmath
 import numpy as np
+import optimistix as optx
 import problems
 import pytest
 from solver_table import solvers
 
 import cfjax
+from cfjax.scenes import wilson_flow
 
 SOLVERS = {name: getattr(cfjax, name) for name in solvers("stabilised")}
+SOLVERS_ROWS = solvers("stabilised")
 names = pytest.mark.parametrize("name", SOLVERS)
 # Twice the index of the Gegenbauer polynomials.
 INDEX = {"RKL2": 1, "RKG2": 3, "RKL3": 1}
@@ -284,15 +287,16 @@ def test_order_on_a_dictionary_of_rotations_and_an_array(flight_problem, name, s
 
 def diffusion(n):
     """Between cells with conductivity i (n - i): the modes are discrete Legendre polynomials, with
-    rates k (k + 1). In two dimensions, along both axes.
+    rates k (k + 1). Along all axes, each of n cells.
     """
     k = np.arange(1, n) * (n - np.arange(1, n))
 
     def along(y, axis):
-        flux = jnp.asarray(k, float)[:, None] * jnp.diff(jnp.moveaxis(y, axis, 0), axis=0)
-        return jnp.moveaxis(jnp.diff(jnp.pad(flux, ((1, 1), (0, 0))), axis=0), 0, axis)
+        flux = jnp.asarray(k, float) * jnp.diff(jnp.moveaxis(y, axis, -1))
+        zeros = [(0, 0)] * (y.ndim - 1)
+        return jnp.moveaxis(jnp.diff(jnp.pad(flux, [*zeros, (1, 1)])), -1, axis)
 
-    return lambda t, y, args: along(y, 0) + along(y, 1)
+    return lambda t, y, args: sum(along(y, axis) for axis in range(y.ndim))
 
 
 def legendre_mode(n, k):
@@ -418,17 +422,19 @@ PROBLEMS = {
 
 
 def solve(field, solver, t1, y0, args=None, tolerance=1e-5, **options):
-    return diffrax.diffeqsolve(
-        cfjax.LieTerm(field),
-        solver,
-        0.0,
-        t1,
-        t1 / 1000,
-        y0,
-        args,
-        stepsize_controller=diffrax.PIDController(rtol=0.0, atol=tolerance),
-        **{"max_steps": 10_000, **options},
-    )
+    # diffrax's control of complex states asks for it.
+    with jax.numpy_dtype_promotion("standard"):
+        return diffrax.diffeqsolve(
+            cfjax.LieTerm(field),
+            solver,
+            0.0,
+            t1,
+            t1 / 1000,
+            y0,
+            args,
+            stepsize_controller=diffrax.PIDController(rtol=0.0, atol=tolerance),
+            **{"max_steps": 10_000, **options},
+        )
 
 
 def distance_from_manifold(name, y):
@@ -440,6 +446,7 @@ def distance_from_manifold(name, y):
 
 
 @pytest.mark.parametrize("name", ["RKL2", "RKL3", pytest.param("RKG2", marks=pytest.mark.slow)])
+@pytest.mark.filterwarnings("ignore:Complex dtype support in Diffrax")
 @pytest.mark.parametrize("problem", PROBLEMS)
 def test_error_over_tolerance_by_exact_answers(problem, name):
     field, y0, args, t1, answer = PROBLEMS[problem]()
@@ -454,8 +461,538 @@ def test_error_over_tolerance_by_exact_answers(problem, name):
     for tolerance in (1e-3, 1e-4, 1e-5):
         y, steps = run(jnp.asarray(tolerance))
         errors.append(np.abs(np.asarray(y) - answer).max())
-        print(problem, name, tolerance, errors[-1] / tolerance, steps)
         assert low < errors[-1] / tolerance < high
         # As rounding adds up over the steps.
         assert distance_from_manifold(problem, y) < 1e-14 * (10 + steps)
     assert errors[0] > errors[1] > errors[2]
+
+
+def test_the_derivative_of_two_sublattices_with_respect_to_their_angle():
+    def angle(a, solver):
+        sol = solve(spins, solver, 0.25, sublattices(a), tolerance=1e-6)
+        y = sol.ys[-1]
+        return jnp.arccos(jnp.sum(y[0, 0] * y[0, 1]))
+
+    found = jax.jit(jax.grad(angle), static_argnums=1)(2.4, cfjax.RKL3(spectral_radius=8.0))
+    shrink = np.exp(-8 * 0.25)
+    u = shrink * np.tan(1.2)
+    expected = shrink / np.cos(1.2) ** 2 / (1 + u**2)
+    np.testing.assert_allclose(found, expected, rtol=1e-5)
+
+
+@pytest.mark.slow
+@pytest.mark.filterwarnings("ignore:Complex dtype support in Diffrax")
+@names
+def test_wilson_flow_of_links(name):
+    """The action of 3^4 links, by SciPy's DOP853. 4 d is a bound of the radius."""
+    y0 = wilson_flow.y0(3)
+    end = wilson_flow.reference(1.0, y0)
+    solver = SOLVERS[name](spectral_radius=16.0)
+    found = jax.jit(lambda y0: solve(wilson_flow.field, solver, 1.0, y0, tolerance=1e-4).ys[-1])(
+        jnp.asarray(y0)
+    )
+    assert np.abs(np.asarray(found) - end).max() < 1e-3
+    actions = [float(wilson_flow.action(jnp.asarray(y))) for y in (found, end)]
+    np.testing.assert_allclose(actions[0], actions[1], rtol=1e-3)
+    defect = np.einsum("...ji,...jk", found.conj(), found) - np.eye(3)
+    assert np.abs(defect).max() < 1e-12
+
+
+@names
+def test_on_the_manifold_for_any_length_of_a_step(name):
+    field, y0, _, _, _ = damped_spin_problem()
+    solver = SOLVERS[name](spectral_radius=60.0)
+
+    @jax.jit
+    def end(t1):
+        return cfjax.integrate(cfjax.LieTerm(field), solver, 0.0, t1, y0, num_steps=3).ys[-1]
+
+    for t1 in (0.1, 1.0, 10.0, 100.0):
+        # Flows correct the length up to rounding, of angles of up to some 1000.
+        assert abs(np.linalg.norm(end(t1)) - 1) < 1e-13
+
+
+# Control and the spectral radius
+
+
+def rough_heat(n, amplitude):
+    """Along one axis: a smooth mode, and the stiffest one with an amplitude; its radius."""
+    field = diffusion(n)
+    smooth, stiffest = legendre_mode(n, 1), legendre_mode(n, n - 1)
+    y = smooth + amplitude * stiffest / np.abs(stiffest).max()
+    return field, jnp.asarray(y), n * (n - 1)
+
+
+@pytest.mark.parametrize("name", ["RKL2", "RKL3"])
+def test_the_estimate_rejects_a_step_with_a_radius_that_is_too_small(name):
+    field, y0, radius = rough_heat(30, 1e-6)
+    # 13 stages for 0.9 of the radius, at the end of their range.
+    h = reach(13, 1) / (0.9 * radius) * (1 - 1e-6)
+
+    @jax.jit
+    def error(radius):
+        solver = SOLVERS[name](spectral_radius=lambda t, y, args: args)
+        t = jnp.zeros(())
+        return problems.first_step(solver, cfjax.LieTerm(field), t, t + h, y0, radius)[1]
+
+    right, wrong = (np.abs(error(jnp.asarray(r * radius))).max() for r in (1.0, 0.9))
+    assert wrong > 10 * right
+    assert wrong > 1e-4
+
+
+def test_a_radius_that_is_too_small_costs_steps_and_not_accuracy():
+    field, y0, radius = rough_heat(30, 1e-3)
+    solver = cfjax.RKL2(spectral_radius=lambda t, y, args: args)
+    ends, steps = [], []
+    run = jax.jit(lambda r: solve(field, solver, 0.5, y0, r, 1e-4))
+    for factor in (1.0, 0.9):
+        sol = run(jnp.asarray(factor * radius))
+        ends.append(sol.ys[-1])
+        steps.append(sol.stats["num_rejected_steps"])
+    exact = legendre_mode(30, 1) * np.exp(-1.0)
+    for end in ends:
+        assert np.abs(end - exact).max() < 1e-2
+    assert steps[1] > steps[0]
+
+
+@names
+def test_spectral_radius_as_a_number_a_function_and_an_estimate(name):
+    field, y0, radius = rough_heat(12, 0.1)
+    exact = legendre_mode(12, 1) * np.exp(-0.4) + 0.0
+    for value in (float(radius), np.float64(radius), lambda t, y, args: 1.0 * radius, None):
+        sol = solve(field, SOLVERS[name](spectral_radius=value), 0.2, y0, tolerance=1e-5)
+        assert np.abs(sol.ys[-1] - exact).max() < 1e-3
+
+
+def test_the_estimated_radius_follows_the_state():
+    """Stages follow a radius that grows a hundredfold within the solve."""
+
+    def field(t, y, args):
+        return {"rate": y["rate"], "y": -y["rate"] * (y["y"] - 1)}
+
+    start = {"rate": jnp.asarray(10.0), "y": jnp.zeros(3)}
+    sol = solve(field, cfjax.RKL2(), np.log(100), start, tolerance=1e-4)
+    np.testing.assert_allclose(sol.ys["rate"][-1], 1000, rtol=1e-3)
+    np.testing.assert_allclose(sol.ys["y"][-1], 1, rtol=1e-3)
+    assert sol.stats["num_rejected_steps"] < 0.2 * sol.stats["num_steps"]
+
+
+# More stages than there may be
+
+
+def stiff(t, y, args):
+    return -args * (y - jnp.cos(t))
+
+
+def test_max_stages_too_small_is_an_error_that_says_how_many():
+    with pytest.raises(RuntimeError, match=r"max_stages=10 is too small.* than 20 stages"):
+        cfjax.integrate(
+            cfjax.LieTerm(stiff), cfjax.RKL2(max_stages=10), 0.0, 1.0, jnp.ones(2), 1000.0,
+            num_steps=4,
+        )  # fmt: skip
+    sol = cfjax.integrate(
+        cfjax.LieTerm(stiff), cfjax.RKL2(max_stages=10), 0.0, 1.0, jnp.ones(2), 1000.0,
+        num_steps=4, throw=False,
+    )  # fmt: skip
+    assert np.isnan(sol.ys).all()
+    with pytest.raises(RuntimeError, match=r"(?i)nonfinite"):
+        diffrax.diffeqsolve(
+            cfjax.LieTerm(stiff), cfjax.RKL3(max_stages=10), 0.0, 1.0, 0.25, jnp.ones(2), 1000.0
+        )
+
+
+@pytest.mark.parametrize("name", ["RKL2", "RKL3"])
+def test_max_stages_too_small_shortens_controlled_steps_and_has_a_derivative(name):
+    """Rejected steps move nothing and evaluate no stage, so their derivative is finite."""
+    solver = SOLVERS[name](spectral_radius=lambda t, y, args: args, max_stages=5)
+
+    def end(rate):
+        controller = diffrax.PIDController(rtol=0.0, atol=1e-3)
+        sol = diffrax.diffeqsolve(
+            cfjax.LieTerm(stiff), solver, 0.0, 1.0, 0.5, jnp.zeros(1), rate,
+            stepsize_controller=controller, max_steps=200,
+        )  # fmt: skip
+        return sol.ys[-1, 0], sol.stats
+
+    (y, stats), slope = jax.jit(jax.value_and_grad(end, has_aux=True))(500.0)
+    assert stats["num_rejected_steps"] > 0
+    # Of the forced solution, up to what decays.
+    exact = lambda k: (k**2 * np.cos(1.0) + k * np.sin(1.0)) / (1 + k**2)  # noqa: E731
+    assert y == pytest.approx(exact(500.0), abs=1e-3)
+    assert np.isfinite(slope)
+    assert slope == pytest.approx((exact(501.0) - exact(499.0)) / 2, abs=1e-4)
+
+
+@pytest.mark.parametrize("name", ["RKL2", "RKL3"])
+def test_an_impossible_step_evaluates_no_stage(name):
+    calls = []
+
+    def field(t, y, args):
+        jax.debug.callback(lambda t: calls.append(float(t)), t)
+        return -y
+
+    solver = SOLVERS[name](spectral_radius=lambda t, y, args: args, max_stages=9)
+    term, y0 = cfjax.LieTerm(field), jnp.ones(1)
+    for radius, evaluations in ((100.0, "few"), (10.0, "all")):
+        radius, t = jnp.asarray(radius), jnp.zeros(())
+        state = solver.init(term, t, t + 1, y0, radius)
+        calls.clear()
+        y, error, *_ = solver.step(term, t, t + 1, y0, radius, state, made_jump=False)
+        jax.block_until_ready(y)
+        jax.effects_barrier()
+        assert np.isnan(y).all() == np.isnan(error).all() == (evaluations == "few")
+        # That of the end, and the one in the middle.
+        stages = stages_for(10.0, 1)
+        expected = (
+            {"few": 1, "all": stages}
+            if name == "RKL2"
+            else {"few": 2, "all": stages + 2 * stages_for(5.0, 1) - 1}
+        )
+        assert len(calls) == expected[evaluations]
+
+
+# With diffrax
+
+
+@names
+def test_the_first_evaluation_is_the_last_of_the_step_before(name):
+    times = []
+
+    def field(t, y, args):
+        jax.debug.callback(lambda t: times.append(float(t)), t)
+        return -y
+
+    y = cfjax.integrate(
+        cfjax.LieTerm(field), SOLVERS[name](5), 0.0, 1.0, jnp.ones(1), num_steps=4
+    ).ys
+    jax.block_until_ready(y)
+    jax.effects_barrier()
+    assert len(times) == 1 + 4 * SOLVERS_ROWS[name].evaluations
+    assert max(times) == 1.0
+
+
+@names
+def test_a_jump_is_seen_by_the_step_after_it(name):
+    def field(t, y, args):
+        return jnp.where(t < 0.5, 1.0, -3.0) * jnp.ones(1) + 0 * y
+
+    controller = diffrax.ClipStepSizeController(
+        diffrax.PIDController(rtol=0.0, atol=1e-6), jump_ts=jnp.array([0.5])
+    )
+    sol = diffrax.diffeqsolve(
+        cfjax.LieTerm(field), SOLVERS[name](5), 0.0, 1.0, 0.1, jnp.zeros(1),
+        stepsize_controller=controller,
+    )  # fmt: skip
+    # Otherwise the first field after the jump would be that before it. diffrax steps over it by a
+    # rounding of time.
+    np.testing.assert_allclose(sol.ys[-1], 0.5 - 1.5, rtol=0, atol=1e-13)
+
+
+@pytest.mark.parametrize("name", ["RKL2", "RKL3"])
+def test_output_within_a_step_has_order_two_stays_on_the_manifold_and_meets_the_end(
+    attitude_answer, name
+):
+    y0, solver = jnp.eye(3), SOLVERS[name](5)
+
+    @jax.jit
+    def output(h, theta):
+        term, t = cfjax.LieTerm(attitude), jnp.zeros(())
+        y1, _, info, _, _ = problems.first_step(solver, term, t, t + h, y0, None)
+        interpolation = solver.interpolation_cls(t0=t, t1=t + h, **info)
+        return y1, jax.vmap(lambda x: interpolation.evaluate(x * h))(theta)
+
+    theta = jnp.array([0.0, 0.3, 0.7, 1.0])
+    errors = []
+    for h in (0.2, 0.1, 0.05):
+        y1, ys = output(jnp.asarray(h), theta)
+        np.testing.assert_allclose(ys[0], y0, rtol=0, atol=1e-15)
+        np.testing.assert_allclose(ys[-1], y1, rtol=0, atol=1e-14)
+        defect = np.einsum("kji,kjl->kil", ys, ys) - np.eye(3)
+        assert np.abs(defect).max() < 1e-14
+        fine = [
+            problems.many_steps(
+                attitude, cfjax.CF4(), jnp.zeros(()), x * h, y0, None, jnp.asarray(100)
+            )
+            for x in theta[1:3]
+        ]
+        errors.append(np.abs(np.stack(fine) - ys[1:3]).max())
+    # Of one step: h^3.
+    slopes = np.log2(np.array(errors[:-1]) / errors[1:])
+    assert (slopes > 2.6).all()
+
+
+@pytest.mark.parametrize("name", ["RKL2", "RKL3"])
+def test_saved_times_within_controlled_steps(name):
+    field, y0, _, t1, _ = damped_spin_problem()
+    ts = jnp.linspace(0, t1, 7)
+    sol = solve(field, SOLVERS[name](), t1, jnp.asarray(y0), saveat=diffrax.SaveAt(ts=ts))
+    exact = np.stack([damped_spin_problem(t=float(t))[4] for t in ts])
+    assert np.abs(sol.ys - exact).max() < 1e-3
+    assert np.abs(np.linalg.norm(sol.ys, axis=-1) - 1).max() < 1e-13
+
+
+def test_an_event_within_a_step():
+    field, y0, _, t1, _ = damped_spin_problem()
+    event = diffrax.Event(
+        lambda t, y, args, **kwargs: y[2], optx.Newton(rtol=1e-8, atol=1e-8), direction=None
+    )
+    sol = solve(field, cfjax.RKL3(), 10 * t1, jnp.asarray(y0), tolerance=1e-7, event=event)
+    # tan(theta / 2) = 1.
+    rate = 30.0 / 1.25
+    assert sol.ts[-1] == pytest.approx(np.log(np.tan(1.0)) / (0.5 * rate), abs=1e-5)
+
+
+@names
+def test_a_product_of_spins_and_heat_is_as_each_alone(name):
+    heat, u0, radius = rough_heat(12, 0.1)
+    spin_field, s0, _, _, _ = damped_spin_problem()
+
+    def field(t, y, args):
+        return {"s": spin_field(t, y["s"], None), "u": heat(t, y["u"], None)}
+
+    def end(field, y0):
+        solver = SOLVERS[name](spectral_radius=float(radius))
+        return cfjax.integrate(cfjax.LieTerm(field), solver, 0.0, 0.2, y0, num_steps=20).ys
+
+    both = end(field, {"s": jnp.asarray(s0), "u": u0})
+    # One recursion, whose weights do not depend on the state.
+    np.testing.assert_allclose(both["s"], end(spin_field, jnp.asarray(s0)), rtol=0, atol=1e-14)
+    np.testing.assert_allclose(both["u"], end(heat, u0), rtol=0, atol=1e-13)
+
+
+def test_sums_are_compensated():
+    """Of 1e5 steps in single precision, which would round to a hundred units otherwise."""
+
+    def field(t, y, args):
+        return cfjax.Rotation(jnp.array([0.0, 0.0, 1.0], np.float32))
+
+    y0, n = jnp.array([1.0, 0.0, 0.0], np.float32), 100_000
+    y = cfjax.integrate(cfjax.LieTerm(field), cfjax.RKL2(3), 0.0, 1.0, y0, num_steps=n).ys[-1]
+    np.testing.assert_allclose(y, [np.cos(1), np.sin(1), 0], rtol=0, atol=3e-6)
+
+
+@names
+def test_leading_axes_are_states_of_their_own(name):
+    y0 = np.random.default_rng(0).normal(size=(5, 3))
+    y0 = jnp.asarray(y0 / np.linalg.norm(y0, axis=-1, keepdims=True))
+
+    def field(t, y, args):
+        up = jnp.array([0.0, 0.0, 1.0])
+        return cfjax.Rotation(jnp.cos(t) * jnp.cross(y, jnp.broadcast_to(up, y.shape)) + y * y)
+
+    def end(y0):
+        return cfjax.integrate(
+            cfjax.LieTerm(field), SOLVERS[name](5), 0.0, 1.0, y0, num_steps=5
+        ).ys[-1]
+
+    np.testing.assert_allclose(end(y0), jnp.stack([end(y) for y in y0]), rtol=0, atol=1e-14)
+
+
+@pytest.mark.parametrize("radius", [None, "args"])
+def test_a_batch_of_different_stiffness_is_as_its_members(radius):
+    rates = jnp.array([1.0, 100.0, 3000.0])
+    solver = cfjax.RKL2(spectral_radius=radius and (lambda t, y, args: args))
+
+    @jax.jit
+    def end(rate):
+        return solve(stiff, solver, 1.0, jnp.zeros(2), rate, 1e-4).ys[-1]
+
+    found = jax.vmap(end)(rates)
+    np.testing.assert_allclose(found, jnp.stack([end(r) for r in rates]), rtol=0, atol=1e-12)
+
+
+def test_backwards_in_time_what_decayed_grows():
+    def run(t0, t1, y0):
+        term = cfjax.LieTerm(lambda t, y, args: -3 * y)
+        return cfjax.integrate(term, cfjax.RKL3(), t0, t1, y0, num_steps=200).ys[-1]
+
+    end = run(0.0, 1.0, jnp.ones(2))
+    np.testing.assert_allclose(end, np.exp(-3), rtol=1e-6)
+    np.testing.assert_allclose(run(1.0, 0.0, end), 1, rtol=1e-5)
+
+
+@pytest.mark.parametrize("stages", [5, None])
+def test_richardson_takes_them(attitude_answer, stages):
+    """Though a method without an estimate needs it more."""
+    solver = cfjax.Richardson(cfjax.RKL2(stages))
+    sol = solve(attitude, solver, 1.0, jnp.eye(3), tolerance=1e-5)
+    error = np.abs(sol.ys[-1].ravel() - attitude_answer).max()
+    assert 1e-8 < error < 1e-4
+
+
+# Derivatives
+
+
+def end_of_stiff(solver):
+    def end(rate):
+        sol = cfjax.integrate(
+            cfjax.LieTerm(lambda t, y, args: -args * jnp.sin(y)), solver, 0.0, 1.0,
+            jnp.array([1.0, 2.0]), rate, num_steps=10,
+        )  # fmt: skip
+        return jnp.sum(sol.ys[-1])
+
+    return end
+
+
+@names
+def test_reverse_mode_through_chosen_stages(name):
+    end = end_of_stiff(SOLVERS[name](spectral_radius=50.0))
+    expected = problems.central_difference(jax.jit(end), 5.0, 1.0, 1e-2)
+    np.testing.assert_allclose(jax.jit(jax.grad(end))(5.0), expected, rtol=1e-7)
+
+
+@names
+def test_both_modes_through_given_stages(name):
+    end = end_of_stiff(SOLVERS[name](5))
+    expected = problems.central_difference(jax.jit(end), 5.0, 1.0, 1e-2)
+    np.testing.assert_allclose(jax.jit(jax.grad(end))(5.0), expected, rtol=1e-7)
+    np.testing.assert_allclose(jax.jvp(end, (5.0,), (1.0,))[1], expected, rtol=1e-7)
+
+
+@pytest.mark.parametrize("radius", [None, 50.0])
+def test_forward_mode_through_chosen_stages_names_what_has_it(radius):
+    end = end_of_stiff(cfjax.RKL2(spectral_radius=radius))
+
+    def slope(rate):
+        return jax.jvp(end, (rate,), (1.0,))[1]
+
+    for run in (slope, jax.jit(slope)):
+        with pytest.raises(TypeError, match=r"Forward mode needs .*RKL2\(stages=9\)"):
+            run(5.0)
+    # JAX's own words come first in a batch of directions.
+    with pytest.raises(TypeError, match=r"(?i)forward.mode"):
+        jax.jacfwd(end)(5.0)
+    # Batches of reverse mode have nothing to do with that.
+    rates = jnp.array([3.0, 5.0])
+    found = jax.jit(jax.grad(lambda rates: jnp.sum(jax.vmap(end)(rates))))(rates)
+    np.testing.assert_allclose(found, jax.jit(jax.vmap(jax.grad(end)))(rates), rtol=1e-12)
+
+
+# Errors in words
+
+
+@pytest.mark.parametrize(
+    "error, match, kwargs",
+    [
+        (ValueError, "stages must be at least 3, got 2", dict(stages=2)),
+        (ValueError, "max_stages must be at least 3, got 1", dict(max_stages=1)),
+        (TypeError, "stages must be an int", dict(stages=5.0)),
+        (TypeError, "stages must be an int", dict(stages=True)),
+        (TypeError, "max_stages must be an int", dict(max_stages=None)),
+        (ValueError, "spectral_radius must not be negative", dict(spectral_radius=-1.0)),
+        (ValueError, "spectral_radius must not be negative", dict(spectral_radius=np.nan)),
+        (ValueError, "not be given together", dict(stages=5, spectral_radius=1.0)),
+        (TypeError, "spectral_radius must be", dict(spectral_radius="large")),
+    ],
+)
+@names
+@pytest.mark.usefixtures("no_shape_hook")
+def test_arguments_that_are_refused(name, error, match, kwargs):
+    with pytest.raises(error, match=match):
+        SOLVERS[name](**kwargs)
+
+
+@pytest.mark.parametrize("radius", [-1.0, np.nan])
+def test_a_radius_of_a_function_that_is_negative_or_nan_is_an_error(radius):
+    solver = cfjax.RKL2(spectral_radius=lambda t, y, args: radius * args)
+    with pytest.raises(RuntimeError, match="spectral_radius must not be negative"):
+        cfjax.integrate(cfjax.LieTerm(stiff), solver, 0.0, 1.0, jnp.ones(2), 1.0, num_steps=2)
+    with pytest.raises(RuntimeError, match="spectral_radius must not be negative"):
+        solve(stiff, solver, 1.0, jnp.ones(2), 1.0)
+
+
+A = np.random.default_rng(0).normal(size=(6, 6))
+COLUMNS = np.linalg.qr(A[:, :2])[0]
+UNIT = COLUMNS[:, 0]
+INSTEAD = "LeftMatrix.*BorderedSkew"
+REFUSED = {
+    "LowRankSkew": (lambda t, y, args: cfjax.LowRankSkew(A @ y), COLUMNS, INSTEAD),
+    "SphereRotation": (lambda t, y, args: cfjax.SphereRotation(A @ y), UNIT, INSTEAD),
+    "Affine": (lambda t, y, args: cfjax.Affine(-1.0, 0 * y, np.ones(6)), UNIT, "ETD54"),
+    "LinearAffine": (
+        lambda t, y, args: cfjax.LinearAffine(-jnp.eye(6), 0 * y), UNIT, "ETD54",
+    ),
+}  # fmt: skip
+
+
+@pytest.mark.parametrize("kind", REFUSED)
+@names
+@pytest.mark.usefixtures("no_shape_hook")
+def test_fields_whose_sums_grow_are_refused(name, kind):
+    field, y0, match = REFUSED[kind]
+    for solver in (SOLVERS[name](), SOLVERS[name](5)):
+        with pytest.raises(TypeError, match=rf"(?s){name}.*{kind}.*{match}"):
+            jax.eval_shape(
+                lambda y, s=solver: (
+                    cfjax.integrate(
+                        cfjax.LieTerm(field), s, 0.0, 1.0, y, num_steps=2, throw=False
+                    ).ys
+                ),
+                jnp.asarray(y0),
+            )
+
+
+def test_what_they_do_take():
+    """Rotations by SphereRotation in three dimensions, frames by BorderedSkew."""
+    y0 = jnp.array([0.6, 0.0, 0.8])
+    for field, y in [
+        (lambda t, y, args: cfjax.SphereRotation(A[:3, :3] @ y), y0),
+        (lambda t, y, args: cfjax.BorderedSkew(A @ y), jnp.asarray(COLUMNS)),
+    ]:
+        end = cfjax.integrate(cfjax.LieTerm(field), cfjax.RKL2(), 0.0, 0.1, y, num_steps=4).ys[-1]
+        fine = cfjax.integrate(cfjax.LieTerm(field), cfjax.CF4(), 0.0, 0.1, y, num_steps=50).ys[-1]
+        np.testing.assert_allclose(end, fine, rtol=0, atol=3e-3)
+
+
+def test_terms_that_a_path_drives_are_refused():
+    path = diffrax.VirtualBrownianTree(0.0, 1.0, 1e-3, (), jax.random.key(0))
+    noise = cfjax.LieControlTerm(lambda t, y, args, dw: y * dw, path)
+    terms = diffrax.MultiTerm(cfjax.LieTerm(lambda t, y, args: -y), noise)
+    with pytest.raises(TypeError, match=r"ordinary differential equations.*CF4"):
+        cfjax.integrate(terms, cfjax.RKL2(5), 0.0, 1.0, jnp.ones(2), num_steps=2)
+
+
+# Precision and memory
+
+
+@pytest.mark.parametrize("stages", [5, None])
+@names
+def test_single_precision(name, stages):
+    field, y0, _, t1, answer = damped_spin_problem()
+
+    def field(t, y, args, field=field):
+        up = jnp.array([0.0, 0.0, 30.0], np.float32)
+        return cfjax.Rotation((up + jnp.float32(0.5) * jnp.cross(y, up)) / np.float32(1.25))
+
+    y0 = jnp.asarray(y0, np.float32)
+    y = cfjax.integrate(cfjax.LieTerm(field), SOLVERS[name](stages), 0.0, t1, y0, num_steps=400).ys[
+        -1
+    ]
+    assert y.dtype == np.float32
+    # The error of the methods, and of some 400 roundings.
+    np.testing.assert_allclose(y, answer, rtol=0, atol=1e-4)
+
+
+@names
+def test_memory_does_not_depend_on_the_stages(name):
+    """As the compiler plans it, in states: y, the first field, two elements, a point, its field."""
+    n = 100_000
+
+    def field(t, y, args):
+        # Not entry by entry, so the stages cannot be computed one entry after another.
+        return jnp.cumsum(y) / n - y
+
+    def used(solver):
+        def end(y0):
+            return cfjax.integrate(cfjax.LieTerm(field), solver, 0.0, 1.0, y0, num_steps=10).ys
+
+        compiled = jax.jit(end, donate_argnums=0).lower(jnp.zeros(n)).compile()
+        return compiled.memory_analysis().temp_size_in_bytes / (8 * n)
+
+    few, many, chosen = (
+        used(SOLVERS[name](*args, **kwargs))
+        for args, kwargs in [((9,), {}), ((41,), {}), ((), dict(spectral_radius=100.0))]
+    )
+    assert many < few + 0.1
+    # One more for an evaluation; elements of parts, and where the second half starts.
+    assert max(few, chosen) < (12.5 if name == "RKL3" else 7.5)
