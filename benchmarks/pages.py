@@ -640,6 +640,35 @@ def quantum_norm() -> str:
 
 
 @table
+def lindblad() -> list[list[str]]:
+    """The times are relative to the fastest of the others that are equally accurate."""
+    ours = ("cfjax, Kraus4", "cfjax, Magnus4", "cfjax, CF4")
+    methods = (*ours, "dynamiqs, Rouchon3")
+    names = (code(name.removeprefix("cfjax, ")) for name in methods)
+    least = "smallest eigenvalue: `Kraus4`, fastest other"
+    table = [["", "error", *names, "fastest other", least]]
+    rows = [row for row in load("lindblad")["rows"] if "method" in row]
+    for problem in values(rows, "problem"):
+        for goal in values(pick(rows, problem=problem), "goal"):
+            found = {r["method"]: r for r in pick(rows, problem=problem, goal=goal)}
+            others = [n for n in found if n not in methods and not n.startswith("cfjax")]
+            best = min(others, key=lambda n: found[n]["over best of others"][2])
+            cells = [
+                cell(found[name]["over best of others"]) if name in found else ""
+                for name in methods
+            ]
+            eigenvalues = (power(found[n]["least eigenvalue"]) for n in (ours[0], best))
+            time = in_units(found[best]["seconds"][2])
+            table.append([problem, power(goal), *cells, f"{best}, {time}", ", ".join(eigenvalues)])
+    return table
+
+
+@number
+def lindblad_others() -> str:
+    return load("lindblad")["rows"][0]["others"]
+
+
+@table
 def peers_spacecraft() -> list[list[str]]:
     return _peers("spacecraft")
 
