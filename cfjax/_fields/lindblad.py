@@ -62,7 +62,7 @@ class Lindblad(AbstractFrozenField):
     products of size n, `1 + 2 m` for each term of a series: 25 terms for a norm of 2.4 and 10 for
     each unit beyond, or 2.4 where damping is weak, less than some 0.5 for 28 of the norm. The norm
     is at most twice that of h and of `sum_k rates_k L_k^H L_k`. So stiff dissipation takes long:
-    use `cfjax.Kraus4`. A jump with at most 4 diagonals, as that of a ladder operator, takes n^2
+    use `cfjax.Kraus4`. A jump with at most 3 diagonals, as that of a ladder operator, takes n^2
     operations instead of a product, if it is known when the program is traced. The flow is NaN
     beyond a norm of some 2500.
 

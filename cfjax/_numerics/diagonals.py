@@ -11,8 +11,8 @@ from jaxtyping import Array, Inexact
 
 from .matmul import promoted, small_product
 
-# With more diagonals, or in smaller matrices, a dense product is as fast.
-_MOST_DIAGONALS = 4
+# With more diagonals, or in smaller matrices, dense products are as fast in a batch.
+_MOST_DIAGONALS = 3
 _LEAST_ROWS = 5
 
 

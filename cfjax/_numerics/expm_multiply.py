@@ -230,8 +230,8 @@ def _chebyshev(precision: str) -> _Series:
 def _on_strip(precision: str) -> _Series:
     """Polynomials for the rectangles `-_DECAY <= Re z <= _GROWTH`, `|Im z| <= lengths`."""
     eps = float(jnp.finfo(precision).eps)
-    # For a shorter one Taylor's takes fewer products.
-    intervals = np.array([x for x in _INTERVALS if x >= 1])
+    # For a shorter one Taylor's takes fewer products. The longest would need too high a degree.
+    intervals = np.array([x for x in _INTERVALS[:-1] if x >= 1])
     # In the rectangle as long as the interval the terms, and so the rounding error, would be larger
     # by up to 7.
     lengths = intervals / 1.05

@@ -119,7 +119,7 @@ def case(n, norm, damping, dtype=complex):
 # The flow itself
 
 
-@pytest.mark.representatives(8)
+@pytest.mark.representatives(7)
 @pytest.mark.parametrize("dtype", [np.complex128, np.complex64])
 @WAYS
 @pytest.mark.parametrize("n", [2, 3, 4, 5, 8])
@@ -242,11 +242,9 @@ def test_a_negative_rate_is_computed_as_it_is(way, in_way):
     np.testing.assert_allclose(found, want, rtol=0, atol=1e-14)
 
 
-@WAYS
 @pytest.mark.parametrize("kind", ["coherent", "damped", "pumped"])
-def test_the_bounds_of_the_numerical_range(kind, way):
+def test_the_bounds_of_the_numerical_range(kind):
     """Of the operator on Hermitian and other matrices, in the Hilbert-Schmidt product."""
-    del way
     n = 4
     for seed in range(20):
         h = hermitian(n, seed) * (3.0 if kind == "coherent" else 0.1) + 5 * np.eye(n)
@@ -426,6 +424,7 @@ LOSSES = {
 }
 
 
+@pytest.mark.representatives(1)
 @pytest.mark.parametrize("name", LOSSES)
 def test_how_much_positivity_order_4_loses_to_a_rate_that_touches_zero(name):
     solver, losses = LOSSES[name]
@@ -476,12 +475,13 @@ def observed(field, solver, t1, y0, args, want, steps):
     return slope(steps, found)
 
 
+@pytest.mark.representatives(2)
 @pytest.mark.parametrize(
     ("solver", "order"),
     [
+        (cfjax.CF4(), 4),
         (cfjax.CF2(), 2),
         (cfjax.CF3(), 3),
-        (cfjax.CF4(), 4),
         (cfjax.CF43(), 4),
     ],
     ids=repr,
@@ -491,8 +491,9 @@ def test_the_order_with_a_mean_field(solver, order):
     assert order - 0.2 < found < order + 0.35
 
 
+@pytest.mark.representatives(1)
 @pytest.mark.parametrize(
-    ("solver", "order"), [(cfjax.Magnus2(), 2), (cfjax.Magnus4(), 4)], ids=repr
+    ("solver", "order"), [(cfjax.Magnus4(), 4), (cfjax.Magnus2(), 2)], ids=repr
 )
 def test_the_order_with_a_drive(solver, order):
     found = observed(driven_by_time, solver, 2.0, density(3), None, answer(0.0), (16, 32, 64))
@@ -666,7 +667,8 @@ DRIVES = {n: hermitian(n, 8) for n in (3, 6)}
 OBSERVED = {n: hermitian(n, 9) for n in (3, 6)}
 
 
-@pytest.mark.parametrize("n", [3, 6])
+@pytest.mark.representatives(1)
+@pytest.mark.parametrize("n", [6, 3])
 def test_derivatives_through_a_solve(n):
     """By Hamiltonian, jump, rates and start, both modes."""
     p = parameters(n)
@@ -679,14 +681,14 @@ def test_derivatives_through_a_solve(n):
         return slope, jax.grad(value)(p)
 
     forward, pulled = found(p, way)
-    # Truncation h^4 and rounding eps / h.
+    # The direction has a length of 10 and more: truncation (10 h)^4 and rounding eps / h.
     compiled = jax.jit(value)
-    want = float(central_difference(compiled, p, way, 1e-3))
+    want = float(central_difference(compiled, p, way, 2e-4))
     assert forward == pytest.approx(want, rel=1e-9, abs=1e-9)
     assert inner(pulled, way) == pytest.approx(float(forward), rel=1e-12)
     for name in p:
         part = {k: way[k] if k == name else jax.tree.map(jnp.zeros_like, way[k]) for k in way}
-        want = float(central_difference(compiled, p, part, 1e-3))
+        want = float(central_difference(compiled, p, part, 2e-4))
         assert inner(pulled[name], way[name]) == pytest.approx(want, rel=1e-9, abs=1e-9)
 
 
@@ -715,7 +717,7 @@ def test_derivatives_at_the_zero_field(way, in_way):
 
 def saved(ts, args):
     def field(t, rho, args):
-        h = hermitian(3, 1) + args * jnp.cos(2 * t) * hermitian(3, 2)
+        h = hermitian(3, 1) + (args * jnp.cos(2 * t)).astype(complex) * hermitian(3, 2)
         return Lindblad(h, [L2, lower(3)], [0.3, 0.2])
 
     return field, diffrax.diffeqsolve(

@@ -1,11 +1,11 @@
-"""The bounds of Taylor polynomials. Chebyshev series are tested where they are used."""
+"""The bounds of Taylor polynomials, and the tails of Chebyshev series."""
 
 import math
 
 import mpmath as mp
 import pytest
 
-from cfjax._numerics.expm_series import TAYLOR_THETA
+from cfjax._numerics.expm_series import TAYLOR_THETA, chebyshev_of_exp_minus_one
 
 UNIT = {"float32": 2.0**-24, "float64": 2.0**-53}
 
@@ -30,3 +30,19 @@ def test_the_bounds_are_where_the_backward_error_reaches_the_unit_roundoff(preci
             return sum(abs(float(a)) * x ** (k - 1) for k, a in enumerate(c) if a)
 
         assert backward(theta) <= UNIT[precision] < backward(theta * 1.004)
+
+
+@pytest.mark.parametrize("growth", [1.0, 1.7])
+def test_the_tail_of_a_chebyshev_series(growth):
+    """Where `R_k` is at most `growth^k` it is below the tolerance, and no shorter series is so."""
+    length, tolerance = 6.0, 1e-13
+    found = chebyshev_of_exp_minus_one(length, tolerance, growth)
+    with mp.workdps(40):
+        numbers = [2 * mp.besselj(k, length) for k in range(120)]
+        tail = [
+            mp.fsum(abs(c) * mp.mpf(growth) ** k for k, c in enumerate(numbers) if k >= n)
+            for n in (len(found), len(found) - 1)
+        ]
+        assert tail[0] <= tolerance < tail[1]
+        numbers[0] = numbers[0] / 2 - 1
+        assert all(abs(c - a) < 1e-16 for c, a in zip(found, numbers, strict=False))
