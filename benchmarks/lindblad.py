@@ -185,7 +185,8 @@ def by_cfjax(problem: Problem, method: str, num_steps: int) -> Program:
             return cfjax.Lindblad(h, problem.jumps, problem.rates)
 
         term, solver = cfjax.LieTerm(field), getattr(cfjax, method)()
-        return cfjax.integrate(term, solver, 0.0, problem.t1, rho0, num_steps=num_steps).ys[-1]
+        sol = cfjax.integrate(term, solver, 0.0, problem.t1, rho0, num_steps=num_steps)
+        return jnp.asarray(sol.ys)[-1]
 
     return final_state
 
@@ -206,7 +207,7 @@ def by_diffrax(problem: Problem, method: str, num_steps: int) -> Program:
         term = diffrax.ODETerm(lambda t, rho, args: velocity(problem, t, rho))
         solver, step = getattr(diffrax, method)(), problem.t1 / num_steps
         sol = diffrax.diffeqsolve(term, solver, 0.0, problem.t1, step, rho0, max_steps=None)
-        return sol.ys[-1]
+        return jnp.asarray(sol.ys)[-1]
 
     return final_state
 

@@ -105,7 +105,8 @@ def heat(*shape: int, peers: tuple[str, ...], targets: tuple[float, ...] = HEAT_
         """By SciPy's exponential of a sparse matrix, made from differences along each axis."""
         matrix: Any = 0
         for axis, k in enumerate(walls):
-            step = diags([-np.ones(n - 1), np.ones(n - 1)], [0, 1], shape=(n - 1, n))
+            offsets: Any = [0, 1]
+            step = diags([-np.ones(n - 1), np.ones(n - 1)], offsets, shape=(n - 1, n))
             parts = [step if j == axis else eye(m) for j, m in enumerate(shape)]
             gradient = functools.reduce(kron, parts).tocsr()
             matrix = matrix - gradient.T @ diags(k.ravel()) @ gradient * n**2

@@ -82,6 +82,11 @@ class AbstractStabilised(AbstractChartSolver, diffrax.AbstractAdaptiveSolver):
     and for terms that a path drives.
     """
 
+    # Twice the index of the Gegenbauer polynomials.
+    twice_index: eqx.AbstractClassVar[int]
+    # Of the combination of the elements of a step that leads to points within it.
+    continuous_extension: eqx.AbstractClassVar[ContinuousExtension]
+
     stages: int | None = eqx.field(static=True, default=None)
     spectral_radius: float | Callable[[Any, PyTree, PyTree], Any] | None = eqx.field(
         default=None, kw_only=True
@@ -89,11 +94,6 @@ class AbstractStabilised(AbstractChartSolver, diffrax.AbstractAdaptiveSolver):
     max_stages: int = eqx.field(static=True, default=200, kw_only=True)
     # The length of the step at hand times the radius, where that decides. NaN if it is too large.
     stiffness: Real[Array, ""] | None = eqx.field(default=None, init=False)
-
-    # Twice the index of the Gegenbauer polynomials.
-    twice_index: eqx.AbstractClassVar[int]
-    # Of the combination of the elements of a step that leads to points within it.
-    continuous_extension: eqx.AbstractClassVar[ContinuousExtension]
 
     def __check_init__(self):
         for name, value in (("stages", self.stages), ("max_stages", self.max_stages)):

@@ -99,6 +99,8 @@ def wigner(
     from scipy.special import eval_genlaguerre, gammaln
 
     n, square = y.shape[-1], 4 * np.abs(amplitude) ** 2
+    turning: Any
+    element: Any
     total = np.zeros(y.shape[:-2] + amplitude.shape)
     for k in range(n):
         # The element for k photons and k + d more, and its adjoint.
@@ -193,20 +195,22 @@ def picture() -> figures.Figure:
     figure = figures.new(12.0, 3.4)
     *maps, curves = figure.subplots(1, 4, width_ratios=(1, 1, 1, 1.1))
     steps: Any = dict(num_steps=200, save_every=8, save_initial=True)
-    paths, losses = {}, (0.0, 0.03, 0.1)
-    for loss in losses:
-        times, paths[loss] = solve(problem(), solver, args=Oscillator(loss=loss), **steps)
+    solves = {
+        loss: solve(problem(), solver, args=Oscillator(loss=loss), **steps)
+        for loss in (0.0, 0.03, 0.1)
+    }
+    times = solves[0.0][0]
     x, p = np.linspace(-3.5, 3.5, 141), np.linspace(-2.5, 2.5, 101)
     middle = int(np.argmin(np.abs(times - 0.4)))
-    shown = None
+    shown: Any = None
     for ax, k in zip(maps, (0, middle, -1), strict=True):
-        values = wigner(paths[0.0][k], x + 1j * p[:, None])
+        values = wigner(solves[0.0][1][k], x + 1j * p[:, None])
         options: Any = dict(cmap="RdBu_r", vmin=-2 / np.pi, vmax=2 / np.pi, rasterized=True)
         shown = ax.pcolormesh(x, p, values, shading="gouraud", **options)
         ax.set(title=f"t = {times[k]:g}", aspect="equal", xticks=[-2, 0, 2], yticks=[-2, 0, 2])
     figure.colorbar(shown, ax=maps, location="bottom", shrink=0.4, aspect=40)
     colours = figures.BLUE, figures.ORANGE, figures.VERMILION
-    for (loss, ys), colour in zip(paths.items(), colours, strict=True):
+    for (loss, (_, ys)), colour in zip(solves.items(), colours, strict=True):
         curves.plot(times, negativity(ys), color=colour, label=f"loss {loss:g}")
     curves.set(title="Integral of the negative part", xlabel="t")
     curves.legend(frameon=False)

@@ -71,8 +71,8 @@ def velocity(t: Any, y: Density, args: Qubit) -> Complex[Array, "2 2"]:
 
 def bloch(y: Complex[Array | np.ndarray, "*times 2 2"]) -> Float[Array, "*times 3"]:
     """The Bloch vector. Its length is 1 for a pure state; the ground state is `(0, 0, 1)`."""
-    turning = 2 * y[..., 1, 0]
-    return jnp.stack([turning.real, turning.imag, (y[..., 0, 0] - y[..., 1, 1]).real], axis=-1)
+    turning, height = 2 * y[..., 1, 0], y[..., 0, 0] - y[..., 1, 1]
+    return jnp.stack([jnp.real(turning), jnp.imag(turning), jnp.real(height)], axis=-1)
 
 
 def density(vector: Float[Array | np.ndarray, "3"]) -> Complex[np.ndarray, "2 2"]:
@@ -197,7 +197,8 @@ def _least(method: Any, steps: np.ndarray, starts: Array, args: Qubit) -> np.nda
     term, solver = method
 
     def step(t: Array, rho: Array, h: Array) -> Array:
-        return cfjax.integrate(term, solver, t, t + h, rho, args, num_steps=1).ys[-1]
+        ys: Any = cfjax.integrate(term, solver, t, t + h, rho, args, num_steps=1).ys
+        return ys[-1]
 
     matrices = jax.jit(lambda h: choi(step, starts, h))
     return np.asarray([np.linalg.eigvalsh(np.asarray(matrices(h))).min() for h in steps])

@@ -164,7 +164,8 @@ def picture(side: int = 64) -> figures.Figure:
     )
     ys = np.asarray(sol.ys)
     figure = figures.new(12.5, 4.6)
-    left, right = figure.subfigures(1, 2, width_ratios=(2.1, 1))
+    subfigures: Any = figure.subfigures(1, 2, width_ratios=(2.1, 1))
+    left, right = subfigures
     above, below = left.subplots(2, len(shots))
     for k, t in enumerate(shots):
         y = ys[np.argmin(np.abs(times - t))]

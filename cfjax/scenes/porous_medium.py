@@ -19,7 +19,7 @@ Source: Barenblatt, On some unsteady motions of a liquid and gas in a porous med
 Mekh. 16 (1952); Vázquez, The Porous Medium Equation, Oxford University Press (2006).
 """
 
-from typing import Any
+from typing import Any, cast
 
 import diffrax
 import jax
@@ -118,7 +118,7 @@ def chart(**options: Any) -> cfjax.WorkPrecision:
 def picture(n: int = 64) -> figures.Figure:
     """The spot at four times, beside the exact solution, and the steps that it takes."""
     times = np.array([1.0, 4.0, 20.0, 100.0])
-    given = problem() | dict(y0=jnp.asarray(y0(n)))
+    given: Any = problem() | dict(y0=jnp.asarray(y0(n)))
     sol = diffrax.diffeqsolve(
         given["term"],
         solver,
@@ -134,7 +134,7 @@ def picture(n: int = 64) -> figures.Figure:
         max_steps=1000,
     )
     spots, steps = jax.tree.map(np.asarray, sol.ys)
-    ends = np.asarray(sol.ts[1])
+    ends = np.asarray(cast(Any, sol.ts)[1])
     used = np.isfinite(ends)
     ends, steps = ends[used], steps[used]
 

@@ -838,7 +838,7 @@ def test_a_product_state_with_a_rotation():
     found = cfjax.integrate(cfjax.LieTerm(field), cfjax.CF4(), 0.0, 1.0, start, num_steps=40).ys
     # Of order 4, (1/40)^4.
     np.testing.assert_allclose(np.ravel(found["rho"][-1]), want[:4], rtol=0, atol=1e-7)
-    np.testing.assert_allclose(found["spin"][-1], want[4:].real, rtol=0, atol=1e-7)
+    np.testing.assert_allclose(found["spin"][-1], np.real(want[4:]), rtol=0, atol=1e-7)
 
 
 @pytest.mark.parametrize("n", [3, 6])

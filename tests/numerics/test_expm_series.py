@@ -1,6 +1,7 @@
 """The bounds of Taylor polynomials, and the tails of Chebyshev series."""
 
 import math
+from typing import Any
 
 import mpmath as mp
 import pytest
@@ -39,7 +40,7 @@ def test_the_tail_of_a_chebyshev_series(growth):
     found = chebyshev_of_exp_minus_one(length, tolerance, growth)
     with mp.workdps(40):
         numbers = [2 * mp.besselj(k, length) for k in range(120)]
-        tail = [
+        tail: Any = [
             mp.fsum(abs(c) * mp.mpf(growth) ** k for k, c in enumerate(numbers) if k >= n)
             for n in (len(found), len(found) - 1)
         ]

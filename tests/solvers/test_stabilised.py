@@ -958,9 +958,9 @@ def test_terms_that_a_path_drives_are_refused():
 @pytest.mark.parametrize("stages", [5, None])
 @names
 def test_single_precision(name, stages):
-    field, y0, _, t1, answer = damped_spin_problem()
+    _, y0, _, t1, answer = damped_spin_problem()
 
-    def field(t, y, args, field=field):
+    def field(t, y, args):
         up = jnp.array([0.0, 0.0, 30.0], np.float32)
         return cfjax.Rotation((up + jnp.float32(0.5) * jnp.cross(y, up)) / np.float32(1.25))
 
