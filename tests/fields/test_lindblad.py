@@ -162,7 +162,7 @@ def test_a_large_flow_against_scipy(damping):
     jumps = [jumps[0], np.diag(np.sqrt(np.arange(1, n) / n), 1)]
     x = density(n, 3)
     one = scipy.sparse.identity(n)
-    total = -1j * (scipy.sparse.kron(h, one) - scipy.sparse.kron(one, h.T))
+    total: Any = -1j * (scipy.sparse.kron(h, one) - scipy.sparse.kron(one, h.T))
     for rate, a in zip(rates, map(scipy.sparse.csr_array, jumps), strict=True):
         loss = a.conj().T @ a / 2
         total = total + rate * (
