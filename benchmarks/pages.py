@@ -1056,7 +1056,7 @@ def diffusion_times() -> list[list[str]]:
     }
     table = [["", "error", "", "time", *bases.values()]]
     for (problem, target), rows in _stabilised().items():
-        for row in (r for r in rows if r["program"] in ("RKL2", "RKL3") and "seconds" in r):
+        for row in (r for r in rows if r["program"] in ("RKL2", "RKL3") and r.get("seconds")):
             over = [row[f"over {base}"] for base in bases]
             table.append(
                 [
@@ -1068,6 +1068,17 @@ def diffusion_times() -> list[list[str]]:
                 ]
             )
     return table
+
+
+@number
+def diffusion_frames() -> str:
+    """How much shorter the stable steps of RKL2 are without the part along the spin."""
+    rows = pick(load("stabilised")["rows"], method="RKL2")
+    along, across = (
+        {row["damping"]: row["stable to"] for row in pick(rows, frame=frame)}
+        for frame in values(rows, "frame")
+    )
+    return between(along[a] / across[a] for a in along if 0.5 <= a <= 2)
 
 
 def _exact(error: float) -> str:
