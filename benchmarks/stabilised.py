@@ -509,12 +509,17 @@ def draw() -> dict[str, Figure]:
 
 def _work(rows: list[results.Row]) -> Figure:
     rows = [row for row in rows if row.get("evaluations")]
-    figure = _style.new_figure((12, 9.5))
-    panels = dict(zip(PROBLEMS, figure.subplots(3, 3).flat, strict=True))
+    named: set[str] = set()
+    problems = [name for name in PROBLEMS if results.pick(rows, problem=name)]
+    num_rows = -(-len(problems) // 3)
+    figure = _style.new_figure((12, 3.2 * num_rows))
+    panels = dict(zip(problems, figure.subplots(num_rows, 3).flat, strict=False))
     for problem, axes in panels.items():
         for program, (color, marker) in STYLES.items():
             curve = results.pick(rows, problem=problem, program=program)
-            if curve or axes is figure.axes[0]:
+            is_first = program not in named
+            if curve:
+                named.add(program)
                 axes.plot(
                     [row["evaluations"] for row in curve],
                     [row["error"] for row in curve],
@@ -522,7 +527,7 @@ def _work(rows: list[results.Row]) -> Figure:
                     marker=marker,
                     markersize=5,
                     linewidth=1,
-                    label=NAMES.get(program, program),
+                    label=NAMES.get(program, program) if is_first else None,
                 )
         axes.set(title=problem, yscale="log")
         _style.logarithmic(axes, "evaluations of the field")
