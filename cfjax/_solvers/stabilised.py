@@ -2,7 +2,7 @@
 
 import abc
 from collections.abc import Callable
-from typing import Any, ClassVar, NamedTuple, cast
+from typing import Any, ClassVar, NamedTuple
 
 import diffrax
 import equinox as eqx
@@ -207,7 +207,7 @@ class AbstractStabilised(AbstractChartSolver, diffrax.AbstractAdaptiveSolver):
         y1 = chart.end(end)
         if self.stiffness is not None:
             # NaN is an infinite error to diffrax, so that the step is taken again, shorter.
-            zero = jnp.where(jnp.isnan(self.stiffness), jnp.nan, 0.0)
+            zero = jnp.where(self._is_possible, 0.0, jnp.nan)
             y1, error = jtu.tree_map(lambda x: x + zero.astype(x.dtype), (y1, error))
         path = Path.of(
             self.continuous_extension,
@@ -216,11 +216,16 @@ class AbstractStabilised(AbstractChartSolver, diffrax.AbstractAdaptiveSolver):
         )
         return Step(y1, path, error, value)
 
+    @property
+    def _is_possible(self) -> Any:
+        return True if self.stiffness is None else ~jnp.isnan(self.stiffness)
+
     def _number(self, length: float) -> Any:
-        """How many stages such a part of the step has: NaN if it is impossible."""
+        """How many stages such a part of the step has."""
         l = self.twice_index  # noqa: E741
         if self.stages is None:
-            return _stages_for(length * cast(Array, self.stiffness), l)
+            # NaN is impossible, and 3 will do.
+            return _stages_for(length * jnp.nan_to_num(jnp.asarray(self.stiffness)), l)
         # As many as reach as far, in a part of it.
         return self.stages if length == 1 else _stages_for(length * _reach(self.stages, l), l)
 
@@ -228,8 +233,7 @@ class AbstractStabilised(AbstractChartSolver, diffrax.AbstractAdaptiveSolver):
         """The element that leads from a point with the field `first` over a part of the step."""
         l = self.twice_index  # noqa: E741
         # An impossible step has zeros and no stage, so that its derivative is finite.
-        is_possible = part.number == part.number
-        number = part.number if self.stages else jnp.where(is_possible, part.number, 3)
+        number, is_possible = part.number, self._is_possible
 
         def stage(j: Any, carry: Any) -> Any:
             u, u_before, time, time_before = carry
@@ -246,7 +250,7 @@ class AbstractStabilised(AbstractChartSolver, diffrax.AbstractAdaptiveSolver):
         zero = jnp.zeros_like(w)
         carry = combine((w * part.length,), (first,)), combine((zero,), (first,)), w, zero
         if self.stages is not None:
-            turns = np.arange(2.0, part.number + 1)
+            turns = np.arange(2.0, number + 1)
             (u, *_), _ = over_stages(lambda carry, j: (stage(j, carry), None), carry, turns)
             return u
         # A loop of no more turns than there are stages.
@@ -370,29 +374,28 @@ class RKL3(AbstractStabilised):
         r = (1 + 2 * wm) / (1 + 2 * ws)
         a, ratio = 4 / (4 - r), r * ds / dm
 
-        def element(carry: Any, x: tuple[Any, _Part]) -> Any:
-            (first_there, point), (is_followed, part) = carry, x
-            if self.stages is None:
-                part = _Part(*(x.astype(s.dtype) for x in part))
-            else:
-                part = part._replace(number=m)
-            v = self._element(chart, first_there, point, part)
+        parts = [_Part(m, 0.0, 0.5, ratio), _Part(m, 0.5, 0.5, ratio), _Part(s)]
 
-            def after() -> Any:
-                middle = chart.flow(v, point)
-                return cast_like(first, chart.field(0.5, middle, [first])), middle
+        def after(v: PyTree, point: PyTree) -> tuple[PyTree, PyTree]:
+            middle = chart.flow(v, point)
+            return cast_like(first, chart.field(0.5, middle, [first])), middle
 
-            return chosen(is_followed, after, lambda: (first, start)), v
+        def element(start_of_part: Any, x: tuple[Any, _Part]) -> Any:
+            is_followed, part = x
+            part = jtu.tree_map(lambda number: number.astype(s.dtype), part)
+            field, point = start_of_part
+            v = self._element(chart, field, point, part)
+            return chosen(is_followed, lambda: after(v, point), lambda: (first, start)), v
 
-        # One program for all elements whose number of stages may be traced.
-        halves = [_Part(m, 0.0, 0.5, ratio), _Part(m, 0.5, 0.5, ratio)]
         if self.stages is None:
-            parts = zip((True, False, False), (*halves, _Part(s)), strict=True)
-            _, (v1, v2, u) = scan_list(element, (first, start), list(parts))
+            # One program for all of them.
+            turns = list(zip((True, False, False), parts, strict=True))
+            _, (v1, v2, u) = scan_list(element, (first, start), turns)
         else:
-            parts = zip((True, False), halves, strict=True)
-            _, (v1, v2) = scan_list(element, (first, start), list(parts))
-            u = self._element(chart, first, start, _Part(s))
+            v1 = self._element(chart, first, start, parts[0])
+            field, middle = after(v1, start)
+            v2 = self._element(chart, field, middle, parts[1])
+            u = self._element(chart, first, start, parts[2])
         weights = a / 2 + 2 / 3, a / 2 - 2 / 3, (1 - a) / 2
         flows = [combine(weights, (v1, v2, u)), combine(weights, (v2, v1, u))]
         error = combine((a - 1, a - 1, 1 - a), (v1, v2, u))

