@@ -94,10 +94,28 @@ FIELDS = {
         ),
         np.array([0.6, 0.8, 0.3, -0.4]),
     ),
+    "ExtendedMotion": (
+        lambda t, y, args: cfjax.ExtendedMotion(
+            omega=args * y[7:] + t, a=args, v=args * y[4:7], frame="body", layout="wxyz_v_p"
+        ),
+        np.array([0.6, 0.0, 0.8, 0.0, 0.3, -0.4, 0.5, 0.1, 0.2, -0.3]),
+    ),
+    "InertialMotion": (
+        lambda t, y, args: cfjax.InertialMotion(
+            omega=args * y[7:] + t, force=args, gravity=-args / 2, layout="wxyz_v_p"
+        ),
+        np.array([0.6, 0.0, 0.8, 0.0, 0.3, -0.4, 0.5, 0.1, 0.2, -0.3]),
+    ),
     "LeftMatrix": (lambda t, y, args: cfjax.LeftMatrix(jnp.outer(args, y)), ON_SPHERE),
     "RightMatrix": (lambda t, y, args: cfjax.RightMatrix(jnp.outer(y, args)), ON_SPHERE),
     "Conjugation": (lambda t, y, args: cfjax.Conjugation(args[:2, None] * y + t), SQUARE),
     "Congruence": (lambda t, y, args: cfjax.Congruence(args[:2, None] * y, jnp.sin(y + t)), SQUARE),
+    "Lindblad": (
+        lambda t, y, args: cfjax.Lindblad(
+            jnp.diag(args * (t + jnp.diag(y).real)), [args[:, None] * np.eye(3, k=1)]
+        ),
+        np.full((3, 3), 1 / 3 + 0j),
+    ),
     "LinearAffine": (
         lambda t, y, args: cfjax.LinearAffine(jnp.outer(args, jnp.sin(y)), y + t),
         ON_SPHERE,
@@ -144,7 +162,7 @@ def check(solver, term, y0, has_gradient):
     np.testing.assert_allclose(np.asarray(end(args)), exact, rtol=0, atol=0.04)
     if has_gradient:
         weights = np.arange(1.0, 1 + y0.size).reshape(y0.shape)
-        loss = jax.jit(lambda args: jnp.sum(end(args) * weights))
+        loss = jax.jit(lambda args: jnp.sum(jnp.real(end(args)) * weights))
         slope = (loss(args + 1e-4 * direction) - loss(args - 1e-4 * direction)) / 2e-4
         # The difference is off by (1e-4)^2 / 6 times a third derivative, and by 1e-16 / 1e-4.
         found = jax.grad(loss)(args) @ direction

@@ -733,6 +733,7 @@ def saved(ts, args):
 
 
 # That of `diffrax`.
+@pytest.mark.slow
 @pytest.mark.filterwarnings("ignore:Complex dtype support")
 def test_derivatives_by_times_of_output():
     ts, args, w = jnp.asarray([0.23, 0.61]), jnp.asarray(1.0), random((2, 3, 3), 4, complex)

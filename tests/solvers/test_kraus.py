@@ -224,6 +224,7 @@ def test_output_within_a_step_is_completely_positive_and_keeps_the_trace(problem
         assert trace < 1e-14
 
 
+@pytest.mark.slow
 def test_stiff_dissipation():
     """Steps far longer than 1 over the largest rate, 5e3: Cholesky meets numbers that underflow."""
     y0 = jnp.asarray(pure(20))
@@ -266,6 +267,7 @@ def test_the_estimate_sees_the_error(problem):
         assert 3.6 < slope < 4.5
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("start", [0.0, 0.5])
 def test_the_estimate_sees_the_error_of_stiff_steps(start):
     """Also where the fast levels are at rest: there it is the error itself, but for a tenth."""
