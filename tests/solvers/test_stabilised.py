@@ -469,6 +469,7 @@ def test_error_over_tolerance_by_exact_answers(problem, name):
     assert errors[0] > errors[1] > errors[2]
 
 
+@pytest.mark.slow
 def test_the_derivative_of_two_sublattices_with_respect_to_their_angle():
     def angle(a, solver):
         sol = solve(spins, solver, 0.25, sublattices(a), tolerance=1e-6)
@@ -602,6 +603,7 @@ def test_max_stages_too_small_is_an_error_that_says_how_many():
         )
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("name", ["RKL2", "RKL3"])
 def test_max_stages_too_small_shortens_controlled_steps_and_has_a_derivative(name):
     """Rejected steps move nothing and evaluate no stage, so their derivative is finite."""
