@@ -162,7 +162,7 @@ def test_a_large_flow_against_scipy(damping):
     jumps = [jumps[0], np.diag(np.sqrt(np.arange(1, n) / n), 1)]
     x = density(n, 3)
     one = scipy.sparse.identity(n)
-    total = -1j * (scipy.sparse.kron(h, one) - scipy.sparse.kron(one, h.T))
+    total: Any = -1j * (scipy.sparse.kron(h, one) - scipy.sparse.kron(one, h.T))
     for rate, a in zip(rates, map(scipy.sparse.csr_array, jumps), strict=True):
         loss = a.conj().T @ a / 2
         total = total + rate * (
@@ -840,7 +840,7 @@ def test_a_product_state_with_a_rotation():
     found = cfjax.integrate(cfjax.LieTerm(field), cfjax.CF4(), 0.0, 1.0, start, num_steps=40).ys
     # Of order 4, (1/40)^4.
     np.testing.assert_allclose(np.ravel(found["rho"][-1]), want[:4], rtol=0, atol=1e-7)
-    np.testing.assert_allclose(found["spin"][-1], want[4:].real, rtol=0, atol=1e-7)
+    np.testing.assert_allclose(found["spin"][-1], np.real(want[4:]), rtol=0, atol=1e-7)
 
 
 @pytest.mark.parametrize("n", [3, 6])

@@ -177,7 +177,7 @@ def test_accuracy_on_a_strip(length, width):
 
 def test_accuracy_on_a_strip_without_growth():
     """Then the decay alone says how many pieces there are."""
-    values = np.linspace(-2, 0, N) + 20j * np.cos(np.arange(N))
+    values = np.linspace(-4, 0, N) + 60j * np.cos(np.arange(N))
     a, q = normal_matrix(values)
     x, norm = vector(), np.abs(values).max() * (1 + 1e-12)
     found = moved_on_strip(a, x, norm, strip_of(values))
