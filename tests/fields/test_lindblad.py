@@ -209,6 +209,8 @@ def test_the_parts_with_and_without_jumps_make_the_equation():
     h, jumps, rates = hermitian(3) + 2 * np.eye(3), [L2, lower(3)], np.array([0.7, 0.3])
     field, x, y = Lindblad(h, jumps, rates), density(3, 3), density(3, 4)
     k = field.no_jump()
+    # Without the trace of h, which has no effect.
+    assert np.trace(k).imag == pytest.approx(0, abs=1e-15)
     found = k @ x + x @ k.conj().T + field.jump(x)
     np.testing.assert_allclose(found, field.tangent(x), rtol=0, atol=1e-14)
     # It is the adjoint in the Hilbert-Schmidt product.
@@ -715,14 +717,14 @@ def test_derivatives_at_the_zero_field(way, in_way):
     assert found_ == pytest.approx(np.sum(w * want).real, abs=1e-14)
 
 
-def saved(ts, args):
+def saved(solver, ts, args):
     def field(t, rho, args):
         h = hermitian(3, 1) + (args * jnp.cos(2 * t)).astype(complex) * hermitian(3, 2)
         return Lindblad(h, [L2, lower(3)], [0.3, 0.2])
 
     return field, diffrax.diffeqsolve(
         cfjax.LieTerm(field),
-        cfjax.CF43(),
+        solver,
         0.0,
         1.0,
         0.05,
@@ -735,24 +737,29 @@ def saved(ts, args):
 # That of `diffrax`.
 @pytest.mark.slow
 @pytest.mark.filterwarnings("ignore:Complex dtype support")
-def test_derivatives_by_times_of_output():
+@pytest.mark.representatives(1)
+@pytest.mark.parametrize(
+    ("solver", "error"), [(cfjax.CF2(), 5e-3), (cfjax.CF43(), 1e-5)], ids=["CF2", "CF43"]
+)
+def test_derivatives_by_times_of_output(solver, error):
     ts, args, w = jnp.asarray([0.23, 0.61]), jnp.asarray(1.0), random((2, 3, 3), 4, complex)
 
     def value(ts, args):
-        ys: Any = saved(ts, args)[1]
+        ys: Any = saved(solver, ts, args)[1]
         return jnp.sum(w * ys).real
 
     @functools.partial(jax.jit, compiler_options=QUICK)
     def found(ts, args):
-        field, ys = saved(ts, args)
+        field, ys = saved(solver, ts, args)
         velocities = jnp.stack(
             [field(t, y, args).tangent(y) for t, y in zip(ts, ys, strict=True)]  # pyright: ignore
         )
         return jax.grad(value, argnums=(0, 1))(ts, args), velocities
 
     (in_ts, in_args), velocities = found(ts, args)
-    # The same as the velocity, up to the slope of the continuous extension, of order 3 in the step.
-    np.testing.assert_allclose(in_ts, np.sum(w * velocities, axis=(1, 2)).real, rtol=0, atol=1e-5)
+    # The same as the velocity, up to the slope of the error of the continuous extension, of the
+    # order of the method less one.
+    np.testing.assert_allclose(in_ts, np.sum(w * velocities, axis=(1, 2)).real, rtol=0, atol=error)
     compiled = jax.jit(value)
     for way in ((np.array([1.0, 0.3]), 0.0), (np.zeros(2), 1.0)):
         # Times within one step, where the extension is smooth.

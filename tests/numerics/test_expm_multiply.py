@@ -175,6 +175,19 @@ def test_accuracy_on_a_strip(length, width):
     np.testing.assert_allclose(found, expected, rtol=0, atol=16 * 2.0**-53 * (1 + norm) * growth)
 
 
+def test_accuracy_on_a_strip_without_growth():
+    """Then the decay alone says how many pieces there are."""
+    values = np.linspace(-4, 0, N) + 60j * np.cos(np.arange(N))
+    a, q = normal_matrix(values)
+    x, norm = vector(), np.abs(values).max() * (1 + 1e-12)
+    found = moved_on_strip(a, x, norm, strip_of(values))
+    expected = q @ (np.expm1(values) * (q.conj().T @ x))
+    np.testing.assert_allclose(found, expected, rtol=0, atol=16 * 2.0**-53 * norm)
+    # Not by Taylor's series.
+    steps = _steps_on_strip(jnp.asarray(norm), strip_of(values))
+    assert number_of_products(steps) < number_of_products(_steps(jnp.asarray(norm), False))
+
+
 def test_a_strip_takes_fewer_products_than_taylor_where_damping_is_weak():
     for norm in (4.0, 20.0, 100.0):
         x = jnp.asarray(norm)

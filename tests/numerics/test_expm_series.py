@@ -39,11 +39,9 @@ def test_the_tail_of_a_chebyshev_series(growth):
     length, tolerance = 6.0, 1e-13
     found = chebyshev_of_exp_minus_one(length, tolerance, growth)
     with mp.workdps(40):
-        numbers = [2 * mp.besselj(k, length) for k in range(120)]
-        tail: Any = [
-            mp.fsum(abs(c) * mp.mpf(growth) ** k for k, c in enumerate(numbers) if k >= n)
-            for n in (len(found), len(found) - 1)
-        ]
+        numbers: list[Any] = [2 * mp.besselj(k, length) for k in range(120)]
+        sizes: list[Any] = [abs(c) * mp.mpf(growth) ** k for k, c in enumerate(numbers)]
+        tail: list[Any] = [mp.fsum(sizes[n:]) for n in (len(found), len(found) - 1)]
         assert tail[0] <= tolerance < tail[1]
         numbers[0] = numbers[0] / 2 - 1
         assert all(abs(c - a) < 1e-16 for c, a in zip(found, numbers, strict=False))
