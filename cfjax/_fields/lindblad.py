@@ -116,10 +116,6 @@ class Lindblad(AbstractFrozenField):
         """`sum_k rates_k L_k x L_k^H`, for a field without leading axes."""
         return _of_jumps(self.rates, self.jumps, x)
 
-    def jump_adjoint(self, x: Inexact[Array, "n n"]) -> Inexact[Array, "n n"]:
-        """`sum_k rates_k L_k^H x L_k`, for a field without leading axes."""
-        return _of_jumps(self.rates, [adjoint(a) for a in self.jumps], x)
-
     @classmethod
     def combine(cls, weights: Sequence[Weight], fields: Sequence[Any]) -> "Lindblad":
         coordinates = [(f.h, _checked_rates(f, fields[0])) for f in fields]
