@@ -44,7 +44,7 @@ def loss(args, y0, term, solver, num_steps=20, **options):
 
 
 TERMS = {"terms": SPLIT, "any": cfjax.LieTerm(whole), "time only": cfjax.LieTerm(of_time)}
-QUICK = [("Strang", 5), ("ImplicitMidpoint", None), ("Magnus2", None)]
+QUICK = [("Strang", 5), ("Magnus2", None)]
 SAVE_EVERY = {"BlanesMoan4": 5, "Composition": 1, "ImplicitMidpoint": 1, "Magnus4Lobatto": 5}
 SLOW = [(name, SAVE_EVERY.get(name)) for name, row in SOLVERS.items() if row.is_symmetric]
 

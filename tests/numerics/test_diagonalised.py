@@ -160,6 +160,7 @@ def test_one_axis_of_a_grid(name):
     np.testing.assert_allclose(found, wanted, rtol=0, atol=60 * 20 * EPS * np.abs(wanted).max())
 
 
+@pytest.mark.slow
 def test_derivative_of_a_solve_with_respect_to_a_factor_of_the_spectrum():
     spectrum, transform = cfjax.diagonalised(advection() / 10)
     u0 = jnp.asarray(points((12,), False))

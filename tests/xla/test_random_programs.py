@@ -35,7 +35,7 @@ def check(seeds, lattices):
 
 # Every fifth operation or so at the end: some 0.15 s a program, of which NumPy evaluates most.
 @pytest.mark.parametrize(
-    "first", [0, 300, *(pytest.param(x, marks=pytest.mark.slow) for x in (150, 450))]
+    "first", [0, *(pytest.param(x, marks=pytest.mark.slow) for x in (150, 300, 450))]
 )
 def test_small_states(first):
     check(range(first, first + 150, 5), lattices=0)

@@ -171,7 +171,6 @@ ROOM = 1.1 if RESULTS["machine"]["jax"] == jax.__version__ else 1.5
 QUICK = [
     ("rigid body", "adaptive steps"),
     ("rigid body", "output at times"),
-    ("rigid body", "`integrate`, gradient"),
 ]
 HELD = [
     pytest.param(*names, marks=[] if names in QUICK else pytest.mark.slow)

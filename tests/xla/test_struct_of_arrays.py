@@ -294,7 +294,7 @@ def compare(found, tolerance):
         np.testing.assert_allclose(a, b, rtol=tolerance, atol=tolerance)
 
 
-@pytest.mark.representatives(2)
+@pytest.mark.representatives(1)
 @pytest.mark.parametrize("solver, how", HOW)
 def test_derivatives_of_a_solve(solver, how):
     """Long ones are cut at the stages."""
@@ -310,6 +310,7 @@ def test_derivatives_of_a_solve(solver, how):
     compare(found, 1e-12)
 
 
+@pytest.mark.slow
 def test_derivatives_of_a_solve_in_batches():
     def found():
         fun = lambda args: loss(STATE, args, cfjax.CF4(), "integrate")  # noqa: E731

@@ -162,7 +162,7 @@ def derivatives(step):
     return value(jax.jacfwd(step))
 
 
-@pytest.mark.representatives(3)
+@pytest.mark.representatives(2)
 @pytest.mark.parametrize("scene", [heavy_top, spacecraft])
 @pytest.mark.parametrize("transform", [value, gradient, gradients, batch, derivatives])
 def test_a_long_step_agrees_with_the_program_as_it_is(scene, transform):
