@@ -46,25 +46,18 @@ class Fault(eqx.Module):
 
 
 def error_if(tree: PyTree, is_wrong: Callable[[PyTree], Bool[Array, ""]], message: str) -> PyTree:
-    """The same arrays, or an error with this message where `is_wrong` of them is true."""
-
-    def zero(tree: PyTree) -> Real[Array, ""]:
-        return eqx.error_if(jnp.zeros(()), is_wrong(tree), message)
-
-    return checked(tree, zero)
-
-
-def checked(tree: PyTree, zero: Callable[[PyTree], Real[Array, ""]]) -> PyTree:
-    """The same floating and complex arrays, or the error that `zero` of them raises.
+    """The same floating and complex arrays, or an error with this message if `is_wrong` of them.
 
     It is one primitive, so that it is linear for `jax.linear_transpose`, and so that its results
     vary over the axes of a mesh as the arrays do for `jax.shard_map`, which those of an error do
-    not. `zero` must close over nothing traced.
+    not. `is_wrong` must close over nothing traced.
     """
     leaves, treedef = jtu.tree_flatten(tree)
-    return treedef.unflatten(
-        checked_p.bind(*leaves, zero=lambda *leaves: zero(treedef.unflatten(leaves)))
-    )
+
+    def zero(*leaves: Array) -> Real[Array, ""]:
+        return eqx.error_if(jnp.zeros(()), is_wrong(treedef.unflatten(leaves)), message)
+
+    return treedef.unflatten(checked_p.bind(*leaves, zero=zero))
 
 
 def needing(zero: Real[Array, ""], tree: PyTree) -> PyTree:
