@@ -113,6 +113,9 @@ if TYPE_CHECKING:
     from ._solvers.splitting import Strang as Strang
     from ._testing import check_field as check_field
     from ._testing import check_terms as check_terms
+    from ._variation.basis import algebra_basis as algebra_basis
+    from ._variation.term import Variation as Variation
+    from ._variation.term import VariationTerm as VariationTerm
 
 __version__ = "0.2.0"
 
@@ -163,6 +166,8 @@ _NAMES_LATER = {
     "_solvers.retraction": ("CayleyRK4",),
     "_solvers.richardson": ("Richardson",),
     "_solvers.splitting": ("BlanesMoan4", "BlanesMoan6", "Splitting", "Strang"),
+    "_variation.basis": ("algebra_basis",),
+    "_variation.term": ("Variation", "VariationTerm"),
 }
 _LATER = {name: f".{module}" for module, names in _NAMES_LATER.items() for name in names}
 _LATER["scenes"] = ".scenes"

@@ -12,7 +12,7 @@ from .._field import AbstractAlgebraElement
 from .._numerics import planar_motion, rigid_motion
 from .._numerics.matmul import matmul
 from .._numerics.quaternion import Frame
-from .elementwise import check_other, check_point, check_real, each
+from .elementwise import check_other, check_point, check_real, each, each_of_its_own
 
 Layout = Literal["wxyz_xyz", "xyz_xyzw", "xyzw_xyz", "xyz_wxyz"]
 PlanarLayout = Literal["unit_complex_xy", "xy_unit_complex"]
@@ -65,6 +65,12 @@ class AbstractMotion(AbstractAlgebraElement):
 
     def tangent(self, point: Float[Array, "..."]) -> Float[Array, "..."]:
         return self._each(self.numerics.tangent, point)
+
+    def framed(self, point: Float[Array, "..."]) -> Any:
+        """Itself on poses, and the velocity on points."""
+        if point.shape[self._num_axes :] == (self.dimension,):
+            return self.tangent(point)
+        return each_of_its_own(self, self._num_axes, point)
 
     def bracket(self, other: Any) -> "AbstractMotion":
         return self._with(self.numerics.bracket, other)
