@@ -25,26 +25,7 @@ from .._term import checked, product
 from .basis import Basis
 from .blocks import Blocks, dependences
 from .frame import Frame, MatrixPart, describe_class
-
-
-class Variation(eqx.Module):
-    """A state, and what `cfjax.VariationTerm` carries beside it; None is not carried.
-
-    The n coordinates of a variation of the state and their order are those of the term
-    (`cfjax.VariationTerm`).
-
-    - `state`: the state.
-    - `transition`: shape `(n, n)`, takes a variation of the start to the one of the state.
-    - `covariance`: shape `(n, n)`, of the state, to first order in the noise.
-    - `sensitivity`: shape `(n, m)`, the derivative by m parameters.
-    - `log_density`: shape `()`, of the state where the start is random.
-    """
-
-    state: PyTree
-    transition: Any = None
-    covariance: Any = None
-    sensitivity: Any = None
-    log_density: Any = None
+from .variation import Variation
 
 
 class VariationTerm(diffrax.AbstractTerm):
@@ -155,9 +136,10 @@ class VariationTerm(diffrax.AbstractTerm):
             p = error_if(start.covariance, _is_not_symmetric, "covariance must be symmetric.")
             p = (p + p.T) / 2
             p = error_if(p, _is_not_semidefinite, "covariance must be positive semidefinite.")
-            start = eqx.tree_at(lambda v: v.covariance, start, p)
+            start = eqx.tree_at(lambda v: v._covariance, start, p)
         zero = here.fault(start).error(jnp.zeros((), dtype))
-        return eqx.tree_at(lambda v: v.state, start, needing(zero, y0))
+        start = eqx.tree_at(lambda v: v.state, start, needing(zero, y0))
+        return start if self.definite else start.by_rows()
 
     def size(self, t: Any, y: PyTree, args: PyTree = None) -> int:
         """The number n of coordinates of a variation of the state y; only its shapes matter."""
@@ -176,7 +158,7 @@ class VariationTerm(diffrax.AbstractTerm):
             )
         here = _Evaluation(self, t, y.state, args)
         here.check(y)
-        return here.rates(y)
+        return here.rates(y).stored_like(y)
 
     def contr(self, t0: Any, t1: Any, **kwargs: Any) -> Any:
         return t1 - t0
@@ -272,6 +254,7 @@ class _Evaluation:
         return fault
 
     def rates(self, y: Variation) -> Variation:
+        y = Variation(y.state, y.transition, y.covariance, y.sensitivity, y.log_density)
         transition = covariance = sensitivity = log_density = a = None
         needs_matrix = y.transition is not None or y.covariance is not None
         if needs_matrix:
