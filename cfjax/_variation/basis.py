@@ -2,10 +2,10 @@
 
 from typing import Any, Literal
 
-import jax
 import jax.numpy as jnp
 import numpy as np
 from jax import lax
+from jax.core import Tracer
 from jaxtyping import Array, Inexact, Real
 
 from .._numerics.matmul import matmul
@@ -73,7 +73,7 @@ class Basis:
     """
 
     def __init__(self, basis: Any):
-        if isinstance(basis, jax.core.Tracer):
+        if isinstance(basis, Tracer):
             raise TypeError("basis must be known when the program is traced: a NumPy array.")
         try:
             basis = np.asarray(basis)
@@ -101,8 +101,8 @@ class Basis:
         defect = np.abs(np.einsum("abd,dij->abij", c, basis) - commutators).max()
         if defect > 1e-6 * np.abs(basis).max() ** 2:
             raise ValueError(
-                "basis must be closed under the commutator, and a commutator of two of its matrices is "
-                f"off its span by {defect:.1g}. cfjax.algebra_basis has those of some algebras."
+                "basis must be closed under the commutator, and one of two of its matrices is off "
+                f"its span by {defect:.1g}. cfjax.algebra_basis has those of some algebras."
             )
         self.matrices = basis
         self.dual = dual if np.iscomplexobj(basis) else dual.real

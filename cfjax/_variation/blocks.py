@@ -22,7 +22,7 @@ _CALLS = {
 
 
 def dependences(
-    fun: Callable[[Sequence[PyTree]], Sequence[PyTree]], inputs: Sequence[PyTree]
+    fun: Callable[[list[PyTree]], Sequence[PyTree]], inputs: list[PyTree]
 ) -> list[set[int]]:
     """For each value that `fun` returns the indices of the inputs that its program needs for it."""
     closed, out = jax.make_jaxpr(fun, return_shape=True)(inputs)

@@ -446,5 +446,5 @@ def _is_not_semidefinite(p: Real[Array, "n n"]) -> Any:
     # In units in which the variances are one.
     scale = jnp.sqrt(jnp.abs(jnp.diagonal(p)))
     scale = jnp.where(scale > 0, scale, 1)
-    smallest = jnp.min(jnp.linalg.eigvalsh(p / (scale[:, None] * scale)), initial=0)
+    smallest = jnp.min(jnp.linalg.eigvalsh(p / jnp.outer(scale, scale)), initial=0)
     return smallest < -np.sqrt(jnp.finfo(p.dtype).eps)
