@@ -10,7 +10,7 @@ import jax.tree_util as jtu
 from jaxtyping import Array, Bool, PyTree, Real
 
 from .._arrays import describe, struct
-from .._field import Rest, is_field
+from .._field import AbstractAlgebraElement, Rest, is_field
 from .._fields.matrix import AbstractOneSided
 from .basis import Basis
 
@@ -172,6 +172,11 @@ def _part(place: str, field: Any, point: PyTree, basis: Basis | None) -> Part:
                 'RightMatrix, such as basis=cfjax.algebra_basis("su", n); for other fields keep '
                 "real and imaginary parts as two parts of the state."
             )
+    if is_field(like) and not isinstance(like, AbstractAlgebraElement):
+        raise TypeError(
+            f"{describe_class(field)}.framed at {place} must return an algebra element or the "
+            f"velocity, got {type(like).__name__}, which has no bracket."
+        )
     if not is_field(like) and struct(like) != struct(point):
         raise ValueError(
             f"{describe_class(field)}.framed at {place} must return a frozen field or what is "

@@ -29,7 +29,83 @@ from .variation import Variation
 
 
 class VariationTerm(diffrax.AbstractTerm):
-    """TODO"""
+    """An equation with its transition matrix, covariance, sensitivities and log-density.
+
+    It is a term around a term of time, such as a `cfjax.LieTerm`. Its state is a
+    `cfjax.Variation`, which `start` makes, and what the start has is carried along:
+
+    ```python
+    def noise(t, q, args, dw):
+        return cfjax.QuaternionRotation(0.02 * dw, frame="body", layout="wxyz")
+
+    term = cfjax.VariationTerm(cfjax.LieTerm(field), noise=noise, channels=3)
+    y0 = term.start(0.0, q0, args, transition=True, covariance=1e-4 * jnp.eye(3))
+    sol = cfjax.integrate(term, cfjax.CF4(), 0.0, 1.0, y0, args, num_steps=100)
+    sol.ys.state, sol.ys.transition, sol.ys.covariance
+    ```
+
+    It works with all solvers of cfjax that take fields which depend on the state, and if all parts
+    of the state move by arrays, with those of diffrax too. The state moves exactly as without
+    variations, and what is carried has the order of the method.
+
+    **Coordinates.** A small change of a state y is written as n numbers `eta`: y changes by the
+    velocity that the element with coordinates `eta` has there. They are
+
+    | the field, and its part of the state | coordinates |
+    | --- | --- |
+    | `QuaternionRotation`; `Rotation` on matrices (3, 3) | `omega`: 3 |
+    | `RigidMotion` and `PlanarMotion` on poses | `omega`, `v`: 6 and 3 |
+    | `LeftMatrix`, `RightMatrix` on matrices, with `basis` | real coefficients of the basis |
+    | all other fields and points, arrays, None | the change itself, entry by entry |
+    | a class of your own | what its `framed` returns, by default the change itself |
+
+    in the frame of the class, `"body"` or `"fixed"`, one part of the state after the other in the
+    order of JAX: keys of a dict are sorted. `slices` says where each part is. An array of leading
+    axes has coordinates for each element.
+
+    **Equations.** With `xi` the coordinates of the field at y, a variation obeys
+    `eta' = D xi[eta] + [xi, eta] = A eta`, with the bracket of the class. Then `Phi' = A Phi`,
+    `P' = A P + P A^T + G G^T` with the columns of G the coordinates of what unit increments of the
+    noise cause, `S' = A S + d xi / d theta`, and `(log p)' = -tr D xi`. The covariance is that to
+    first order in the noise; in that order there is no difference between Itô and Stratonovich.
+    The density is that with respect to the measure which all motions of the frame keep: Haar's for
+    attitudes, unitary and orthogonal matrices; Haar's of rotations times the volume for poses; the
+    uniform one on spheres and frames of vectors, for fields that are skew, as `SphereRotation`;
+    and volume for arrays. It has the unit of one over that measure.
+
+    **Cost.** A stage takes n Jacobian products of the field for A, and at most 2 n^2 k operations
+    for k columns that are carried; blocks of A that the program shows to be zero take none. A
+    sensitivity alone takes m Jacobian products and no A; a log-density alone n, or with `probes`
+    one for each. Where the state and what is carried are at most 16 numbers in vectors of at most
+    7, such as an attitude and its covariance, steps are rewritten as those of small states are.
+
+    **Arguments:**
+
+    - `term`: a term of time: `cfjax.LieTerm`, `diffrax.ODETerm` or a `diffrax.MultiTerm` of such.
+    - `noise`: for the covariance, the function `noise(t, y, args, increment)` that a
+      `cfjax.LieControlTerm` takes, linear in the increment. It returns fields of the classes and
+      frames that the term's field has; None where a part gets no noise. The increment is white
+      noise of unit strength: its variance is the time. Without it P is carried along only.
+    - `channels`: the shape of the increment, or its length.
+    - `parameters`: for sensitivities, a place in args with m numbers in all, as for
+      `equinox.tree_at`: `lambda args: args["bias"]`, or a tuple of such places.
+    - `basis`: for `LeftMatrix` and `RightMatrix` on matrices, shape `(d, n, n)`, linearly
+      independent over the real numbers and closed under the commutator: `cfjax.algebra_basis` has
+      some. It must span the matrices of the field.
+    - `probes`: shape `(k, n)`. The trace of the log-density is the mean of `v^T D xi v` over these
+      vectors v, Hutchinson's estimate, without bias if their entries are random signs.
+    - `definite`: moves P by `cfjax.Congruence` and Phi by `cfjax.LeftMatrix`: P stays definite at
+      any step with `CF3` and `CF4`, and both are exact where A is constant. A flow then costs
+      exponentials of size n and 2 n.
+
+    **Raises** `TypeError` or `ValueError` for arguments of other types or shapes, a basis that is
+    not closed, noise without channels, a term that is driven by a path, complex coordinates, or
+    noise of another frame than the term.
+
+    Sources: for covariances of attitudes and poses, Barfoot, State Estimation for Robotics,
+    Cambridge University Press 2017; for densities, Mathieu and Nickel, Riemannian Continuous
+    Normalizing Flows, 2020.
+    """
 
     term: diffrax.AbstractTerm
     noise: Callable[[Any, Any, Any, Any], PyTree] | None
@@ -102,7 +178,25 @@ class VariationTerm(diffrax.AbstractTerm):
         sensitivity: Any = None,
         log_density: Any = None,
     ) -> Variation:
-        """TODO"""
+        """The state to start from: `y0`, and what is given beside it.
+
+        **Arguments:**
+
+        - `t0`, `y0`, `args`: as for the solve.
+        - `transition`: True for the identity, or an array of shape `(n, n)`.
+        - `covariance`: the covariance of the start, shape `(n, n)`.
+        - `sensitivity`: True for zero, if the start does not depend on the parameters, or an array
+          of shape `(n, m)`.
+        - `log_density`: the logarithm of the density of the start, a number.
+
+        What is None is not carried.
+
+        **Raises** `ValueError` or `TypeError` if nothing is given, for another shape, or for a
+        sensitivity without `parameters`; `ValueError` for noise that the program shows not to be
+        linear. A runtime error for a covariance that is not symmetric, or has a negative
+        eigenvalue in units in which the variances are 1, by more than the root of a unit of
+        rounding; for noise that is not linear; or for a matrix off the span of `basis`.
+        """
         if isinstance(y0, Variation):
             raise TypeError("y0 must be the state alone, got a Variation: start from its .state.")
         y0 = as_state(y0)
