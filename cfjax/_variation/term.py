@@ -345,6 +345,8 @@ class _Evaluation:
                 fault = term.fault(fault, self.t, self.y, self.args, increment)
             except ValueError as error:
                 raise ValueError(f"noise: {error}") from error
+            # It must have the frame of the term.
+            jax.eval_shape(self.of_noise)
         return fault
 
     def rates(self, y: Variation) -> Variation:
@@ -498,7 +500,7 @@ class _Evaluation:
                 values.append(jnp.zeros(part.size, self.dtype))
                 continue
             framed = frame.framed_part(f, point)
-            if describe(framed) != describe(part.like):
+            if not _are_alike(framed, part.like):
                 raise TypeError(
                     f"noise must return for {part.place} a field of the same frame as the term, "
                     f"{describe_class(part.field)} with coordinates {describe(part.like)}, got "
@@ -519,6 +521,14 @@ def _parameters(term: VariationTerm, args: PyTree) -> tuple[Any, Any]:
             f"parameters must be a place in args with real floating numbers, got {describe(nodes)}."
         )
     return ravel_pytree(nodes)
+
+
+def _are_alike(a: PyTree, b: PyTree) -> bool:
+    """Whether both have the same classes, shapes and dtypes, some of which may be weak."""
+    return jtu.tree_structure(a) == jtu.tree_structure(b) and all(
+        x.shape == y.shape and x.dtype == y.dtype
+        for x, y in zip(jtu.tree_leaves(a), jtu.tree_leaves(b), strict=True)
+    )
 
 
 class _NoPath(diffrax.AbstractPath):
