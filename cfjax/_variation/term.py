@@ -296,7 +296,8 @@ class _Evaluation:
         """The coordinates of the field, part by part, at a state given by its parts."""
         args = self.args
         if theta is not None:
-            args = eqx.tree_at(self.term.parameters, args, self.unravel(theta))
+            where: Any = self.term.parameters
+            args = eqx.tree_at(where, args, self.unravel(theta))
         y = self.frame.treedef.unflatten(points)
         return self.frame.coordinates(self.frame.framed(self.field_at(y, args), y))
 

@@ -74,8 +74,10 @@ class Variation(eqx.Module):
         num += self.log_density is not None
         if num > MAX_ENTRIES or any(x.ndim > 1 or x.size > MAX_LENGTH for x in vectors):
             return self
-        apart = [None if x is None else Rows.of(x, half=k == 1) for k, x in enumerate(whole)]
-        return Variation(self.state, *apart, self.log_density)
+        transition, covariance, sensitivity = (
+            None if x is None else Rows.of(x, half=k == 1) for k, x in enumerate(whole)
+        )
+        return Variation(self.state, transition, covariance, sensitivity, self.log_density)
 
     def stored_like(self, other: "Variation") -> "Variation":
         """The same, each matrix stored as that of the other."""
