@@ -9,6 +9,7 @@ import jax.numpy as jnp
 import jax.tree_util as jtu
 from jaxtyping import Array, Bool, PyTree, Real
 
+from .._arguments import time_dtype
 from .._arrays import describe, struct
 from .._field import AbstractAlgebraElement, Rest, is_field
 from .._fields.matrix import AbstractOneSided
@@ -22,18 +23,16 @@ class Part:
     every point freely, or arrays, the velocity.
     """
 
-    def __init__(self, place: str, field: Any, like: PyTree):
-        self.place, self.field, self.like = place, field, like
+    def __init__(self, place: str, field: Any, like: PyTree, dtype: Any):
+        self.place, self.field, self.like, self.dtype = place, field, like, dtype
         leaves, self.treedef = jtu.tree_flatten(like)
         self.shapes = [leaf.shape for leaf in leaves]
         self.size = sum(map(math.prod, self.shapes))
         self.is_element = is_field(like)
 
     def coordinates(self, framed: PyTree) -> Real[Array, " k"]:
-        leaves = jtu.tree_leaves(framed)
-        if not leaves:
-            return jnp.zeros(0)
-        return jnp.concatenate([x.reshape(-1) for x in leaves])
+        leaves = [x.reshape(-1) for x in jtu.tree_leaves(framed)]
+        return jnp.concatenate(leaves) if leaves else jnp.zeros(0, self.dtype)
 
     def element(self, vector: Real[Array, " k"]) -> PyTree:
         leaves, start = [], 0
@@ -88,7 +87,7 @@ class Frame(NamedTuple):
         pairs, treedef = jtu.tree_flatten_with_path(field, is_leaf=is_field)
         points = treedef.flatten_up_to(y)
         parts = [
-            _part("y" + jtu.keystr(path), part, point, basis)
+            _part("y" + jtu.keystr(path), part, point, basis, time_dtype(y))
             for (path, part), point in zip(pairs, points, strict=True)
         ]
         if basis is not None and not any(isinstance(part, MatrixPart) for part in parts):
@@ -145,7 +144,7 @@ def _is_in_basis(field: Any, point: PyTree, basis: Basis | None) -> bool:
     )
 
 
-def _part(place: str, field: Any, point: PyTree, basis: Basis | None) -> Part:
+def _part(place: str, field: Any, point: PyTree, basis: Basis | None, dtype: Any) -> Part:
     like = jax.eval_shape(lambda: _framed(field, point, basis))
     if _is_in_basis(field, point, basis):
         assert basis is not None
@@ -182,7 +181,7 @@ def _part(place: str, field: Any, point: PyTree, basis: Basis | None) -> Part:
             f"{describe_class(field)}.framed at {place} must return a frozen field or what is "
             f"shaped like its point, {describe(point)}, got {describe(like)}."
         )
-    return Part(place, field, like)
+    return Part(place, field, like, dtype)
 
 
 def describe_class(part: Any) -> str:
