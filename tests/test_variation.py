@@ -389,6 +389,18 @@ def test_log_density_of_angles():
     np.testing.assert_allclose(found.transition, np.diag(growth), atol=1e-6)
 
 
+def test_the_density_takes_no_part_of_the_bracket():
+    """Affine maps of a line, whose tr ad is not 0. Motions from the left keep Haar's measure."""
+    basis = np.array([[[1.0, 0], [0, 0]], [[0, 1.0], [0, 0]]])
+    a = np.tensordot([0.7, -0.4], basis, 1)
+    term = VariationTerm(LieTerm(lambda t, x, args: cfjax.LeftMatrix(args)), basis=basis)
+    x0 = np.array([[2.0, 0.3], [0, 1]])
+    y0 = term.start(0.0, x0, jnp.asarray(a), log_density=0.2, transition=True)
+    found = end(term, CF4(), y0, jnp.asarray(a))
+    np.testing.assert_allclose(found.log_density, 0.2, atol=1e-15)
+    np.testing.assert_allclose(np.linalg.det(found.transition), np.exp(0.7), rtol=1e-6)
+
+
 # Orders
 
 
