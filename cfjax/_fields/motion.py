@@ -130,7 +130,7 @@ class AbstractMotion(AbstractAlgebraElement):
     def _check_point(self, point: Array) -> None:
         check_point(self, self.vector, self._num_axes, self._pose_shapes, point)
 
-    def _each(self, fun: Any, point: Array) -> Array:
+    def _each(self, fun: Any, point: Array) -> Any:
         axes = self._num_axes
         self._check_point(point)
         dtype = getattr(self, self.vector).dtype
