@@ -121,6 +121,9 @@ if TYPE_CHECKING:
     from ._solvers.stabilised import RKL3 as RKL3
     from ._testing import check_field as check_field
     from ._testing import check_terms as check_terms
+    from ._variation.basis import algebra_basis as algebra_basis
+    from ._variation.term import VariationTerm as VariationTerm
+    from ._variation.variation import Variation as Variation
 
 __version__ = "0.2.0"
 
@@ -177,6 +180,9 @@ _NAMES_LATER = {
     "_solvers.spectral_radius": ("spectral_radius",),
     "_solvers.stabilised": ("RKG2", "RKL2", "RKL3"),
     "_solvers.splitting": ("BlanesMoan4", "BlanesMoan6", "Splitting", "Strang"),
+    "_variation.basis": ("algebra_basis",),
+    "_variation.term": ("VariationTerm",),
+    "_variation.variation": ("Variation",),
 }
 _LATER = {name: f".{module}" for module, names in _NAMES_LATER.items() for name in names}
 _LATER["scenes"] = ".scenes"

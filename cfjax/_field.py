@@ -106,6 +106,21 @@ class AbstractFrozenField(eqx.Module):
         """
         return type(self).combine((0.5,), (self,)).flow(point)
 
+    def framed(self, point: Any) -> Any:
+        """What has the same velocity at `point`, in the coordinates of variations.
+
+        `cfjax.VariationTerm` writes a variation of a point in the coordinates, all arrays, of what
+        this returns:
+
+        - an algebra element that moves every point freely, as a rotation moves attitudes: no
+          element but zero has velocity zero at a point. It has an own angular velocity, or what
+          its coordinates are, for each element of leading axes;
+        - by default the velocity, which is an array.
+
+        It must be linear in the field. `cfjax.check_field` checks this.
+        """
+        return self.tangent(point)
+
     @classmethod
     def combine(cls, weights: Sequence[Weight], fields: Sequence[Any]) -> Any:
         """The field `sum_i weights[i] * fields[i]`. Weights are real scalars.

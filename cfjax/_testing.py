@@ -11,8 +11,10 @@ import jax.numpy as jnp
 import jax.tree_util as jtu
 import numpy as np
 from jax import lax
+from jax.flatten_util import ravel_pytree
 from jaxtyping import PyTree
 
+from ._arrays import struct
 from ._control_term import LieControlTerm, fault_of_increments, is_driven
 from ._field import (
     AbstractAlgebraElement,
@@ -21,6 +23,7 @@ from ._field import (
     describe,
     flow,
     from_chart,
+    is_field,
     to_chart,
 )
 from ._numerics.checks import Fault
@@ -45,6 +48,8 @@ def check_field(fields: Sequence[AbstractFrozenField], point: PyTree) -> None:
       the point and to the same flow; and if `defect` says how far a point is off the manifold, the
       flow stays on the manifold, also over a hundred flows one after the other, along the field and
       along 2, 4, 8 and 16 times the field: rounding must not grow from flow to flow;
+    - `framed`, if defined, is linear in the field, has the velocity of the field at the point, and
+      is an algebra element that moves the point freely, or shaped like the point;
     - for algebra elements, `[a, b]` has the sign and the size that `cfjax.AbstractAlgebraElement`
       says: its tangent is `DX_a X_b - DX_b X_a`, with the tangents of a and b as functions of the
       point. This is compared for `[a, b]`, for `[b, a]` and for the bracket of `[a, b]` with the
@@ -83,6 +88,9 @@ def check_field(fields: Sequence[AbstractFrozenField], point: PyTree) -> None:
     for field, in_chart in zip(fields, charted, strict=True):
         _compare(name, _of_flow(field, in_chart, charted[0], start, point), rtol)
     _compare(name, _of_combine(fields, charted, start), rtol)
+    if type(fields[0]).framed is not AbstractFrozenField.framed:
+        _check_framed(name, fields, point)
+        _compare(name, _of_framed(fields, point), rtol)
     if all(isinstance(field, AbstractAlgebraElement) for field in charted):
         _compare(name, _of_bracket(charted, start), rtol)
 
@@ -287,6 +295,56 @@ def _of_combine(fields: Sequence[Any], charted: Sequence[Any], start: Any) -> _C
         )
         for what, terms in [("in the fields", fields), ("in what has entered", charted)]
     ]
+
+
+def _check_framed(name: str, fields: Sequence[Any], point: PyTree) -> None:
+    """Raises `ValueError` unless `framed` returns what can hold the coordinates of a variation."""
+    framed = eqx.filter_eval_shape(fields[0].framed, point)
+    if is_field(framed) and not isinstance(framed, AbstractAlgebraElement):
+        raise ValueError(
+            f"{name}.framed must return an algebra element or the velocity, got "
+            f"{type(framed).__name__}, which has no bracket."
+        )
+    if not is_field(framed) and struct(framed) != struct(point):
+        raise ValueError(
+            f"{name}.framed must return an algebra element, or what is shaped like the point, "
+            f"{describe(point)}, got {describe(framed)}."
+        )
+    if not is_field(framed):
+        return
+    zero = jtu.tree_map(lambda x: jnp.zeros(x.shape, x.dtype), framed)
+    vector, unravel = ravel_pytree(zero)
+    velocity = lambda vector: ravel_pytree(unravel(vector).tangent(point))[0]  # noqa: E731
+    matrix = np.asarray(jax.jit(jax.vmap(velocity))(jnp.eye(len(vector), dtype=vector.dtype)))
+    values = np.linalg.svd(matrix, compute_uv=False)
+    rtol = np.sqrt(np.finfo(matrix.dtype).eps)
+    if len(values) < len(matrix) or values[-1] <= rtol * values[0]:
+        raise ValueError(
+            f"{name}.framed must return elements that move the point freely, but one of "
+            f"{type(framed).__name__} that is not zero has velocity zero there. Return the "
+            "velocity, which is the default."
+        )
+
+
+@eqx.filter_jit
+def _of_framed(fields: Sequence[Any], point: PyTree) -> _Comparisons:
+    weights = [0.7 * (-0.6) ** k for k in range(len(fields))]
+    framed = [field.framed(point) for field in fields]
+    expected = combine(weights, framed)
+    comparisons: _Comparisons = [
+        (
+            "framed must be linear in the field",
+            type(fields[0]).combine(weights, fields).framed(point),
+            expected,
+            _scale(framed),
+        )
+    ]
+    for field, element in zip(fields, framed, strict=True):
+        found = element.tangent(point) if is_field(element) else element
+        velocity = field.tangent(point)
+        requirement = "framed must have the velocity of the field at the point"
+        comparisons.append((requirement, found, velocity, _scale((point, velocity))))
+    return comparisons
 
 
 @eqx.filter_jit

@@ -29,7 +29,8 @@ ROWS = [
     {"_control_term"},
     # Fields, and coefficients of methods.
     {"_fields", "_methods"},
-    {"_solvers"},
+    # Steps; and terms of variations.
+    {"_solvers", "_variation"},
     {"_step_back"},
     {"_integrate"},
     {"_batch", "_testing"},

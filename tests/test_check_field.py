@@ -29,6 +29,7 @@ SPECTRUM = RNG.standard_normal(4)
 F32, F64, C64 = np.float32, np.float64, np.complex64
 BUILT_IN: dict[str, tuple[Any, Any]] = {
     "Rotation": (lambda: cfjax.Rotation(random(F64, 3)), random(F64, 3, 2)),
+    "Rotation, attitude": (lambda: cfjax.Rotation(random(F64, 3)), frame(F64, 3, 3)),
     "Rotation, float32": (lambda: cfjax.Rotation(random(F32, 3)), random(F32, 3)),
     "LeftMatrix": (lambda: cfjax.LeftMatrix(random(C64, 2, 2)), random(C64, 2, 3)),
     "RightMatrix": (lambda: cfjax.RightMatrix(random(F64, 2, 2)), random(F64, 2)),
@@ -98,6 +99,34 @@ POINT = random(F64, 2)
 
 def test_a_field_of_a_users_own():
     cfjax.check_field(fields_of(Line), POINT)
+
+
+@pytest.mark.parametrize(
+    "framed, text",
+    [
+        (lambda self, point: self, "must return elements that move the point freely"),
+        (lambda self, point: 2 * self.tangent(point), "must have the velocity of the field"),
+        (lambda self, point: self.tangent(point) ** 2, "must be linear in the field"),
+        (lambda self, point: self.tangent(point)[0], "must return an algebra element, or"),
+        (lambda self, point: Still(self.b), "must return an algebra element or the velocity"),
+    ],
+)
+def test_mistakes_in_framed_are_named(framed, text):
+    cls = type("Framed", (Line,), {"framed": framed})
+    with pytest.raises(ValueError, match=f"Framed.framed {text}"):
+        cfjax.check_field(fields_of(cls), POINT)
+
+
+class Still(AbstractFrozenField):
+    """A field without a bracket."""
+
+    v: jax.Array
+
+    def flow(self, point):
+        return point + self.v
+
+    def tangent(self, point):
+        return self.v
 
 
 def opposite_bracket(self, other):

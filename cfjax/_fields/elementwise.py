@@ -10,7 +10,7 @@ import jax.tree_util as jtu
 from jaxtyping import Array, Bool, PyTree, Real
 
 from .._arrays import Weight
-from .._field import AbstractAlgebraElement, AbstractFrozenField, combine
+from .._field import AbstractAlgebraElement, AbstractFrozenField, combine, is_field
 
 
 def each(fun: Callable[..., PyTree], num_axes: int) -> Callable[..., PyTree]:
@@ -55,6 +55,17 @@ def each(fun: Callable[..., PyTree], num_axes: int) -> Callable[..., PyTree]:
         )
 
     return mapped
+
+
+def each_of_its_own(field: Any, num_axes: int, point: Array) -> Any:
+    """The same field with arrays of its own for each element of the leading axes of a point."""
+    axes = point.shape[:num_axes]
+
+    def broadcast(x: Array) -> Array:
+        shape = *axes, *x.shape[num_axes:]
+        return x if x.shape == shape else jnp.broadcast_to(x, shape)
+
+    return jtu.tree_map(broadcast, field)
 
 
 def check_point(
@@ -174,6 +185,10 @@ class Elementwise(AbstractFrozenField):
 
     def increment(self, point: Any) -> Any:
         return self._each(lambda field, point: field.increment(point))(self.field, point)
+
+    def framed(self, point: Any) -> Any:
+        framed = self._each(lambda field, point: field.framed(point))(self.field, point)
+        return elementwise(framed, self.num_axes) if is_field(framed) else framed
 
     @classmethod
     def combine(cls, weights: Sequence[Weight], fields: Sequence[Any]) -> Any:

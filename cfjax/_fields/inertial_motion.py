@@ -7,7 +7,7 @@ import jax.numpy as jnp
 from jaxtyping import Array, ArrayLike, Float
 
 from .._numerics import inertial_motion
-from .extended_motion import LAYOUTS, LAYOUTS_IN_WORDS, Layout
+from .extended_motion import LAYOUTS, LAYOUTS_IN_WORDS, ExtendedMotion, Layout
 from .motion import AbstractMotion
 
 
@@ -119,3 +119,8 @@ class InertialMotion(AbstractMotion):
                 )
         self._check_dtypes()
         self._check_layout()
+
+    def framed(self, point: Float[Array, "..."]) -> ExtendedMotion:
+        """The motion in the frame of the body that gives a pose the same velocity."""
+        omega, a, v = self._each(inertial_motion.in_body, point)
+        return ExtendedMotion(omega=omega, a=a, v=v, frame="body", layout=self.layout)

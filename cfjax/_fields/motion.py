@@ -10,7 +10,7 @@ from jaxtyping import Array, Bool, Float, Real
 from .._field import AbstractAlgebraElement
 from .._numerics.matmul import matmul
 from .._numerics.quaternion import Frame
-from .elementwise import check_other, check_point, check_real, each
+from .elementwise import check_other, check_point, check_real, each, each_of_its_own
 
 
 class AbstractMotion(AbstractAlgebraElement):
@@ -130,7 +130,7 @@ class AbstractMotion(AbstractAlgebraElement):
     def _check_point(self, point: Array) -> None:
         check_point(self, self.vector, self._num_axes, self._pose_shapes, point)
 
-    def _each(self, fun: Any, point: Array) -> Array:
+    def _each(self, fun: Any, point: Array) -> Any:
         axes = self._num_axes
         self._check_point(point)
         dtype = getattr(self, self.vector).dtype
@@ -169,6 +169,12 @@ class AbstractFramedMotion(AbstractMotion):
         if self.frame not in ("body", "fixed"):
             raise ValueError(f'frame must be "body" or "fixed", got {self.frame!r}.')
         self._check_layout()
+
+    def framed(self, point: Float[Array, "..."]) -> Any:
+        """Itself on poses, and the velocity on points."""
+        if point.shape[self._num_axes :] == (self.dimension,):
+            return self.tangent(point)
+        return each_of_its_own(self, self._num_axes, point)
 
     def dexpinv(self, other: Any, degree: int) -> Any:
         """Exact, whatever the degree, for angles below a full turn, whatever the velocities are."""

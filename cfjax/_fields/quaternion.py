@@ -12,7 +12,7 @@ from .._arrays import describe
 from .._field import AbstractAlgebraElement
 from .._numerics.quaternion import Frame, Layout, check_choice, increment, times
 from .._numerics.rotate import cross_product, dexpinv, has_dexpinv
-from .elementwise import check_point, each
+from .elementwise import check_point, each, each_of_its_own
 from .rotation import check_angular_velocity
 
 
@@ -64,6 +64,9 @@ class QuaternionRotation(AbstractAlgebraElement):
 
     def tangent(self, point: Float[Array, "*batch 4"]) -> Float[Array, "*batch 4"]:
         return self._each(times, point)
+
+    def framed(self, point: Float[Array, "*batch 4"]) -> "QuaternionRotation":
+        return each_of_its_own(self, self._num_axes, point)
 
     def bracket(self, other: Any) -> "QuaternionRotation":
         return self._with(cross_product, other)

@@ -9,7 +9,7 @@ from jaxtyping import Array, Bool, Float
 
 from .._field import AbstractAlgebraElement
 from .._numerics.rotate import cross_product, dexpinv, has_dexpinv, increment, mean, rotate
-from .elementwise import check_other, check_point, check_real, each
+from .elementwise import check_other, check_point, check_real, each, each_of_its_own
 
 
 class Rotation(AbstractAlgebraElement):
@@ -51,6 +51,12 @@ class Rotation(AbstractAlgebraElement):
 
     def mean(self, point: Float[Array, "..."]) -> Float[Array, "..."]:
         return self._each(mean, point)
+
+    def framed(self, point: Float[Array, "..."]) -> Any:
+        """Itself on matrices (3, 3), which are attitudes, and the velocity on other points."""
+        if point.shape[self._num_axes :] != (3, 3):
+            return self.tangent(point)
+        return each_of_its_own(self, self._num_axes, point)
 
     def bracket(self, other: Any) -> "Rotation":
         return self._with(cross_product, other)

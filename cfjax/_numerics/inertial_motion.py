@@ -29,6 +29,7 @@ import jax.numpy as jnp
 from jaxtyping import Array, Float
 
 from . import rigid_motion, rotate
+from .matmul import matmul
 from .quaternion import half, product
 from .rigid_motion import (
     Turn,
@@ -104,6 +105,29 @@ def increment(
     # V moves on in half of the time on average.
     fixed = s + (t / 2) * g
     return _increment(ws, by_force, turned, g, t, fixed, x, indices, exponential, turn)
+
+
+@functools.partial(jax.jit, static_argnames=("indices",))
+def in_body(
+    w: Float[Array, "3"],
+    f: Float[Array, "3"],
+    g: Float[Array, "3"],
+    t: Float[Array, ""],
+    r: Float[Array, "3"],
+    s: Float[Array, "3"],
+    x: Float[Array, "..."],
+    indices: tuple[int, ...],
+) -> tuple[Float[Array, "3"], Float[Array, "3"], Float[Array, "3"]]:
+    """w, and the velocities of V and P in the coordinates of the body: `f + R^T g` and so on."""
+    if x.ndim == 1:
+        q, velocity, _ = pose_parts(x, indices)
+        back = [q[0], *(-b for b in q[1:])]
+        turned = lambda v: pack(rotated(back, entries(v)))  # noqa: E731
+        velocity = pack(velocity)
+    else:
+        turned = lambda v: matmul(x[:3, :3].T, v)  # noqa: E731
+        velocity = x[:3, 3]
+    return w, f + turned(g), r + turned(t * velocity + s)
 
 
 @jax.jit

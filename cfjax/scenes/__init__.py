@@ -5,6 +5,7 @@ from . import annealing as annealing
 from . import cat as cat
 from . import covariance as covariance
 from . import damped_qubit as damped_qubit
+from . import flow_on_spheres as flow_on_spheres
 from . import gray_scott as gray_scott
 from . import harmonic_maps as harmonic_maps
 from . import heat as heat
@@ -15,6 +16,7 @@ from . import kuramoto_sivashinsky as kuramoto_sivashinsky
 from . import landau_zener as landau_zener
 from . import macrospin as macrospin
 from . import porous_medium as porous_medium
+from . import preintegration as preintegration
 from . import rigid_body as rigid_body
 from . import rotational_diffusion as rotational_diffusion
 from . import spacecraft as spacecraft
@@ -23,6 +25,7 @@ from . import spins as spins
 from . import stiefel as stiefel
 from . import tennis_racket as tennis_racket
 from . import toda as toda
+from . import transition as transition
 from . import transmon as transmon
 from . import vortices as vortices
 from . import wilson_flow as wilson_flow

@@ -25,7 +25,7 @@ WITH_NOISE = {"imu", "macrospin", "rotational_diffusion"}
 def test_every_file_is_a_scene_of_the_package():
     public = {name for name, value in vars(scenes).items() if isinstance(value, Scene)}
     assert public == {*NAMES}
-    assert len(NAMES) == 27
+    assert len(NAMES) == 30
 
 
 @pytest.mark.parametrize("name", NAMES)

@@ -1,0 +1,168 @@
+"""Preintegration: exact readings, schemes and their orders, and a covariance by quadrature."""
+
+from pathlib import Path
+
+import diffrax
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from scipy.spatial.transform import Rotation
+
+import cfjax
+from cfjax.scenes import preintegration
+from cfjax.scenes.preintegration import SCHEMES, Sensor
+
+
+def rotations(t):
+    return Rotation.from_quat(np.roll(preintegration.reference(t)[..., :4], -1, axis=-1))
+
+
+def test_readings_are_differences_of_the_path():
+    """Of angles between attitudes and of positions, by differences."""
+    t, h = 3.3, 1e-3
+    before, now, after = preintegration.reference(np.array([t - h, t, t + h]))
+    omega, force = preintegration.readings(t)
+    turn = (rotations(t - h).inv() * rotations(t + h)).as_rotvec() / (2 * h)
+    # Second derivatives of the readings, of some ten, times h^2 / 6, and rounding over h.
+    np.testing.assert_allclose(omega, turn, rtol=0, atol=1e-5)
+    np.testing.assert_allclose(now[4:7], (after[7:] - before[7:]) / (2 * h), rtol=0, atol=1e-5)
+    acceleration = (after[4:7] - before[4:7]) / (2 * h)
+    thrust = rotations(t).inv().apply(acceleration - preintegration.gravity)
+    np.testing.assert_allclose(force, thrust, rtol=0, atol=1e-5)
+    # A drone is pushed along its own axis, and pays for gravity.
+    np.testing.assert_allclose(force[:2], 0, rtol=0, atol=1e-14)
+    assert 8 < force[2] < 12
+
+
+def test_the_velocity_is_that_of_the_field():
+    y = jnp.asarray(preintegration.reference(2.0))
+    found = cfjax.tangent(preintegration.field(2.0, y), y)
+    np.testing.assert_allclose(preintegration.velocity(2.0, y), found, rtol=0, atol=1e-14)
+
+
+def test_a_flight_against_the_reference():
+    with cfjax.rewriting(False):
+        ends = [
+            cfjax.integrate(**preintegration.problem(), solver=cfjax.CF4(), num_steps=n).ys[-1]
+            for n in (160, 320)
+        ]
+    exact = preintegration.reference(preintegration.t1)
+    errors = [preintegration.error(np.asarray(y), exact) for y in ends]
+    assert abs(np.log2(errors[0] / errors[1]) - 4) < 0.3
+    assert errors[1] < 1e-4
+
+
+ORDERS = {
+    "on the manifold, held": (1, 1, 1),
+    "on the tangent space, held": (1, 1, 1),
+    "on the manifold, mean of two": (2, 1, 1),
+    "exact flow, held": (1, 1, 1),
+    "exact flow, mean of two": (2, 2, 2),
+    "CF4, linear interpolation": (2, 2, 2),
+    "CF4, cubic interpolation": (4, 4, 4),
+}
+
+
+@pytest.mark.parametrize(
+    "name",
+    [
+        pytest.param(name, marks=() if "exact" in name or "cubic" in name else pytest.mark.slow)
+        for name in SCHEMES
+    ],
+)
+def test_orders_of_the_schemes(name):
+    scheme = SCHEMES[name]
+    coarse, fine = (np.array(preintegration.errors(scheme, rate)) for rate in (50, 100))
+    # Errors of the next order are a tenth of these.
+    np.testing.assert_allclose(np.log2(coarse / fine), ORDERS[name], rtol=0, atol=0.3)
+
+
+def test_schemes_agree_where_readings_are_constant():
+    """With no turn even the simplest is exact."""
+    seen = preintegration.Samples(np.zeros((11, 3)), np.tile([1.0, -2.0, 9.0], (11, 1)), 0.1)
+    y = preintegration.y0(2.0)
+    turned = rotations(2.0).apply([1.0, -2.0, 9.0]) + preintegration.gravity
+    want = np.r_[y[:4], y[4:7] + turned, y[7:] + y[4:7] + turned / 2]
+    for name, scheme in SCHEMES.items():
+        # Ten steps of numbers of ten.
+        np.testing.assert_allclose(scheme(seen, y), want, rtol=0, atol=1e-13, err_msg=name)
+
+
+def covariance_by_quadrature(t1, args):
+    """P in the body's frame, by Gauss's rule: errors of turned attitudes stay, others add up."""
+
+    def hat(w):
+        return np.array([[0, -w[2], w[1]], [w[2], 0, -w[0]], [-w[1], w[0], 0]])
+
+    x, weights = np.polynomial.legendre.leggauss(60)
+    t, weights = t1 * (1 + x) / 2, t1 * weights / 2
+    end = preintegration.reference(t1)
+    p = np.zeros((9, 9))
+    for s, weight in zip(t, weights, strict=True):
+        now, left = preintegration.reference(s), t1 - s
+        # What the force alone has made since s: velocity and position without gravity.
+        v = end[4:7] - now[4:7] - left * preintegration.gravity
+        r = end[7:] - now[7:] - left * now[4:7] - left**2 / 2 * preintegration.gravity
+        m = np.eye(9)
+        m[3:6, :3], m[6:, :3], m[6:, 3:6] = -hat(v), -hat(r), left * np.eye(3)
+        turn = np.kron(np.eye(3), rotations(s).as_matrix())
+        g = m @ turn @ np.diag([args.gyro_noise] * 3 + [args.force_noise] * 3 + [0] * 3)
+        p += weight * g @ g.T
+    back = np.kron(np.eye(3), rotations(t1).as_matrix().T)
+    return back @ p @ back.T
+
+
+@pytest.mark.slow
+def test_the_covariance_against_quadrature():
+    args = Sensor()
+    times, ys = preintegration.covariances(args, num_steps=320)
+    for k in (80, 320):
+        want = covariance_by_quadrature(times[k], args)
+        scale = np.sqrt(np.outer(np.diag(want), np.diag(want)))
+        # Of a method of order 4 with steps of 1/20, in units of the standard deviations.
+        np.testing.assert_allclose(ys.covariance[k] / scale, want / scale, rtol=0, atol=1e-4)
+
+
+@pytest.mark.slow
+def test_the_covariance_of_samples():
+    """Positions of 400 flights with noise, at the end."""
+    args, count = Sensor(), 400
+    plain = preintegration.problem()
+
+    @jax.jit
+    @jax.vmap
+    def flight(key):
+        path = diffrax.UnsafeBrownianPath((6,), key)
+        term = diffrax.MultiTerm(
+            cfjax.LieTerm(preintegration.field), cfjax.LieControlTerm(preintegration.noise, path)
+        )
+        problem = plain | {"term": term, "args": args}
+        return cfjax.integrate(**problem, solver=cfjax.CF3(), num_steps=400).ys[-1]
+
+    ends = np.asarray(flight(jax.random.split(jax.random.key(0), count)))
+    off = ends[:, 7:] - preintegration.reference(preintegration.t1)[7:]
+    turn = rotations(preintegration.t1).as_matrix()
+    want = turn @ covariance_by_quadrature(preintegration.t1, args)[6:, 6:] @ turn.T
+    found = off.T @ off / count
+    spread = np.sqrt((np.outer(np.diag(want), np.diag(want)) + want**2) / count)
+    assert np.all(np.abs(found - want) < 4 * spread)
+
+
+@pytest.mark.slow
+def test_the_table_of_the_page():
+    text = (Path(__file__).parents[2] / "docs" / "state" / "pose.md").read_text()
+    table = text.split("| scheme |")[1].split("\n\n")[0]
+    rows = [[cell.strip() for cell in row.split("|")[1:-1]] for row in table.splitlines()[2:]]
+    assert [", ".join(row[:2]) for row in rows] == list(SCHEMES)
+    for row, scheme in zip(rows, SCHEMES.values(), strict=True):
+        found = preintegration.errors(scheme, 100)
+        # Two digits are written.
+        np.testing.assert_allclose([float(x) for x in row[2:5]], found, rtol=0.05)
+
+
+@pytest.mark.slow
+def test_the_picture():
+    figure = preintegration.picture()
+    assert len(figure.axes) == 2
+    figure.draw_without_rendering()

@@ -1,0 +1,277 @@
+"""Covariance, bias Jacobian and transition matrix of windows of an inertial measurement unit."""
+
+import functools
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+import scipy.linalg
+from numpy.polynomial import Polynomial
+from scipy.spatial.transform import Rotation as SciPyRotation
+
+import cfjax
+from cfjax import CF4, RKMK8, InertialMotion, LieTerm, Variation, VariationTerm
+
+Q0 = np.array([0.5, 0.1, -0.7, 0.5])
+X0 = np.concatenate([Q0, [0.3, -0.2, 0.5], [1.5, 0.7, -0.4]])
+X0[:4] /= np.linalg.norm(Q0)
+OTHER = np.concatenate([X0[[1, 0, 3, 2]], [-4.0, 3.0, 0.1], [0.4, -8.0, 2.0]])
+GRAVITY = np.array([0.4, -1.1, -9.6])
+P0 = np.diag([0.1, 0.2, 0.3, 0.4, 0.5, 0.6, 0.7, 0.8, 0.9])
+# Unequal and not diagonal.
+GAIN = np.random.default_rng(4).normal(size=(6, 6)) * np.repeat([0.1, 0.4], 3)[:, None]
+
+
+@pytest.fixture(autouse=True, scope="module")
+def as_traced():
+    """Most of these programs run once, and compile faster as they are."""
+    with cfjax.rewriting(False):
+        yield
+
+
+def imu(omega, force, gravity=GRAVITY, time=1.0):
+    return InertialMotion(omega=omega, force=force, gravity=gravity, time=time, layout="wxyz_v_p")
+
+
+def noise(t, x, args, dw):
+    dw = jnp.asarray(GAIN) @ dw
+    return imu(dw[:3], dw[3:], gravity=0 * dw[:3], time=0.0)
+
+
+def hat(w):
+    return np.array([[0, -w[2], w[1]], [w[2], 0, -w[0]], [-w[1], w[0], 0]])
+
+
+def matrix_of(omega, force):
+    """A of `eta' = A eta`, in which neither the state nor gravity is."""
+    a = np.kron(np.eye(3), -hat(omega))
+    a[3:6, :3] = -hat(force)
+    a[6:, 3:6] = np.eye(3)
+    return a
+
+
+def end(term, solver, y0, args=None, num_steps=20):
+    ys = cfjax.integrate(term, solver, 0.0, 1.0, y0, args, num_steps=num_steps).ys
+    return jax.tree.map(lambda x: x[-1], ys)
+
+
+# A window with the attitude R0 exp(alpha e1) exp(beta e3) and a force that is a polynomial.
+
+ALPHA, BETA = Polynomial([0.0, 0.7, 0.4, -0.5]), Polynomial([0.0, -0.9, 0.3, 0.8])
+FORCES = [Polynomial([0.3, 1.0, -2.0]), Polynomial([-1.0, 0.5, 1.0]), Polynomial([9.0, -1.0, 0.7])]
+
+
+def window(t, x, bias):
+    def value(p):
+        return jnp.polyval(jnp.asarray(p.coef[::-1]), t)
+
+    b, da, db = map(value, (BETA, ALPHA.deriv(), BETA.deriv()))
+    omega = jnp.stack([da * jnp.cos(b), -da * jnp.sin(b), db])
+    return imu(omega - bias[:3], jnp.stack([value(p) for p in FORCES]) - bias[3:])
+
+
+NO_BIAS = jnp.zeros(6)
+TERM = VariationTerm(LieTerm(window), noise=noise, channels=6, parameters=lambda bias: bias)
+
+
+def start(x0=X0, **kwargs):
+    carried = kwargs or dict(transition=True, covariance=P0, sensitivity=True)
+    return TERM.start(0.0, x0, NO_BIAS, **carried)
+
+
+def attitude(t):
+    turns = SciPyRotation.from_rotvec(np.multiply.outer(ALPHA(t), [1.0, 0, 0]))
+    return (turns * SciPyRotation.from_rotvec(np.multiply.outer(BETA(t), [0, 0, 1.0]))).as_matrix()
+
+
+@functools.cache
+def nodes(n):
+    """Gauss's rule on [0, 1]."""
+    x, weights = np.polynomial.legendre.leggauss(n)
+    return (1 + x) / 2, weights / 2
+
+
+def propagator(t, n):
+    """The matrix that takes errors in the coordinates of the start from 0 to t, and R there.
+
+    With R the attitude, R times an error of the attitude is constant; R times that of the velocity
+    falls by the cross product of the velocity that the force has made with it; R times that of the
+    position grows by that of the velocity.
+    """
+    s, weights = nodes(n)
+    forces = np.stack([p(t * s) for p in FORCES], axis=1)
+    turned = np.einsum("nij,nj->ni", attitude(t * s), forces)
+    velocity, position = t * weights @ turned, t**2 * (weights * (1 - s)) @ turned
+    m = np.eye(9)
+    m[3:6, :3], m[6:, :3], m[6:, 3:6] = -hat(velocity), -hat(position), t * np.eye(3)
+    return m, np.kron(np.eye(3), attitude(t))
+
+
+@functools.cache
+def exact(n=40):
+    """Phi, P and the Jacobian by the biases at the end, by Gauss's rule with n nodes."""
+    m1, turn1 = propagator(1.0, n)
+    phi = turn1.T @ m1
+    g = np.zeros((9, 6))
+    g[:6] = GAIN
+    b = -np.eye(9, 6)
+    p, jacobian = phi @ P0 @ phi.T, np.zeros((9, 6))
+    for t, weight in zip(*nodes(n), strict=True):
+        m, turn = propagator(t, n)
+        from_t = turn1.T @ m1 @ np.linalg.inv(m) @ turn
+        p += weight * from_t @ g @ (from_t @ g).T
+        jacobian += weight * from_t @ b
+    return phi, p, jacobian
+
+
+def test_the_reference_is_exact_to_rounding():
+    for found, other in zip(exact(), exact(60), strict=True):
+        # Entries of at most 60, sums of 40 and 60.
+        np.testing.assert_allclose(found, other, rtol=0, atol=2e-14)
+    # The window is not nearly still, nor its covariance nearly diagonal.
+    assert np.abs(exact()[0]).max() > 4
+    p = exact()[1]
+    assert np.abs(p / np.sqrt(np.outer(np.diag(p), np.diag(p))) - np.eye(9)).max() > 0.5
+
+
+def test_order_of_cf4():
+    errors = []
+    for num_steps in (20, 40):
+        y = end(TERM, CF4(), start(), NO_BIAS, num_steps)
+        found = y.transition, y.covariance, y.sensitivity
+        errors.append([np.abs(a - b).max() for a, b in zip(found, exact(), strict=True)])
+    slopes = np.log2(np.divide(*errors))
+    assert np.all(np.abs(slopes - 4) < 0.25), slopes
+
+
+def test_errors_of_rkmk8():
+    y = end(TERM, RKMK8(), start(), NO_BIAS, 40)
+    for found, want in zip((y.transition, y.covariance, y.sensitivity), exact(), strict=True):
+        # Ten times the error that was seen, of entries of up to 60.
+        np.testing.assert_allclose(found, want, rtol=0, atol=1e-12)
+
+
+def test_the_matrix_of_errors_depends_on_the_readings_alone():
+    omega, force = np.array([0.4, -0.3, 0.8]), np.array([1.0, 0.5, -0.7])
+    term = VariationTerm(LieTerm(lambda t, x, args: imu(omega, force)))
+    for x0 in (X0, OTHER):
+        y = term.start(0.0, x0, transition=True)
+        a = term.vf_prod(0.0, y, None, 1.0).transition
+        # Velocities of 5 and a gravity of 10 cancel.
+        np.testing.assert_allclose(a, matrix_of(omega, force), rtol=0, atol=4e-15)
+
+
+def test_a_window_does_not_depend_on_its_start():
+    one, other = (end(TERM, CF4(), start(x0), NO_BIAS, 20) for x0 in (X0, OTHER))
+    assert np.abs(one.state - other.state).max() > 1
+    for name in ("transition", "covariance", "sensitivity"):
+        a, b = getattr(one, name), getattr(other, name)
+        # 20 steps, from rounding of A.
+        np.testing.assert_allclose(a, b, rtol=0, atol=1e-14 * np.abs(a).max(), err_msg=name)
+
+
+@pytest.mark.slow
+def test_a_bias_in_the_state_adds_its_share():
+    def with_bias(t, y, args):
+        return {"bias": None, "x": window(t, y["x"], y["bias"])}
+
+    def noise_of_both(t, y, args, dw):
+        return {"bias": None, "x": noise(t, y["x"], args, dw)}
+
+    p_bias = np.diag([1e-4, 2e-4, 3e-4, 1e-2, 2e-2, 3e-2])
+    term = VariationTerm(LieTerm(with_bias), noise=noise_of_both, channels=6)
+    y0 = term.start(
+        0.0, {"bias": np.zeros(6), "x": X0}, covariance=scipy.linalg.block_diag(p_bias, P0)
+    )
+    found = end(term, RKMK8(), y0, None, 40).covariance
+    _, p, jacobian = exact()
+    # As for RKMK8 above.
+    np.testing.assert_allclose(
+        found[6:, 6:], p + jacobian @ p_bias @ jacobian.T, rtol=0, atol=1e-12
+    )
+    np.testing.assert_allclose(found[6:, :6], jacobian @ p_bias, rtol=0, atol=1e-12)
+
+
+# Constant readings
+
+MANY = VariationTerm(LieTerm(lambda t, x, args: imu(args[:3], args[3:])), noise=noise, channels=6)
+
+
+def van_loan(readings):
+    """P of a window of one second from P0, in JAX."""
+    readings, w = jnp.asarray(readings), jnp.cross
+    a = jnp.kron(jnp.eye(3), w(readings[:3], jnp.eye(3)))
+    a = a.at[3:6, :3].set(w(readings[3:], jnp.eye(3))).at[6:, 3:6].set(jnp.eye(3))
+    g = jnp.zeros((9, 6)).at[:6].set(GAIN)
+    block = jnp.block([[-a, g @ g.T], [jnp.zeros((9, 9)), a.T]])
+    e = jax.scipy.linalg.expm(block)
+    return e[9:, 9:].T @ (P0 @ e[9:, 9:] + e[:9, 9:])
+
+
+def covariance(readings, num_steps=20):
+    y0 = Variation(jnp.asarray(X0), covariance=jnp.asarray(P0))
+    return end(MANY, CF4(), y0, readings, num_steps).covariance
+
+
+@pytest.mark.slow
+def test_gradients_of_the_covariance_by_readings():
+    readings = jnp.asarray([0.4, -0.3, 0.8, 1.0, 0.5, -0.7])
+    loss = lambda r: jnp.trace(covariance(r))  # noqa: E731
+    want = jax.grad(lambda r: jnp.trace(van_loan(r)))(readings)
+    reverse, forward = jax.jit(jax.grad(loss))(readings), jax.jit(jax.jacfwd(loss))(readings)
+    # Of a method of order 4 with steps of 1/20; both modes agree to rounding.
+    np.testing.assert_allclose(reverse, want, rtol=0, atol=1e-5)
+    np.testing.assert_allclose(forward, reverse, rtol=0, atol=1e-13)
+    assert np.abs(want).min() > 1e-2
+
+
+@pytest.mark.parametrize("count", [200, pytest.param(10_000, marks=pytest.mark.slow)])
+def test_many_windows_by_map_batch(count):
+    readings = np.random.default_rng(1).normal(size=(count, 6)) * np.repeat([0.5, 2.0], 3)
+    found = cfjax.map_batch(covariance, readings, chunk_size=count // 4, progress=False).values
+    assert found.shape == (count, 9, 9)
+    for k in (0, count // 2, count - 1):
+        want = van_loan(readings[k])
+        # CF4 at steps of 1/20, with rates of up to 2: the fourth power of a tenth.
+        np.testing.assert_allclose(found[k], want, rtol=0, atol=1e-4 * np.abs(want).max())
+
+
+# Log-density
+
+
+def drag(t, x, args):
+    """Turns the body to the identity, and slows it down."""
+    k, loss = args
+    # omega = -k sin(angle) times the axis: 2 w (x, y, z) is sin(angle) times the axis.
+    omega = -2 * k * x[0] * x[1:4]
+    back = x[:4] * jnp.asarray([1.0, -1, -1, -1])
+    force = cfjax.quaternion_rotate(back, -loss * x[4:7] - jnp.asarray(GRAVITY), layout="wxyz")
+    return imu(omega, force)
+
+
+@pytest.mark.slow
+def test_log_density_and_its_gradients():
+    """tan(angle/2) falls as e^(-kt), of the weight sin^2(angle/2); velocities as e^(-loss t)."""
+    angle = 1.2
+    x0 = np.r_[np.cos(angle / 2), np.sin(angle / 2) * np.array([2.0, -1, 2]) / 3, X0[4:]]
+    term = VariationTerm(LieTerm(drag))
+
+    def found(args):
+        y0 = Variation(jnp.asarray(x0), log_density=jnp.asarray(0.3))
+        return end(term, CF4(), y0, args, 40).log_density
+
+    def want(args):
+        k, loss = args
+        later = 2 * jnp.arctan(jnp.exp(-k) * jnp.tan(angle / 2))
+        of_turns = jnp.log(jnp.sin(later) / jnp.sin(angle))
+        of_turns += 2 * jnp.log(jnp.sin(later / 2) / jnp.sin(angle / 2))
+        return 0.3 - of_turns + 3 * loss
+
+    args = jnp.asarray([0.8, 0.5])
+    # An integral by a method of order 4 with steps of 1/40.
+    np.testing.assert_allclose(found(args), want(args), rtol=0, atol=1e-7)
+    slope = jax.grad(want)(args)
+    reverse, forward = jax.jit(jax.grad(found))(args), jax.jit(jax.jacfwd(found))(args)
+    np.testing.assert_allclose(reverse, slope, rtol=0, atol=1e-6)
+    np.testing.assert_allclose(forward, reverse, rtol=0, atol=1e-13)
