@@ -11,7 +11,6 @@ others are, and the program is up to twice as long.
 """
 
 import functools
-import weakref
 from collections.abc import Callable, Sequence
 from typing import Any, NamedTuple
 
@@ -106,24 +105,12 @@ class Of(NamedTuple):
         return derivative
 
     def derived(self) -> ClosedJaxpr:
-        programs = _derived.setdefault(self.program, {})
-        key = self.derive, self.moving, self.results
-        if key not in programs:
-            operands, outs = self.program.in_avals, self.program.out_avals
-            ways = [outs[k] for k in self.results]
-            if self.derive is _tangents:
-                ways = [operands[k] for k in self.moving]
-            fun = self.applied(jaxpr_as_fun(self.program), operands)
-            programs[key] = program_of(fun, *(operands[k] for k in self.residuals), *ways)
-        while len(_derived) > _MAX_PROGRAMS:
-            del _derived[next(iter(_derived))]
-        return programs[key]
-
-
-# While one program after the other is differentiated, each is derived once. No program is held that
-# JAX has dropped, and of those that JAX keeps, which are thousands, the last ones alone.
-_derived: weakref.WeakKeyDictionary[ClosedJaxpr, dict[Any, Any]] = weakref.WeakKeyDictionary()
-_MAX_PROGRAMS = 32
+        operands, outs = self.program.in_avals, self.program.out_avals
+        ways = [outs[k] for k in self.results]
+        if self.derive is _tangents:
+            ways = [operands[k] for k in self.moving]
+        fun = self.applied(jaxpr_as_fun(self.program), operands)
+        return program_of(fun, *(operands[k] for k in self.residuals), *ways)
 
 
 class Kind(NamedTuple):
