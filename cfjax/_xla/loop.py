@@ -8,10 +8,10 @@ import jax.numpy as jnp
 import jax.tree_util as jtu
 import numpy as np
 from jax import lax
-from jax.extend.core import ClosedJaxpr, jaxpr_as_fun
+from jax.extend.core import jaxpr_as_fun
 from jaxtyping import Array, Int, PyTree
 
-from .jaxprs import altered, is_inexact, program_of, reached, structs
+from .jaxprs import is_inexact, program_of, structs
 from .limits import MANY, MAX_ENTRIES, MAX_SIZE
 from .pack import pack, unpack
 from .program import read
@@ -33,8 +33,8 @@ def repeat(
 
     On CPU a loop of small steps is fast if XLA has few operations left after fusion, and it fuses
     towards each result all that leads to it. So the numbers of the carry travel as one vector,
-    which is kept as it is, and those without a derivative as another. Those of short vectors along
-    leading axes travel as one array for each of their entries.
+    which is kept as it is. Those of short vectors along leading axes travel as one array for each
+    of their entries.
     """
     reading = read(step, carry, MAX_ENTRIES["loop"])
     if reading is None:
@@ -42,7 +42,7 @@ def repeat(
     leaves, structure = jtu.tree_flatten(carry)
     leaves = list(map(jnp.asarray, leaves))
     program, parameters = reading.program, reading.parameters
-    packing, n = _Packing.of(leaves, program), len(parameters)
+    packing, n = _Packing.of(leaves), len(parameters)
 
     def of_parts(*operands: Array) -> list[Array]:
         return packing.packed(jaxpr_as_fun(program)(*operands[:n], *packing.unpacked(operands[n:])))
@@ -81,27 +81,24 @@ def _loop(
 class _Packing(NamedTuple):
     """What is carried in the place of some arrays.
 
-    Those of each group are one vector, and these come first. Of the others short vectors along
-    leading axes are apart, one array for each of their entries.
+    The small ones are one vector, which comes first. Of the others short vectors along leading axes
+    are apart, one array for each of their entries.
     """
 
     arrays: Sequence[jax.ShapeDtypeStruct]
-    groups: Sequence[Sequence[int]]
+    small: Sequence[int]
     others: Sequence[int]
 
     @classmethod
-    def of(cls, arrays: Sequence[Array], program: ClosedJaxpr) -> "_Packing":
-        """Reverse mode does not keep what has no derivative, as what sums have lost, if apart."""
-        eqns = [eqn for eqn in program.jaxpr.eqns if eqn.primitive.name != "stop_gradient"]
-        are_moving = reached(altered(program.jaxpr, eqns=eqns), map(is_inexact, program.in_avals))
+    def of(cls, arrays: Sequence[Array]) -> "_Packing":
         dtype = next((x.dtype for x in arrays if is_inexact(x)), None)
-        places = [k for k, x in enumerate(arrays) if x.dtype == dtype and x.size <= MAX_SIZE]
-        groups = [[k for k in places if are_moving[k] == moves] for moves in (True, False)]
-        others = [k for k in range(len(arrays)) if k not in places]
-        return cls(structs(arrays), [group for group in groups if group], others)
+        small = [k for k, x in enumerate(arrays) if x.dtype == dtype and x.size <= MAX_SIZE]
+        others = [k for k in range(len(arrays)) if k not in small]
+        return cls(structs(arrays), small, others)
 
     def packed(self, arrays: Sequence[Array]) -> list[Array]:
-        parts = [jnp.concatenate([jnp.ravel(arrays[k]) for k in group]) for group in self.groups]
+        small = [jnp.ravel(arrays[k]) for k in self.small]
+        parts = [jnp.concatenate(small)] if small else []
         for k in self.others:
             x = arrays[k]
             parts += unpack(x, axis=x.ndim - 1) if is_rows(x) else [x]
@@ -109,9 +106,9 @@ class _Packing(NamedTuple):
 
     def unpacked(self, parts: Sequence[Array]) -> list[Array]:
         tail, arrays = iter(parts), {}
-        for group in self.groups:
-            ends = np.cumsum([self.arrays[k].size for k in group])[:-1]
-            arrays.update(zip(group, jnp.split(next(tail), ends), strict=True))
+        if self.small:
+            ends = np.cumsum([self.arrays[k].size for k in self.small])[:-1]
+            arrays.update(zip(self.small, jnp.split(next(tail), ends), strict=True))
         for k in self.others:
             x = self.arrays[k]
             if is_rows(x):

@@ -1,6 +1,6 @@
 """The rules: what operations make of numbers and structs of arrays."""
 
-from collections.abc import Callable, Hashable, Sequence
+from collections.abc import Callable, Sequence
 from typing import Any
 
 import jax
@@ -8,7 +8,7 @@ import numpy as np
 from jax.extend.core import JaxprEqn
 
 from . import arithmetic, moves
-from .jaxprs import evaluate, is_inexact, parameters
+from .jaxprs import evaluate, is_inexact
 from .scope import is_numeric
 from .struct_of_arrays import Call, StructOfArrays, is_small_shape, is_whole, static_value
 from .understood import ELEMENTWISE, REDUCTIONS, is_understood
@@ -74,19 +74,6 @@ def on_entries(
     return [x if x.shape else x.entries[0] for x in results]
 
 
-# What an operation makes of static values. A loop over stages asks for the same in each turn, and
-# JAX takes longer to answer than the rest of the turn.
-_cache: dict[Hashable, list[np.ndarray]] = {}
-_MAX_CACHED = 2048
-
-
 def _of_static(eqn: JaxprEqn, values: Sequence[np.ndarray]) -> list[np.ndarray]:
-    operands = tuple((x.tobytes(), x.dtype, x.shape) for x in values)
-    key = eqn.primitive, parameters(eqn), operands
-    if key not in _cache:
-        with jax.ensure_compile_time_eval():
-            outs = list(map(np.asarray, evaluate(eqn, values)))
-        if len(_cache) >= _MAX_CACHED:
-            _cache.clear()
-        _cache[key] = outs
-    return _cache[key]
+    with jax.ensure_compile_time_eval():
+        return list(map(np.asarray, evaluate(eqn, values)))

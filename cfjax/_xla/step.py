@@ -11,7 +11,6 @@ others are, and the program is up to twice as long.
 """
 
 import functools
-import weakref
 from collections.abc import Callable, Sequence
 from typing import Any, NamedTuple
 
@@ -106,24 +105,12 @@ class Of(NamedTuple):
         return derivative
 
     def derived(self) -> ClosedJaxpr:
-        programs = _derived.setdefault(self.program, {})
-        key = self.derive, self.moving, self.results
-        if key not in programs:
-            operands, outs = self.program.in_avals, self.program.out_avals
-            ways = [outs[k] for k in self.results]
-            if self.derive is _tangents:
-                ways = [operands[k] for k in self.moving]
-            fun = self.applied(jaxpr_as_fun(self.program), operands)
-            programs[key] = program_of(fun, *(operands[k] for k in self.residuals), *ways)
-        while len(_derived) > _MAX_PROGRAMS:
-            del _derived[next(iter(_derived))]
-        return programs[key]
-
-
-# While one program after the other is differentiated, each is derived once. No program is held that
-# JAX has dropped, and of those that JAX keeps, which are thousands, the last ones alone.
-_derived: weakref.WeakKeyDictionary[ClosedJaxpr, dict[Any, Any]] = weakref.WeakKeyDictionary()
-_MAX_PROGRAMS = 32
+        operands, outs = self.program.in_avals, self.program.out_avals
+        ways = [outs[k] for k in self.results]
+        if self.derive is _tangents:
+            ways = [operands[k] for k in self.moving]
+        fun = self.applied(jaxpr_as_fun(self.program), operands)
+        return program_of(fun, *(operands[k] for k in self.residuals), *ways)
 
 
 class Kind(NamedTuple):
@@ -346,8 +333,6 @@ def _run(*operands, program, kind):
             return _one_by_one(operands, program, kind, level)
     if few is not None or num_operations > kind.limit():
         return _as_traced(operands, program, kind)
-    if kind.is_batch and num_operations > FLAT_WHOLE:
-        operands = _single_numbers_materialised(operands, kind.levels)
     is_cut = kind.is_cut(program.jaxpr, num_operations)
     if kind.linear and kind.levels and not is_cut and kind.max_derivatives == FLAT_MANY:
         # What is kept of many steps lies entry beside entry, and XLA would read it where it lies,
@@ -447,9 +432,6 @@ def whole(eqn: JaxprEqn) -> ClosedJaxpr:
 
 
 def _as_traced(operands, program, kind) -> list[Any]:
-    if kind.levels:
-        operands = _single_numbers_materialised(operands, kind.levels)
-
     def run(operands: Sequence[Any], turn: ClosedJaxpr, fixed: Sequence[bool]) -> list[Any]:
         lengths = kind.max_values, kind.max_derivatives
         of_turn = Kind(tuple(fixed), len(turn.out_avals), kind.rows, *lengths, is_once=True)
@@ -464,15 +446,6 @@ def _in_batches(fun: Callable[..., Any], levels: Sequence[Any]) -> Callable[...,
     for axes in levels:
         fun = jax.vmap(fun, in_axes=axes)
     return fun
-
-
-def _single_numbers_materialised(operands: Sequence[Any], levels: Sequence[Any]) -> list[Any]:
-    """The operands, materialised where they have no batch axis, as the time of a step.
-
-    XLA would compute them anew in each of its functions for a batch.
-    """
-    places = range(len(operands))
-    return together(operands, [k for k in places if all(axes[k] is None for axes in levels)])
 
 
 ad.primitive_jvps[step_p] = _jvp

@@ -92,30 +92,6 @@ def _functions(scene, solver):
     return [(text.count("\n"), text.count(" reduce(")) for text in functions]
 
 
-def test_the_time_of_a_long_step_in_a_batch_is_computed_once(rewritten):
-    """In a loop of one's own. Otherwise it would be in all functions, and a step take 100 ms."""
-    given = rigid_body.problem()
-
-    def solve(y0):
-        solver = cfjax.RKMK8()
-        state = solver.init(given["term"], 0.0, 0.1, y0, given["args"])
-
-        def step(carry, k):
-            t = 0.1 * k
-            y, state = carry
-            y, _, _, state, _ = solver.step(
-                given["term"], t, t + 0.1, y, given["args"], state, made_jump=False
-            )
-            return (y, state), None
-
-        return jax.lax.scan(step, (y0, state), jnp.arange(3.0))[0][0]
-
-    y0s = jnp.stack([given["y0"], -given["y0"]] * 50)
-    program = str(jax.jit(jax.vmap(solve)).lower(y0s).compile().as_text())
-    # What a single number is materialised by; nothing else here adds numbers up.
-    assert " reduce(" in program
-
-
 @pytest.mark.parametrize("in_batches", [False, True])
 def test_in_a_batch_only_if_asked_for(in_batches):
     """There a call is what XLA does not fuse."""
