@@ -46,6 +46,8 @@ class _Iteration(NamedTuple):
 class _State(State):
     # None where the radius is not estimated.
     iteration: _Iteration | None
+    # The most stages that a step needed, or None where they are given.
+    most: Real[Array, ""] | None
 
 
 class AbstractStabilised(AbstractChartSolver, diffrax.AbstractAdaptiveSolver):
@@ -140,26 +142,23 @@ class AbstractStabilised(AbstractChartSolver, diffrax.AbstractAdaptiveSolver):
         return self
 
     def init(self, terms, t0, t1, y0, args) -> _State:
-        state, fault = self._start(terms, t0, t1, y0, args)
+        state, fault = self.start(terms, t0, t1, y0, args)
         zero = fault.error(jnp.zeros((), jnp.result_type(t0)))
-        return _State(state.compensation, state.first, zero, state.iteration)
+        return eqx.tree_at(lambda s: s.zero, state, zero, is_leaf=lambda x: x is None)
 
-    def start(self, terms, t0, t1, y0, args):
-        state, fault = self._start(terms, t0, t1, y0, args)
-        if self.stages is None:
-            # Nothing shortens an equal step.
-            radius = self._radius(terms, t0, y0, args, state.iteration)
-            number = _stages_for(jnp.abs(t1 - t0) * radius, self.twice_index)
-            for level in (1, 2, 5, 10, 100, 1000):
-                limit = level * self.max_stages
-                fault = fault.with_case(
-                    number > limit,
-                    f"max_stages={self.max_stages} is too small: the first step takes more than "
-                    f"{limit} stages. Take more steps or, with max_stages, more stages.",
-                )
-        return state, fault
+    def ended(self, solver_state, fault):
+        if self.stages is not None:
+            return fault
+        for level in (1, 2, 5, 10, 100, 1000):
+            limit = level * self.max_stages
+            fault = fault.with_case(
+                solver_state.most > limit,
+                f"max_stages={self.max_stages} is too small: a step takes more than {limit} "
+                "stages. Take more steps or, with max_stages, more stages.",
+            )
+        return fault
 
-    def _start(self, terms, t0, t1, y0, args) -> tuple[_State, Fault]:
+    def start(self, terms, t0, t1, y0, args) -> tuple[_State, Fault]:
         state, fault = super().start(terms, t0, t1, y0, args)
         if self.spectral_radius is not None:
             radius = self._radius(terms, t0, y0, args, None)
@@ -171,7 +170,11 @@ class AbstractStabilised(AbstractChartSolver, diffrax.AbstractAdaptiveSolver):
         if self.stages is None and self.spectral_radius is None:
             vector = start_vector(y0)
             iteration = _Iteration(*iterated(terms, t0, y0, args, vector, FIRST_ITERATIONS))
-        return _State(state.compensation, state.first, None, iteration), fault
+        most = None
+        if self.stages is None:
+            z = jnp.abs(t1 - t0) * self._radius(terms, t0, y0, args, iteration)
+            most = jnp.zeros((), z.dtype)
+        return _State(state.compensation, state.first, None, iteration, most), fault
 
     def _radius(self, terms, t0, y0, args, iteration: _Iteration | None) -> Real[Array, ""]:
         if iteration is not None:
@@ -181,19 +184,22 @@ class AbstractStabilised(AbstractChartSolver, diffrax.AbstractAdaptiveSolver):
 
     def step(self, terms, t0, t1, y0, args, solver_state, made_jump):
         self.for_terms(terms)
-        solver, iteration = self, solver_state.iteration
+        solver, iteration, most = self, solver_state.iteration, solver_state.most
         if iteration is not None:
             radius, vector = iterated(terms, t0, y0, args, iteration.vector, 1)
             radius = jnp.maximum(radius, _LEAST_RATIO * iteration.radius)
             iteration = _Iteration(radius, vector)
         if self.stages is None:
             z = jnp.abs(t1 - t0) * self._radius(terms, t0, y0, args, iteration)
-            is_possible = _stages_for(z, self.twice_index) <= self.max_stages
+            number = _stages_for(z, self.twice_index)
+            # Not NaN, of states after a step that failed.
+            most = jnp.where(number > most, number, most)
+            is_possible = number <= self.max_stages
             solver: Any = self._with(stiffness=jnp.where(is_possible, z, jnp.nan))
         y1, error, dense_info, state, result = AbstractChartSolver.step(
             solver, terms, t0, t1, y0, args, solver_state, made_jump
         )
-        state = _State(state.compensation, state.first, state.zero, iteration)
+        state = _State(state.compensation, state.first, state.zero, iteration, most)
         return y1, error, dense_info, state, result
 
     def step_in(self, chart):

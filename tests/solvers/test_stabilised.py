@@ -4,6 +4,7 @@ import functools
 import itertools
 
 import diffrax
+import equinox as eqx
 import jax
 import jax.numpy as jnp
 import mpmath
@@ -666,6 +667,18 @@ def test_max_stages_too_small_is_an_error_that_says_how_many():
         num_steps=4, throw=False,
     )  # fmt: skip
     assert np.isnan(sol.ys).all()
+    # Only later steps take as many.
+    grow = cfjax.LieTerm(lambda t, y, args: -args * jnp.exp(5 * t) * y)
+
+    def end(rate):
+        solver = cfjax.RKL2(spectral_radius=lambda t, y, args: args * jnp.exp(5 * t), max_stages=15)
+        return cfjax.integrate(grow, solver, 0.0, 1.0, jnp.ones(2), rate, num_steps=4).ys
+
+    assert np.isfinite(end(5.0)).all()
+    # exp(3.75) * 40 / 4 = 425, of which 29 stages have 434.
+    for run in (end, eqx.filter_jit(end)):
+        with pytest.raises(RuntimeError, match=r"max_stages=15 is too small.* than 15 stages"):
+            run(40.0)
     with pytest.raises(RuntimeError, match=r"(?i)nonfinite"):
         diffrax.diffeqsolve(
             cfjax.LieTerm(stiff), cfjax.RKL3(max_stages=10), 0.0, 1.0, 0.25, jnp.ones(2), 1000.0
