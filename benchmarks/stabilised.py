@@ -514,6 +514,8 @@ def _work(rows: list[results.Row]) -> Figure:
     num_rows = -(-len(problems) // 3)
     figure = _style.new_figure((12, 3.2 * num_rows))
     panels = dict(zip(problems, figure.subplots(num_rows, 3).flat, strict=False))
+    for axes in figure.axes[len(problems) :]:
+        axes.remove()
     for problem, axes in panels.items():
         for program, (color, marker) in STYLES.items():
             curve = results.pick(rows, problem=problem, program=program)
