@@ -1065,7 +1065,7 @@ def _stabilised() -> dict[tuple[str, float], list[Row]]:
 @table
 def diffusion_evaluations() -> list[list[str]]:
     def text(row: Row) -> str:
-        return str(row["evaluations"]) if "evaluations" in row else "not reached"
+        return str(row.get("evaluations") or "not reached")
 
     table = [["", "error", *STABILISED.values()]]
     for (problem, target), rows in _stabilised().items():

@@ -14,7 +14,7 @@ The problems, the first five in plain space:
 - porous medium: `cfjax.scenes.porous_medium`.
 - p-Laplacian: `u' = div(|grad u| grad u)`, periodic.
 - heat and reaction: `u' = laplacian u + 50 (u - u^3)`, periodic, which a transform diagonalises.
-- spins: `cfjax.scenes.harmonic_maps`, to t = 50.
+- spins: `cfjax.scenes.harmonic_maps` with 32 x 32 spins, to t = 50.
 - Wilson flow: `cfjax.scenes.wilson_flow`, to t = 4.
 """
 
@@ -199,7 +199,7 @@ def heat_and_reaction(n: int = 64) -> Problem:
 
 
 def spins() -> Problem:
-    start = harmonic_maps.y0()
+    start = harmonic_maps.y0(32)
     return Problem(
         0.0,
         50.0,
@@ -234,7 +234,7 @@ PROBLEMS: dict[str, Callable[[], Problem]] = {
     "heat, 32 x 32 x 32": lambda: heat(32, 32, 32, peers=("Tsit5",), targets=HEAT_TARGETS[:2]),
     "porous medium": porous,
     "p-Laplacian": p_laplacian,
-    "spins": spins,
+    "spins, 32 x 32": spins,
     "Wilson flow": links,
     "heat and reaction": heat_and_reaction,
 }
@@ -514,6 +514,8 @@ def _work(rows: list[results.Row]) -> Figure:
     num_rows = -(-len(problems) // 3)
     figure = _style.new_figure((12, 3.2 * num_rows))
     panels = dict(zip(problems, figure.subplots(num_rows, 3).flat, strict=False))
+    for axes in figure.axes[len(problems) :]:
+        axes.remove()
     for problem, axes in panels.items():
         for program, (color, marker) in STYLES.items():
             curve = results.pick(rows, problem=problem, program=program)

@@ -259,6 +259,9 @@ def equal_steps(
     # Of the saved states alone, outside the loop: sums and products keep infinity and NaN, so a
     # blow-up shows in what is saved after it.
     result = result_of(ys)
+    ended = solver.ended(carry[2], fault)
+    if throw and ended is not fault:
+        ys = needing(ended.error(jnp.zeros((), t0.dtype)), ys)
     if solver.shows_failure:
         ys = error_if(ys, lambda ys: ~is_finite(ys), _BLOW_UP) if throw else ys
     else:
@@ -278,7 +281,7 @@ def equal_steps(
         made_jump=None,
         event_mask=None,
     )
-    return solution, fault.with_case(~is_finite(y0), _NOT_FINITE)
+    return solution, ended.with_case(~is_finite(y0), _NOT_FINITE)
 
 
 def _checked_solution(solution: diffrax.Solution, fault: Fault) -> diffrax.Solution:

@@ -45,6 +45,11 @@ class AbstractSolver(diffrax.AbstractSolver):
         del terms, length, t0, y0, args
         return self
 
+    def ended(self, solver_state: PyTree, fault: Fault) -> Fault:
+        """The fault, with what the state of the solver says was wrong in equal steps."""
+        del solver_state
+        return fault
+
     def without_estimate(self) -> Any:
         """The same method for steps without error control: it computes nothing for an estimate."""
         return self

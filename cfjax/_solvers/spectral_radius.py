@@ -69,13 +69,13 @@ def iterated(
     velocity_at, constants = jax.closure_convert(velocity_at, y)
     y, constants = lax.stop_gradient((y, constants))
 
-    def iteration(carry: Any, _: None) -> Any:
-        _, vector = carry
-        tangent = jax.jvp(lambda z: velocity_at(z, *constants), (y,), (vector,))[1]
-        return _normalised(tangent), None
+    def iteration(vector: PyTree) -> tuple[Real[Array, ""], PyTree]:
+        return _normalised(jax.jvp(lambda z: velocity_at(z, *constants), (y,), (vector,))[1])
 
+    if number == 1:
+        return iteration(vector)
     zero = jnp.zeros((), _dtype(vector))
-    return lax.scan(iteration, (zero, vector), length=number)[0]
+    return lax.scan(lambda carry, _: (iteration(carry[1]), None), (zero, vector), length=number)[0]
 
 
 def _normalised(x: PyTree) -> tuple[Real[Array, ""], PyTree]:

@@ -14,7 +14,6 @@ import numpy as np
 from jax import lax
 from jax.extend.core import Primitive
 from jax.interpreters import ad, batching, mlir
-from jax.scipy.special import digamma
 from jaxtyping import Array, PyTree, Real
 
 from .._control_term import is_driven
@@ -47,6 +46,8 @@ class _Iteration(NamedTuple):
 class _State(State):
     # None where the radius is not estimated.
     iteration: _Iteration | None
+    # The most stages that a step needed, or None where they are given.
+    most: Real[Array, ""] | None
 
 
 class AbstractStabilised(AbstractChartSolver, diffrax.AbstractAdaptiveSolver):
@@ -71,10 +72,12 @@ class AbstractStabilised(AbstractChartSolver, diffrax.AbstractAdaptiveSolver):
       the stages.
 
     Output within a step has order 2 and stays on the manifold. The last evaluation of a step is the
-    first one of the next. Besides what an evaluation takes, a step keeps six arrays like
-    the state, or eleven for `RKL3`, whatever the number of stages; with an estimated radius one
-    more. Reverse mode works by checkpoints; forward mode needs `stages`, as it has
-    no rule for a loop whose length is chosen.
+    first one of the next. Whatever the number of stages, a step keeps five arrays like the state:
+    the state, the first field, two elements of the recursion and the point of an evaluation; what
+    an evaluation keeps itself comes on top. `RKL3` keeps eight with given stages, ten with chosen
+    ones, as elements of parts and the middle of the step. An estimated radius takes one more.
+    Reverse mode works by checkpoints; forward mode needs `stages`, as it has no rule for a loop
+    whose length is chosen.
 
     **Raises** `TypeError` or `ValueError` for an argument of another kind or value, or `stages`
     together with `spectral_radius`. When the program is traced, `TypeError` for fields whose sums
@@ -139,26 +142,23 @@ class AbstractStabilised(AbstractChartSolver, diffrax.AbstractAdaptiveSolver):
         return self
 
     def init(self, terms, t0, t1, y0, args) -> _State:
-        state, fault = self._start(terms, t0, t1, y0, args)
+        state, fault = self.start(terms, t0, t1, y0, args)
         zero = fault.error(jnp.zeros((), jnp.result_type(t0)))
-        return _State(state.compensation, state.first, zero, state.iteration)
+        return eqx.tree_at(lambda s: s.zero, state, zero, is_leaf=lambda x: x is None)
 
-    def start(self, terms, t0, t1, y0, args):
-        state, fault = self._start(terms, t0, t1, y0, args)
-        if self.stages is None:
-            # Nothing shortens an equal step.
-            radius = self._radius(terms, t0, y0, args, state.iteration)
-            number = _stages_for(jnp.abs(t1 - t0) * radius, self.twice_index)
-            for level in (1, 2, 5, 10, 100, 1000):
-                limit = level * self.max_stages
-                fault = fault.with_case(
-                    number > limit,
-                    f"max_stages={self.max_stages} is too small: the first step takes more than "
-                    f"{limit} stages. Take more steps or, with max_stages, more stages.",
-                )
-        return state, fault
+    def ended(self, solver_state, fault):
+        if self.stages is not None:
+            return fault
+        for level in (1, 2, 5, 10, 100, 1000):
+            limit = level * self.max_stages
+            fault = fault.with_case(
+                solver_state.most > limit,
+                f"max_stages={self.max_stages} is too small: a step takes more than {limit} "
+                "stages. Take more steps or, with max_stages, more stages.",
+            )
+        return fault
 
-    def _start(self, terms, t0, t1, y0, args) -> tuple[_State, Fault]:
+    def start(self, terms, t0, t1, y0, args) -> tuple[_State, Fault]:
         state, fault = super().start(terms, t0, t1, y0, args)
         if self.spectral_radius is not None:
             radius = self._radius(terms, t0, y0, args, None)
@@ -170,7 +170,11 @@ class AbstractStabilised(AbstractChartSolver, diffrax.AbstractAdaptiveSolver):
         if self.stages is None and self.spectral_radius is None:
             vector = start_vector(y0)
             iteration = _Iteration(*iterated(terms, t0, y0, args, vector, FIRST_ITERATIONS))
-        return _State(state.compensation, state.first, None, iteration), fault
+        most = None
+        if self.stages is None:
+            z = jnp.abs(t1 - t0) * self._radius(terms, t0, y0, args, iteration)
+            most = jnp.zeros((), z.dtype)
+        return _State(state.compensation, state.first, None, iteration, most), fault
 
     def _radius(self, terms, t0, y0, args, iteration: _Iteration | None) -> Real[Array, ""]:
         if iteration is not None:
@@ -180,27 +184,34 @@ class AbstractStabilised(AbstractChartSolver, diffrax.AbstractAdaptiveSolver):
 
     def step(self, terms, t0, t1, y0, args, solver_state, made_jump):
         self.for_terms(terms)
-        solver, iteration = self, solver_state.iteration
+        solver, iteration, most = self, solver_state.iteration, solver_state.most
         if iteration is not None:
             radius, vector = iterated(terms, t0, y0, args, iteration.vector, 1)
             radius = jnp.maximum(radius, _LEAST_RATIO * iteration.radius)
             iteration = _Iteration(radius, vector)
         if self.stages is None:
             z = jnp.abs(t1 - t0) * self._radius(terms, t0, y0, args, iteration)
-            is_possible = _stages_for(z, self.twice_index) <= self.max_stages
+            number = _stages_for(z, self.twice_index)
+            # Not NaN, of states after a step that failed.
+            most = jnp.where(number > most, number, most)
+            is_possible = number <= self.max_stages
             solver: Any = self._with(stiffness=jnp.where(is_possible, z, jnp.nan))
         y1, error, dense_info, state, result = AbstractChartSolver.step(
             solver, terms, t0, t1, y0, args, solver_state, made_jump
         )
-        state = _State(state.compensation, state.first, state.zero, iteration)
+        state = _State(state.compensation, state.first, state.zero, iteration, most)
         return y1, error, dense_info, state, result
 
     def step_in(self, chart):
         _check_fields(self, chart)
         elements = self.elements(chart)
-        end = chart.start
-        for element in elements.flows:
-            end = chart.flow(element, end)
+
+        def flow(end: PyTree, weights: tuple[Any, ...]) -> tuple[PyTree, PyTree]:
+            element = combine(weights, elements.all)
+            return chart.flow(element, end), element
+
+        # One program for all of them.
+        end, flows = scan_list(flow, chart.start, elements.weights)
         value = chart.value_at(1.0, end)
         last = chart.frozen(value, end, [chart.first_field])
         error = tangent(elements.error(last), chart.state(end))
@@ -212,7 +223,7 @@ class AbstractStabilised(AbstractChartSolver, diffrax.AbstractAdaptiveSolver):
         path = Path.of(
             self.continuous_extension,
             chart.origin,
-            [chart.first_field, *elements.flows, last],
+            [chart.first_field, *flows, last],
         )
         return Step(y1, path, error, value)
 
@@ -236,19 +247,23 @@ class AbstractStabilised(AbstractChartSolver, diffrax.AbstractAdaptiveSolver):
         number, is_possible = part.number, self._is_possible
 
         def stage(j: Any, carry: Any) -> Any:
-            u, u_before, time, time_before = carry
+            u, last, time, time_before = carry
             field = chart.field(part.start + part.length * time, chart.flow(u, point), [first])
             mu, nu, of_field, of_first = _weights(j, number, l, part.ratio)
-            weights = mu, nu, of_field * part.length, of_first * part.length
-            new = combine(weights, (u, u_before, cast_like(first, field), first))
+            weights = mu + nu - 1, -nu, of_field * part.length, of_first * part.length
+            last = cast_like(first, combine(weights, (u, last, cast_like(first, field), first)))
+            new = combine((1.0, 1.0), (u, last))
             new_time = mu * time + nu * time_before + of_field + of_first
-            return cast_like(first, new), u, new_time, time
+            return cast_like(first, new), last, new_time, time
 
         # The time of the first stage, and the weight of the first field there.
         w = (l + 1) / (2 * (l + 2)) * part.ratio * _slope(number, l)
         w = jnp.where(is_possible, w if self.stages is None else jnp.asarray(w, float), 0.0)
         zero = jnp.zeros_like(w)
-        carry = combine((w * part.length,), (first,)), combine((zero,), (first,)), w, zero
+        u = combine((w * part.length,), (first,))
+        # An element and its last increment: both change in place, where XLA would copy two elements
+        # to exchange them.
+        carry = u, u, w, zero
         if self.stages is not None:
             turns = np.arange(2.0, number + 1)
             (u, *_), _ = over_stages(lambda carry, j: (stage(j, carry), None), carry, turns)
@@ -274,11 +289,12 @@ class _Part(NamedTuple):
 
 
 class _Elements(NamedTuple):
-    """Elements along which a step moves, one after the other, and the element of the estimate, from
-    the field at the end.
+    """Elements, the weights of them in the flows along which a step moves, one after the other, and
+    the element of the estimate, from the field at the end.
     """
 
-    flows: list[PyTree]
+    all: tuple[PyTree, ...]
+    weights: list[tuple[Any, ...]]
     error: Callable[[PyTree], PyTree]
 
 
@@ -300,7 +316,8 @@ class _OneElement(AbstractStabilised):
     def elements(self, chart):
         first = chart.first_field
         u = self._element(chart, first, chart.start, _Part(self._number(1.0)))
-        return _Elements([u], lambda last: combine((-0.8, 0.4, 0.4), (u, first, last)))
+        error = lambda last: combine((-0.8, 0.4, 0.4), (u, first, last))  # noqa: E731
+        return _Elements((u,), [(1.0,)], error)
 
 
 class RKL2(_OneElement):
@@ -365,10 +382,11 @@ class RKL3(AbstractStabilised):
     def elements(self, chart):
         first, start = chart.first_field, chart.start
         s, m = self._number(1.0), self._number(0.5)
+        most = self.stages or self.max_stages
         # c is -(1 + 2 w) / 18, and d is -3 b_1 times what follows.
         ws, wm = _slope(s, 1), _slope(m, 1)
         ds, dm = (
-            w**2 * (_harmonic(number) - 1) / (number**2 + number)
+            w**2 * (_harmonic(number, most) - 1) / (number**2 + number)
             for w, number in ((ws, s), (wm, m))
         )
         r = (1 + 2 * wm) / (1 + 2 * ws)
@@ -396,10 +414,9 @@ class RKL3(AbstractStabilised):
             field, middle = after(v1, start)
             v2 = self._element(chart, field, middle, parts[1])
             u = self._element(chart, first, start, parts[2])
-        weights = a / 2 + 2 / 3, a / 2 - 2 / 3, (1 - a) / 2
-        flows = [combine(weights, (v1, v2, u)), combine(weights, (v2, v1, u))]
+        p, q, e = a / 2 + 2 / 3, a / 2 - 2 / 3, (1 - a) / 2
         error = combine((a - 1, a - 1, 1 - a), (v1, v2, u))
-        return _Elements(flows, lambda last: error)
+        return _Elements((v1, v2, u), [(p, q, e), (q, p, e)], lambda last: error)
 
 
 def _check_fields(solver: AbstractStabilised, chart: Chart) -> None:
@@ -434,10 +451,11 @@ def _weights(j: Any, s: Any, l: int, ratio: Any) -> tuple[Any, Any, Any, Any]:  
     return mu, nu, of_field, (b(j - 1) - 1) * of_field
 
 
-def _harmonic(s: Any) -> Any:
-    if isinstance(s, int):
-        return float(np.sum(1 / np.arange(1, s + 1)))
-    return digamma(s + 1) + np.euler_gamma
+def _harmonic(s: Any, most: int) -> Any:
+    """The sum of the first s of the numbers 1 / k, of not more than `most`."""
+    numpy: Any = jnp if isinstance(s, jax.Array) else np
+    k = numpy.arange(1, most + 1, dtype=numpy.result_type(s))
+    return numpy.sum(numpy.where(k <= s, 1 / k, 0))
 
 
 def _slope(s: Any, l: int) -> Any:  # noqa: E741
