@@ -200,6 +200,9 @@ def test_scenes_solve_with_the_method_that_readme_recommends():
     for name, module in SCENES.items():
         problem = module.problem()
         chosen = type(module.solver).__name__
+        if isinstance(problem["term"], cfjax.VariationTerm):
+            # With variations by the method for the state.
+            problem |= {"term": problem["term"].term, "y0": problem["y0"].state}
         if not isinstance(problem["term"], cfjax.LieTerm):
             # Of splittings and of noise: the pages on them.
             assert chosen in ("BlanesMoan4", "Strang", "WeakOrder2"), name

@@ -84,7 +84,8 @@ def reference(t: float | Float[np.ndarray, "*times"]) -> Float[np.ndarray, "*tim
         q = cfjax.quaternion_from_matrix(attitude(t), layout="wxyz")
         return jnp.concatenate([q, _velocity(t), place(t)])
 
-    return np.asarray(jnp.vectorize(one, signature="()->(n)")(jnp.asarray(t, float)))
+    many = jax.jit(jnp.vectorize(one, signature="()->(n)"))
+    return np.asarray(many(jnp.asarray(t, float)))
 
 
 def field(t: Any, y: Pose, args: Any = None) -> cfjax.InertialMotion:
