@@ -46,7 +46,6 @@ from .limits import (
     FLAT_WHOLE,
     MAX_ENTRIES,
     MAX_RESULTS_IN_BATCHES,
-    UNCUT_DERIVATIVES,
     UNCUT_VALUES,
 )
 from .materialise import not_materialised, together
@@ -157,11 +156,11 @@ class Kind(NamedTuple):
         What is not cut may explode: 1000 bodies with `RKMK8` took half a second a step where their
         inertia is known, and 0.15 ms where it is an argument.
         """
-        if self.rows:
-            return bool(self.linear) and num_operations > FLAT_WHOLE
+        if self.linear:
+            return num_operations > FLAT_WHOLE
         least = CUT_IN_BATCHES if self.levels else CUT_ONE
-        uncut = UNCUT_DERIVATIVES if self.linear else UNCUT_VALUES
-        return num_operations > least and num_operations * num_turns(jaxpr) > uncut
+        is_long = num_operations > least and num_operations * num_turns(jaxpr) > UNCUT_VALUES
+        return is_long and not self.rows
 
 
 # For a step of many, which may take longer to compile, and for any other.

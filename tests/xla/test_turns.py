@@ -12,6 +12,7 @@ import pytest
 from xla import random_programs
 
 import cfjax
+from cfjax._xla.limits import FUNCTION
 from cfjax.scenes import heavy_top, rigid_body, spacecraft
 
 pytestmark = pytest.mark.usefixtures("rewritten_by_default")
@@ -89,6 +90,42 @@ def test_long_values_of_a_batch_are_cut_at_groups_of_turns(monkeypatch):
     assert num_materialised(cfjax.RKMK8()) + 3 <= number
     # Short ones are not.
     assert num_materialised(cfjax.CF4()) < 5
+
+
+def _twist(t, y, args):
+    return cfjax.RigidMotion(
+        omega=y[1:4] * args + 0.1 * t, v=0.1 * y[4:], frame="body", layout="wxyz_xyz"
+    )
+
+
+LONG_GRADIENTS = {
+    "pose, CF4": (_twist, cfjax.CF4(), [1.0, 0, 0, 0, 0.1, 0.2, 0.3]),
+    "vector, RKMK5": (lambda t, y, args: cfjax.Rotation(-y / args), cfjax.RKMK5(), [0.6, 0, 0.8]),
+}
+
+
+@pytest.mark.representatives(1)
+@pytest.mark.parametrize("name", LONG_GRADIENTS)
+def test_no_function_of_a_long_gradient_is_longer_than_those_of_xla(name):
+    """XLA would compute what two of its functions need in both: these gradients did not end."""
+    field, solver, y0 = LONG_GRADIENTS[name]
+
+    def loss(y, args):
+        term = cfjax.LieTerm(field)
+        state = solver.init(term, 0.0, 0.1, y, args)
+
+        def step(carry, t):
+            y, state = carry
+            y, _, _, state, _ = solver.step(term, t, t + 0.1, y, args, state, made_jump=False)
+            return (y, state), None
+
+        return jnp.sum(jax.lax.scan(step, (y, state), 0.1 * jnp.arange(10.0))[0][0])
+
+    start = jnp.asarray(y0, float), jnp.asarray([1.0, 2.0, 3.0])
+    program = jax.jit(jax.grad(loss, (0, 1))).lower(*start).compile().as_text()
+    functions = str(program).split("\n}")
+    longest = max(text.count(" = ") for text in functions if "fused_computation" in text)
+    assert FUNCTION / 10 < longest < FUNCTION
 
 
 def test_what_is_unrolled_has_no_terms_that_are_zero():
