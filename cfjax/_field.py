@@ -165,6 +165,19 @@ class AbstractFrozenField(eqx.Module):
         del earlier
         return self, point
 
+    def projected(self, point: Any) -> Any:
+        """This field at a point in the coordinates of a step in plain space, for
+        `cfjax.RKMK(..., coordinates="projected")`.
+
+        An `AbstractAlgebraElement` that is a translation by `tangent(point)`, with a further method
+        `projection(start)`. This returns by how much the step leads from a start on the manifold to
+        an end on it, and whether it could be brought there; `cfjax._fields.projected` has such
+        classes. None, the default, if there are no such coordinates. The point need not be on the
+        manifold.
+        """
+        del point
+        return None
+
     def room(self, point: Any, num_fields: int) -> Any:
         """A chart of the step with room for so many fields, of which this is the first.
 
@@ -247,6 +260,12 @@ class Rest(AbstractAlgebraElement):
 
     def bracket(self, other: "Rest") -> "Rest":
         return self
+
+    def projected(self, point: PyTree) -> "Rest":
+        return self
+
+    def projection(self, point: PyTree) -> tuple[PyTree, Bool[Array, ""]]:
+        return self.tangent(point), jnp.asarray(True)
 
 
 def is_field(x: Any) -> bool:
@@ -412,6 +431,51 @@ def from_chart(field: PyTree, point: PyTree) -> PyTree:
     """The state at a point of the chart, for a field in the chart."""
     return jtu.tree_map(
         lambda f, p: f.from_chart(p) if is_field(f) else p, field, point, is_leaf=is_field
+    )
+
+
+def projected(field: PyTree, point: PyTree) -> PyTree:
+    """The field at a point in the coordinates of a step in plain space, part by part.
+
+    **Raises** `TypeError` for a part that has no such coordinates.
+    """
+
+    def part(f: Any, p: PyTree) -> Any:
+        coordinates = f.projected(p) if is_field(f) else f
+        if coordinates is None:
+            raise TypeError(_not_projected_message(f))
+        return coordinates
+
+    return jtu.tree_map(part, field, point, is_leaf=is_field)
+
+
+def projection(field: PyTree, point: PyTree) -> tuple[PyTree, Bool[Array, ""]]:
+    """By how much a field in these coordinates moves a point on the manifold, to another on it; and
+    whether all parts could be brought there.
+    """
+    fields, treedef = jtu.tree_flatten(field, is_leaf=is_field)
+    pairs = [
+        f.projection(p) if is_field(f) else (f, jnp.asarray(True))
+        for f, p in zip(fields, treedef.flatten_up_to(point), strict=True)
+    ]
+    is_there = functools.reduce(jnp.logical_and, [x for _, x in pairs], jnp.asarray(True))
+    return treedef.unflatten([increment for increment, _ in pairs]), is_there
+
+
+def _not_projected_message(field: AbstractFrozenField) -> str:
+    has_closed_form = (
+        isinstance(field, AbstractAlgebraElement)
+        and type(field).dexpinv is not AbstractAlgebraElement.dexpinv
+    )
+    return (
+        f'{type(field).__name__} has no coordinates for coordinates="projected", which are for '
+        "cfjax.LeftMatrix, RightMatrix, LowRankSkew, BorderedSkew, Conjugation, Congruence without "
+        "q, and arrays beside them. Use "
+        + (
+            'coordinates="exponential", the default, where this field has a closed form.'
+            if has_closed_form
+            else "a commutator-free method, for example cfjax.CF4()."
+        )
     )
 
 

@@ -13,9 +13,10 @@ from .._arrays import Weight
 from .._numerics.expm import expm, expm_parts
 from .._numerics.expm_both import expm_both_parts
 from .._numerics.expm_source import expm_parts_with_source
-from .._numerics.matmul import promoted, small_product
-from .elementwise import check_other, check_point, each
+from .._numerics.matmul import plus_identity, promoted, small_product
+from .elementwise import check_other, check_point, each, elementwise
 from .matrix import AbstractMatrix, check_companion
+from .projected import BesideCayley
 
 
 class AbstractTwoSided(AbstractMatrix):
@@ -44,6 +45,28 @@ class AbstractTwoSided(AbstractMatrix):
     def bracket(self, other: Any) -> "AbstractTwoSided":
         check_other(self, other)
         return each(lambda x, y: x.commutator(y), self._num_axes)(self, other)
+
+    def projected(self, point: Inexact[Array, "*batch n n"]) -> Any:
+        if self._num_axes:
+            return elementwise(self, self._num_axes).projected(point)
+        return BesideCayley(self.tangent(point), type(self)(self.effective()))
+
+    def dcayinv(self, other: Any) -> Any:
+        """How u, this field, changes where `cay(u)` does with the matrix of the other field.
+
+        Here `cay(u) = (I - u/2)^-1 (I + u/2)`, and u' is `(I - u/2) a (I + u/2)`. For fields
+        without leading axes.
+        """
+        a = other.a - _times(self.a, other.a) / 2
+        return type(self)(a + _times(a, self.a) / 2)
+
+    @abc.abstractmethod
+    def cayley_increment(self, x: Inexact[Array, "n n"]) -> Inexact[Array, "n n"]:
+        """By how much `cay(u)` of this field, u, moves x; for a field without leading axes."""
+
+    @abc.abstractmethod
+    def effective(self) -> Inexact[Array, "n n"]:
+        """The matrix a without the multiple of the identity that has no effect."""
 
     @abc.abstractmethod
     def move(self, x: Inexact[Array, "n n"]) -> tuple[Inexact[Array, ""], Inexact[Array, "n n"]]:
@@ -89,20 +112,27 @@ class Conjugation(AbstractTwoSided):
     """
 
     def move(self, x: Inexact[Array, "n n"]) -> tuple[Inexact[Array, ""], Inexact[Array, "n n"]]:
-        # A multiple of the identity has no effect, and the norm is smaller without.
-        a = _minus_identity(self.a, jnp.trace(self.a) / self.a.shape[0])
+        # The norm is smaller.
+        a = self.effective()
         weight, remainder, inverse_remainder = expm_both_parts(a)
         return _from_both_sides(weight, (a, remainder), x, (-a, inverse_remainder))
 
     def average(self, x: Inexact[Array, "n n"]) -> Inexact[Array, "n n"]:
         # exp([[a, x], [0, a]]) has the integral of exp((1 - s) a) x exp(s a) above the diagonal.
-        a = _minus_identity(self.a, jnp.trace(self.a) / self.a.shape[0])
-        a, x = promoted(a, x)
+        a, x = promoted(self.effective(), x)
         exp = expm(jnp.block([[a, x], [jnp.zeros_like(x), a]]))
         return _times(exp[: len(x), len(x) :], expm(-a))
 
     def velocity(self, x: Inexact[Array, "n n"]) -> Inexact[Array, "n n"]:
         return _commutator(self.a, x)
+
+    def effective(self) -> Inexact[Array, "n n"]:
+        return _minus_identity(self.a, jnp.trace(self.a) / self.a.shape[0])
+
+    def cayley_increment(self, x: Inexact[Array, "n n"]) -> Inexact[Array, "n n"]:
+        u, x = promoted(self.a, x)
+        left = jnp.linalg.solve(plus_identity(-u / 2), _commutator(u, x))
+        return jnp.linalg.solve(plus_identity(u / 2).T, left.T).T
 
     def commutator(self, other: Any) -> "Conjugation":
         return Conjugation(_commutator(self.a, other.a))
@@ -145,11 +175,8 @@ class Congruence(AbstractTwoSided):
             check_companion("q", self.q, self.a, self.a.shape[-2:])
 
     def move(self, x: Inexact[Array, "n n"]) -> tuple[Inexact[Array, ""], Inexact[Array, "n n"]]:
-        a = self.a
-        if jnp.iscomplexobj(a):
-            # An imaginary multiple of the identity has no effect, and the norm is smaller without.
-            trace = jnp.trace(a)
-            a = _minus_identity(a, (trace - trace.conj()) / (2 * a.shape[0]))
+        # The norm is smaller.
+        a = self.effective()
         is_hermitian = jnp.all(x == _adjoint(x))
         source = jnp.zeros((), x.dtype)
         if self.q is None:
@@ -172,6 +199,22 @@ class Congruence(AbstractTwoSided):
         eye = jnp.eye(n, dtype=a.dtype)
         exp = expm(jnp.block([[a, q, zero], [zero, b, eye], [zero, zero, b]]))
         return jnp.add(*promoted(mean, _times(exp[:n, 2 * n :], expm(-b))))
+
+    def projected(self, point: Inexact[Array, "*batch n n"]) -> Any:
+        return super().projected(point) if self.q is None else None
+
+    def effective(self) -> Inexact[Array, "n n"]:
+        if not jnp.iscomplexobj(self.a):
+            return self.a
+        trace = jnp.trace(self.a)
+        return _minus_identity(self.a, (trace - trace.conj()) / (2 * self.a.shape[0]))
+
+    def cayley_increment(self, x: Inexact[Array, "n n"]) -> Inexact[Array, "n n"]:
+        is_hermitian = jnp.all(x == _adjoint(x))
+        u, x = promoted(self.a, x)
+        matrix = plus_identity(-u / 2)
+        left = jnp.linalg.solve(matrix, _linear_part(u, x))
+        return _without_skew_part(_adjoint(jnp.linalg.solve(matrix, _adjoint(left))), is_hermitian)
 
     def velocity(self, x: Inexact[Array, "n n"]) -> Inexact[Array, "n n"]:
         v = _linear_part(self.a, x)

@@ -224,6 +224,10 @@ class Elementwise(AbstractFrozenField):
     def from_chart(self, point: Any) -> Any:
         return self._each(lambda field, point: field.from_chart(point))(self.field, point)
 
+    def projected(self, point: Any) -> Any:
+        field = self._each(lambda field, point: field.projected(point))(self.field, point)
+        return None if field is None else elementwise(field, self.num_axes)
+
     def _each(self, fun: Callable[..., PyTree]) -> Callable[..., PyTree]:
         return each(fun, self.num_axes)
 
@@ -242,3 +246,8 @@ class ElementwiseElement(Elementwise, AbstractAlgebraElement):
     def has_dexpinv(self) -> Bool[Array, ""] | None:
         has_value = self._each(lambda a: a.has_dexpinv())(self.field)
         return None if has_value is None else jnp.all(has_value)
+
+    def projection(self, point: Any) -> tuple[Any, Bool[Array, ""]]:
+        each = self._each(lambda field, point: field.projection(point))
+        increment, is_there = each(self.field, point)
+        return increment, jnp.all(is_there)

@@ -25,6 +25,7 @@ from .._numerics.span import (
     square,
 )
 from .elementwise import check_point, check_real, each, elementwise
+from .projected import Polar
 
 
 class AbstractSkew(AbstractFrozenField):
@@ -33,6 +34,13 @@ class AbstractSkew(AbstractFrozenField):
     def defect(self, point: Float[Array, "*batch n p"]) -> tuple[Array, str]:
         defect = each(lambda y: orthonormal_defect(square(y)), point.ndim - 2)(point)
         return jnp.max(jnp.abs(defect), initial=0), "orthonormal columns (in entries of y0.T @ y0)"
+
+    def projected(self, point: Float[Array, "*batch n p"]) -> Any:
+        if point.ndim > 2:
+            return elementwise(self, point.ndim - 2).projected(point)
+        # Skew by construction.
+        defect = jnp.zeros((), point.dtype)
+        return Polar(self.tangent(point), defect, are_orthonormal=True)
 
 
 class LowRankSkew(AbstractSkew):

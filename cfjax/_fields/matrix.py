@@ -15,7 +15,8 @@ from .._numerics.expm import expm_parts
 from .._numerics.expm_multiply import Dense, expm_minus_one_multiply, row_norm
 from .._numerics.matmul import by_columns, promoted, small_product
 from .._numerics.squaring import max_over_batch
-from .elementwise import check_other, check_point, each
+from .elementwise import check_other, check_point, each, elementwise
+from .projected import Polar, skew_defect
 
 
 class AbstractMatrix(AbstractAlgebraElement):
@@ -83,6 +84,17 @@ class AbstractOneSided(AbstractMatrix):
         # Flows from the right compose in the reverse order, and so do these products.
         act = each(self.act, self._num_axes)
         return type(self)(act(self.a, other.a) - act(other.a, self.a))
+
+    def projected(self, point: Inexact[Array, "..."]) -> Any:
+        if self._num_axes:
+            return elementwise(self, self._num_axes).projected(point)
+        if point.size > self.a.shape[0] ** 2:
+            raise ValueError(
+                f'coordinates="projected" with {type(self).__name__} needs a point of full rank, '
+                f"which a of shape {self.a.shape} multiplies at most {len(self.a)} vectors of, got "
+                f"shape {point.shape}. Use a commutator-free method, for example cfjax.CF4()."
+            )
+        return Polar(self.tangent(point), skew_defect(self.a), are_rows=self.axis == -1)
 
     def _each(self, fun: Callable[[Array, Array], Array], point: Array) -> Array:
         n = self.a.shape[-1]

@@ -10,7 +10,8 @@ import diffrax
 import equinox as eqx
 import jax.numpy as jnp
 import jax.tree_util as jtu
-from jaxtyping import Array, PyTree, Real
+from jax import lax
+from jaxtyping import Array, Bool, PyTree, Real
 
 from .._control_term import is_driven
 from .._field import (
@@ -21,18 +22,27 @@ from .._field import (
     has_dexpinv,
     is_field,
     no_bracket_message,
+    projected,
     tangent,
 )
 from .._methods.continuous_extension import RungeKuttaExtension, runge_kutta_extension
 from .._methods.order_conditions import runge_kutta_order
 from .._methods.tableau import ContinuousExtension, Row
 from .._numerics.vectors import smooth
+from .._term import product
 from .base import check_choice, combine_nonzero, without_trailing_zeros
 from .compiled import materialised_together, scalarised
 from .dense import Path
+from .projected import ProjectedChart
 from .stages import rolled_elements
 from .step import AbstractChartSolver, Chart, Step
 from .sums import Sums
+
+_NOT_SKEW = (
+    'coordinates="projected" needs skew-Hermitian matrices a in LeftMatrix and RightMatrix, as for '
+    "orthogonal and unitary matrices, and a is not skew-Hermitian at the start. Use a "
+    "commutator-free method, for example cfjax.CF4()."
+)
 
 # The rows of the stages after the first, and the weights.
 _RungeKutta = tuple[tuple[tuple[float, ...], ...], tuple[float, ...]]
@@ -87,7 +97,8 @@ class AbstractMuntheKaas(AbstractChartSolver, diffrax.AbstractStratonovichSolver
     def step_in(self, chart):
         elements = self.elements(chart)
         v = combine_nonzero(self.b, elements.fields)
-        end = chart.flow(v, chart.start)
+        end, is_there = chart.flow_of_step(v)
+        elements = elements.add_zero(_zero_where(is_there, v))
         y1 = elements.or_nan(chart.end(end))
         error = None
         # All that follows is for error control and output within the step. The compiler leaves it
@@ -98,13 +109,13 @@ class AbstractMuntheKaas(AbstractChartSolver, diffrax.AbstractStratonovichSolver
             if self.estimate == "algebra":
                 error = tangent(difference, chart.state(end))
             else:
-                embedded = chart.flow(combine((1.0, -1.0), (v, difference)), chart.start)
+                embedded, _ = chart.flow_of_step(combine((1.0, -1.0), (v, difference)))
                 error = chart.difference(end, embedded)
             # NaN is an infinite error to diffrax, so that the step is taken again, shorter.
             error = elements.or_nan(error)
         # All of them are results then, and XLA would compute the step anew for each.
         fields = materialised_together(elements.fields)
-        path = Path.of(self.continuous_extension, chart.origin, fields)
+        path = Path.of(self.continuous_extension, chart.origin, fields, chart.apply_flow)
         return Step(y1, path, error, elements.last)
 
 
@@ -134,7 +145,11 @@ class _Elements(NamedTuple):
 @smooth
 def _zero_or_nan(u: PyTree) -> Real[Array, ""] | None:
     """Zero, or NaN if `dexpinv` at u has no value; None if nothing is known."""
-    is_defined = has_dexpinv(u)
+    return _zero_where(has_dexpinv(u), u)
+
+
+def _zero_where(is_defined: Bool[Array, ""] | None, u: PyTree) -> Real[Array, ""] | None:
+    """Zero, or NaN if not, in the precision of the field u; None if nothing is known."""
     if is_defined is None:
         return None
     dtype = jnp.finfo(jtu.tree_leaves(u)[0].dtype).dtype
@@ -234,16 +249,45 @@ class RKMK(AbstractMuntheKaas, diffrax.AbstractAdaptiveSolver):
     field at the end of the step, which is the first field of the next step. Dense output has order
     q - 1 and uses the stages alone; for `diffrax.Dopri8` it takes 4 evaluations more.
 
+    With `coordinates="projected"` a step takes no exponentials and no commutators. Within a step it
+    moves along straight lines: the stages are those of the tableau in plain space, off the manifold
+    by their own error, and only the end of the step, or the output within it, is brought back to
+    the manifold. The order, the order of output and the cost of the estimate are as above; the
+    estimate is that of plain space. It takes these fields, with leading axes or without, and arrays
+    and None beside them:
+
+    - `LeftMatrix` and `RightMatrix` with a skew-Hermitian `a`, on columns or rows of full rank. The
+      end keeps their products, so matrices stay orthogonal or unitary. The determinant of a complex
+      matrix is only as accurate as the solution. A step takes four or five products with the point
+      more than in plain space, and an inverse where the columns are not orthonormal.
+    - `LowRankSkew` and `BorderedSkew`. The end has orthonormal columns.
+    - `Conjugation` and `Congruence` without `q`, with any `a`. Beside the point a step computes an
+      element of the algebra in Cayley's coordinates, which moves the start to the end. This takes
+      two products of matrices a stage, and two solves a step.
+
+    The function of the term is called off the manifold, and must return elements of the same
+    algebra there.
+
     **Arguments:** `tableau`, a `diffrax.ButcherTableau`, for example `diffrax.Dopri5.tableau`;
-    `estimate`, `"algebra"`, `"group"` or None, and `unroll`, as in the other methods.
+    `coordinates`, `"exponential"` or `"projected"`; `estimate`, `"algebra"`, `"group"` or None, and
+    `unroll`, as in the other methods.
 
     **Raises** `TypeError` if the tableau is something else, `ValueError` if the method is implicit,
-    or for another `estimate` or `unroll`.
+    or for other `coordinates`, `estimate` or `unroll`. With `coordinates="projected"`: `TypeError`
+    for a field without these coordinates, `ValueError` for more columns than a column has entries;
+    and a runtime error for an `a` that is not skew-Hermitian at the start, by more than 1000 units
+    of rounding of its largest entry. Such an `a` later on makes a step fail, and so do an end so
+    far off that five corrections do not lead to rounding, and an element of the algebra that turns
+    by nearly pi. Then `cfjax.integrate` raises an error, and an adaptive step is taken again,
+    shorter.
 
     Source: Munthe-Kaas, High order Runge-Kutta methods on manifolds, Appl. Numer. Math. 29 (1999),
     doi:10.1016/S0168-9274(98)00030-0.
     """
 
+    coordinates: Literal["exponential", "projected"] = eqx.field(
+        static=True, default="exponential", kw_only=True
+    )
     # Tuples: unlike diffrax's tableau they compare by value, as a static field must. Last are
     # stages without weight that only serve the estimate.
     a: tuple[tuple[float, ...], ...] = eqx.field(static=True)
@@ -257,6 +301,7 @@ class RKMK(AbstractMuntheKaas, diffrax.AbstractAdaptiveSolver):
         self,
         tableau: diffrax.ButcherTableau,
         *,
+        coordinates: Literal["exponential", "projected"] = "exponential",
         estimate: Literal["algebra", "group"] | None = "algebra",
         unroll: bool | None = None,
     ):
@@ -273,8 +318,25 @@ class RKMK(AbstractMuntheKaas, diffrax.AbstractAdaptiveSolver):
         n = max(len(self.b), len(self.b_error or ()))
         self.a = ((), *(tuple(row.tolist()) for row in tableau.a_lower[: n - 1]))
         self.c = (0.0, *tableau.c.tolist()[: n - 1])
+        self.coordinates = coordinates
         self.estimate = estimate
         self.unroll = unroll
+
+    def __check_init__(self):
+        check_choice("coordinates", self.coordinates, "exponential", "projected")
+
+    @property
+    def chart_type(self) -> type[Chart]:
+        return ProjectedChart if self.coordinates == "projected" else Chart
+
+    def start(self, terms, t0, t1, y0, args):
+        state, fault = super().start(terms, t0, t1, y0, args)
+        if self.coordinates == "projected":
+            value = product(terms, terms.vf(t0, y0, args), terms.contr(t0, t1))
+            is_defined = has_dexpinv(projected(lax.stop_gradient(value), y0))
+            if is_defined is not None:
+                fault = fault.with_case(~is_defined, _NOT_SKEW)
+        return state, fault
 
     def order(self, terms) -> int:
         return _order(*self._end)
@@ -330,12 +392,12 @@ class RKMK(AbstractMuntheKaas, diffrax.AbstractAdaptiveSolver):
 
         def extra_fields(start: PyTree) -> list[PyTree]:
             identity = lambda field: field  # noqa: E731
-            chart = Chart(field, identity, Sums(start), None, fields[0], start)
+            chart = self.chart_type(field, identity, Sums(start), None, fields[0], start)
             elements = self._stages(fields[:n], rows, times, chart)
             return elements.or_nan(elements.fields[n:])
 
         fields = [*fields[:n], *scalarised(extra_fields, start, in_batches=True)]
-        return Path.of(path.continuous_extension, start, fields)
+        return Path.of(path.continuous_extension, start, fields, path.apply_flow)
 
     @property
     def _extension(self) -> RungeKuttaExtension:
@@ -372,7 +434,7 @@ class RKMK5(RKMK):
     This is `RKMK(diffrax.Tsit5.tableau)`, without commutators for a field whose `dexpinv` is a
     closed form, otherwise with 10. The estimate takes no flow, but needs the field at the end of
     the step, which is the first field of the next step, and 2 commutators for this field. Dense
-    output of order 4.
+    output of order 4. With `coordinates="projected"`, as in `RKMK`, it takes no commutators.
 
     Source: Tsitouras, Runge-Kutta pairs of order 5(4) satisfying only the first column simplifying
     assumption, Comput. Math. Appl. 62 (2011), doi:10.1016/j.camwa.2011.06.002.
@@ -381,10 +443,13 @@ class RKMK5(RKMK):
     def __init__(
         self,
         *,
+        coordinates: Literal["exponential", "projected"] = "exponential",
         estimate: Literal["algebra", "group"] | None = "algebra",
         unroll: bool | None = None,
     ):
-        super().__init__(diffrax.Tsit5.tableau, estimate=estimate, unroll=unroll)
+        super().__init__(
+            diffrax.Tsit5.tableau, coordinates=coordinates, estimate=estimate, unroll=unroll
+        )
 
 
 class RKMK8(RKMK):
@@ -392,7 +457,8 @@ class RKMK8(RKMK):
 
     This is `RKMK(diffrax.Dopri8.tableau)`, for fields whose `dexpinv` is a closed form: with other
     fields it takes 72 commutators a step. The estimate comes at no extra cost. Dense output of
-    order 7, for 4 evaluations and flows more.
+    order 7, for 4 evaluations and flows more. With `coordinates="projected"`, as in `RKMK`, it
+    takes no commutators.
 
     Source: Prince & Dormand, High order embedded Runge-Kutta formulae, J. Comput. Appl. Math. 7
     (1981), doi:10.1016/0771-050X(81)90010-3.
@@ -401,10 +467,13 @@ class RKMK8(RKMK):
     def __init__(
         self,
         *,
+        coordinates: Literal["exponential", "projected"] = "exponential",
         estimate: Literal["algebra", "group"] | None = "algebra",
         unroll: bool | None = None,
     ):
-        super().__init__(diffrax.Dopri8.tableau, estimate=estimate, unroll=unroll)
+        super().__init__(
+            diffrax.Dopri8.tableau, coordinates=coordinates, estimate=estimate, unroll=unroll
+        )
 
 
 @functools.lru_cache

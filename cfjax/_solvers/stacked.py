@@ -165,7 +165,7 @@ def stack_with_zeros(tree: PyTree, n: int) -> PyTree:
 
 def combination_of(row: Weights, fields: Array) -> Array:
     fields = fields[: len(row.weights)]
-    if jnp.size(fields[0]) <= limits.LARGE:
+    if jnp.size(fields[0]) <= limits.LARGE_TERM:
         return _sum(row, fields)
     return where_scalarised(lambda: _sum(row, fields), lambda: _product(row.weights, fields))
 

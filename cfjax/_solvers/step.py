@@ -10,7 +10,7 @@ import jax.numpy as jnp
 import jax.tree_util as jtu
 from jax import lax
 from jax.core import Tracer
-from jaxtyping import Array, PyTree, Real
+from jaxtyping import Array, Bool, PyTree, Real
 
 from .._field import from_chart, is_field
 from .._term import product
@@ -22,7 +22,7 @@ from .compiled import (
     scalarised,
 )
 from .dense import AbstractPath, Interpolation
-from .sums import Sums
+from .sums import Sums, flow_once
 
 # A part of the step.
 Time = float | Real[Array, ""]
@@ -89,6 +89,13 @@ class Chart(NamedTuple):
         """Where a combination of fields of the step carries a point in unit time."""
         return self.sums.flow(field, point)
 
+    def flow_of_step(self, field: PyTree) -> tuple[PyTree, Bool[Array, ""] | None]:
+        """Where a step leads along one field: its end, and whether there is one, None if so."""
+        return self.flow(field, self.start), None
+
+    # Within a step, from the state at its start, for `Path`.
+    apply_flow = staticmethod(flow_once)
+
     def end(self, point: PyTree) -> PyTree:
         """The state at a point, or its increment from the start where it is a compensated sum."""
         return from_chart(self.first_field, point)
@@ -121,6 +128,10 @@ class Chart(NamedTuple):
 
 class AbstractChartSolver(AbstractLieSolver):
     """A method whose step is one chart: flows of combinations of the fields in it."""
+
+    @property
+    def chart_type(self) -> type[Chart]:
+        return Chart
 
     # Whether the fields depend on where in the state they are evaluated.
     is_of_state: ClassVar[bool] = True
@@ -166,7 +177,7 @@ class AbstractChartSolver(AbstractLieSolver):
             sums = Sums(y0, compensation)
             first_value = value(self.first_time, y0) if first is None else first
             frozen = lambda value: product(terms, value, control)  # noqa: E731
-            step = self.step_in(Chart.at_start(value, frozen, sums, first_value))
+            step = self.step_in(self.chart_type.at_start(value, frozen, sums, first_value))
             end, error, last = step.end, step.error, None if first is None else step.last
             if not step.is_materialised:
                 end, error = sums.materialised(end, error, is_followed=first is not None)

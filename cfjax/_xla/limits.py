@@ -62,9 +62,11 @@ FLAT_WHOLE = 2 * FUNCTION
 FEW_DIRECTIONS = 4
 # Of the numbers of a point. If a loop over stages is differentiated, it keeps the points of all
 # stages for each of its turns, which is too much memory for larger ones; and unrolled, XLA keeps
-# several fields to add them up at once, which is too much for those of twice as many. Of larger
-# fields, combinations are matrix products, up to ten times as fast as sums. (scenes)
+# several fields to add them up at once, which is too much for those of twice as many. (scenes)
 LARGE = 2048
+# Of the numbers of a field's array. In a loop over stages, combinations of larger ones are matrix
+# products: with 1000 numbers a step takes a twentieth to a quarter less, with 64 as long. (scenes)
+LARGE_TERM = 512
 
 # Of the stages of a method, or of equal steps: more are many. A method of many stages is mostly not
 # scalarised as a whole, and unrolled its time to compile grows as the square of their number. The

@@ -1,0 +1,599 @@
+"""`RKMK(..., coordinates="projected")`: stages in plain space, and the end on the manifold."""
+
+from collections.abc import Callable
+from typing import Any, NamedTuple
+
+import diffrax
+import jax
+import jax.numpy as jnp
+import numpy as np
+import problems
+import pytest
+import scipy.linalg
+
+import cfjax
+from cfjax.scenes import toda
+
+expm = scipy.linalg.expm
+PROJECTED: Any = {"coordinates": "projected"}
+RKMK5, RKMK8 = cfjax.RKMK5(**PROJECTED), cfjax.RKMK8(**PROJECTED)
+SOLVERS = {"RKMK5": RKMK5, "RKMK8": RKMK8}
+_RNG = np.random.default_rng(3)
+
+
+def skew(n, is_complex=False):
+    """A skew-Hermitian matrix of norm 1 and trace 0."""
+    a = _RNG.normal(size=(n, n)) + (1j * _RNG.normal(size=(n, n)) if is_complex else 0)
+    a = a - a.conj().T
+    a = a - np.trace(a) / n * np.eye(n)
+    return a / np.linalg.norm(a, 2)
+
+
+def symmetric(n):
+    a = _RNG.normal(size=(n, n))
+    return (a + a.T) / np.linalg.norm(a + a.T, 2)
+
+
+class Problem(NamedTuple):
+    """A field with its start, args, and the solution at any time, by formulas of SciPy."""
+
+    field: Callable[..., Any]
+    y0: Any
+    args: Any
+    exact: Callable[[float], Any]
+
+    @property
+    def term(self):
+        return cfjax.LieTerm(self.field)
+
+    def end(self, solver, t1, num_steps):
+        y0, args = problems.arrays((self.y0, self.args))
+        ys = cfjax.integrate(self.term, solver, 0.0, t1, y0, args, num_steps=num_steps).ys
+        return jax.tree_util.tree_map(lambda y: y[-1], ys)
+
+
+# y' = b y + y c, written as a field from one side: the solution is exp(t b) y0 exp(t c).
+
+
+def left(t, y, args):
+    b, c = args
+    return cfjax.LeftMatrix(b + y @ c @ y.conj().T)
+
+
+def right(t, y, args):
+    b, c = args
+    return cfjax.RightMatrix(y.conj().T @ b @ y + c)
+
+
+def two_sided(field, y0, b, c):
+    # Their y^H y and y y^H are the identity or constant.
+    rows, columns = np.eye(len(b)), np.eye(len(c))
+    if field is left:
+        columns = y0.conj().T @ y0
+    else:
+        rows = y0 @ y0.conj().T
+    return Problem(field, y0, (b, c), lambda t: expm(t * rows @ b) @ y0 @ expm(t * c @ columns))
+
+
+def low_rank(t, y, args):
+    # (g y^T - y g^T) y has y c twice, and y^T b y as well as b y.
+    b, c = args
+    return cfjax.LowRankSkew(b @ y + y @ (c - y.T @ b @ y) / 2)
+
+
+def bordered(t, y, args):
+    return cfjax.BorderedSkew(args * jnp.cos(t))
+
+
+def _bordered(y0, gamma):
+    matrix = np.pad(gamma, ((0, 0), (0, len(gamma) - gamma.shape[1])))
+    matrix = matrix - matrix.T
+    return Problem(bordered, y0, gamma, lambda t: expm(np.sin(t) * matrix) @ y0)
+
+
+def flow_of_toda(t, y, args):
+    return cfjax.Conjugation(jnp.triu(y, 1) - jnp.tril(y, -1))
+
+
+def conjugation(t, y, args):
+    """No part of y is in the matrix but y^2, which commutes with y."""
+    return cfjax.Conjugation(args + y @ y)
+
+
+def riccati(t, x, args):
+    """x' = b x + x b^T - x r x, and skew multiples of x, which move nothing."""
+    b, r, k = args
+    return cfjax.Congruence(b - x @ r / 2 + x @ k)
+
+
+def _riccati(x0, b, r, k):
+    def exact(t):
+        zero = np.zeros_like(b)
+        start = np.vstack([x0, np.eye(len(b))])
+        x, y = np.split(expm(t * np.block([[b, zero], [r, -b.T]])) @ start, 2)
+        return x @ np.linalg.inv(y)
+
+    return Problem(riccati, x0, (b, r, k), exact)
+
+
+_COLUMNS = _RNG.normal(size=(6, 3)) / 2
+_ORTHONORMAL = np.linalg.qr(_COLUMNS)[0]
+_B = _RNG.normal(size=(4, 4)) / 4
+_LATTICE = symmetric(4)
+PROBLEMS = {
+    "SO(5)": two_sided(left, np.eye(5), skew(5), skew(5)),
+    "SO(5), body frame": two_sided(right, np.eye(5), skew(5), skew(5)),
+    "SU(3)": two_sided(left, np.eye(3) + 0j, skew(3, True), skew(3, True)),
+    "orthonormal columns": two_sided(left, _ORTHONORMAL, skew(6), skew(3)),
+    "orthonormal columns, low rank": two_sided(left, _ORTHONORMAL, skew(6), skew(3))._replace(
+        field=low_rank
+    ),
+    "columns": two_sided(left, _COLUMNS, skew(6), skew(3) / 3),
+    "rows": two_sided(right, np.eye(4)[:2] + 0.1, skew(2), skew(4)),
+    "a vector": Problem(
+        lambda t, y, args: cfjax.LeftMatrix(args * jnp.cos(t)),
+        2 * np.eye(5)[0],
+        b := skew(5),
+        lambda t, b=b: expm(np.sin(t) * b)[:, 0] * 2,
+    ),
+    "bordered": _bordered(_ORTHONORMAL, _RNG.normal(size=(6, 3)) / 3),
+    "Toda": Problem(flow_of_toda, _LATTICE, None, lambda t: toda.reference(t, _LATTICE)),
+    "conjugation": Problem(
+        conjugation,
+        _LATTICE @ _B,
+        3 * _B,
+        lambda t: expm(3 * t * _B) @ _LATTICE @ _B @ expm(-3 * t * _B),
+    ),
+    "Riccati": _riccati(np.eye(4) + 0.1, _B, np.eye(4) / 2 + symmetric(4) / 4, skew(4)),
+}
+
+
+def both(t, y, args):
+    """Columns and a lattice, each with a projection of its own."""
+    return {
+        "columns": left(t, y["columns"], args),
+        "lattice": flow_of_toda(t, y["lattice"], None),
+    }
+
+
+_GIVEN = PROBLEMS["columns"]
+BOTH = Problem(
+    both,
+    {"columns": _GIVEN.y0, "lattice": _LATTICE},
+    _GIVEN.args,
+    lambda t: {"columns": _GIVEN.exact(t), "lattice": toda.reference(t, _LATTICE)},
+)
+
+
+# Steps to t = 2 that leave more than rounding.
+STEPS = {"RKMK5": (16, 32, 64), "RKMK8": (6, 8, 12)}
+
+
+def fixed_of(problem, y):
+    """What stays, by NumPy: a spectrum, or products of columns or rows."""
+    if problem in ("Toda", "conjugation"):
+        # Of matrices that are not symmetric, as eigenvalues may be ill-conditioned.
+        return np.stack([np.trace(np.linalg.matrix_power(y, k)) for k in range(1, len(y) + 1)])
+    return y @ y.conj().T if problem in ("rows", "SO(5), body frame") else y.conj().T @ y
+
+
+@pytest.mark.representatives(12)
+@pytest.mark.parametrize("name", SOLVERS)
+@pytest.mark.parametrize("problem", PROBLEMS)
+def test_order_against_exact_answers(problem, name):
+    """On the manifold too, in the fewest steps, which are off by far more.
+
+    Tsitouras' error terms of order 5 are so small that the next ones show, up to half an order.
+
+    Mistakes in the coordinates leave order 2.
+    """
+    given, solver = PROBLEMS[problem], SOLVERS[name]
+    order = {"RKMK5": 5, "RKMK8": 8}[name]
+    assert solver.order(None) == order
+    exact = given.exact(2.0).ravel()
+    off = problems.errors(given.field, solver, 2.0, given.y0, given.args, exact, STEPS[name])
+    # A hundred roundings of numbers up to 3.
+    assert off.min() > 5e-14
+    assert order - 0.3 < problems.slope(STEPS[name], off) < order + 1.1
+    if problem == "Riccati":
+        return
+    times_and_state = problems.arrays((0.0, 2.0, given.y0, given.args, STEPS[name][0]))
+    t0, t1, y0, args, n = times_and_state
+    end = np.asarray(problems.many_steps(given.field, solver, t0, t1, y0, args, n))
+    np.testing.assert_allclose(
+        fixed_of(problem, end), fixed_of(problem, given.y0), rtol=0, atol=2e-14
+    )
+
+
+def spinning(t, y, args):
+    b, c = args
+    return cfjax.LeftMatrix(jnp.cos(t) * b + jnp.sin(2 * t) * y @ c @ y.T)
+
+
+@pytest.mark.parametrize(
+    "problem, num_steps",
+    [
+        pytest.param(problem, n, marks=[pytest.mark.slow] * (n > 10_000))
+        for problem in ("SO(5)", "columns", "low rank", "Toda")
+        for n in (10_000, 100_000)
+    ],
+)
+def test_many_steps_stay_on_the_manifold(problem, num_steps):
+    """With fields that vary, in steps of 0.1: the products of the start, to 5e-14."""
+    fields = {
+        "SO(5)": (spinning, np.eye(5), (skew(5), skew(5))),
+        "columns": (spinning, _COLUMNS, (skew(6), skew(3) / 3)),
+        "low rank": (low_rank, _ORTHONORMAL, (skew(6), skew(3))),
+        # Periodic in time, as Toda's own flow comes to rest.
+        "Toda": (
+            lambda t, y, args: cfjax.Conjugation(
+                jnp.cos(t) * args + jnp.triu(y, 1) - jnp.tril(y, -1)
+            ),
+            _LATTICE,
+            skew(4),
+        ),
+    }
+    given = Problem(*fields[problem], exact=lambda t: np.zeros(0))
+    end = given.end(RKMK5, 0.1 * num_steps, num_steps)
+    found, expected = (fixed_of(problem, y) for y in (np.asarray(end), given.y0))
+    scale = np.abs(expected).max()
+    np.testing.assert_allclose(found, expected, rtol=0, atol=5e-14 * max(scale, 1))
+
+
+@pytest.mark.parametrize("problem", ["orthonormal columns, low rank", "bordered"])
+def test_columns_that_start_off_by_rounding_become_orthonormal(problem):
+    """As by other methods. A matrix that acts from one side keeps the products as they are."""
+    given = PROBLEMS[problem]
+    end = given._replace(y0=given.y0 * (1 + 1e-9)).end(RKMK5, 0.1, 1)
+    np.testing.assert_allclose(end.T @ end, np.eye(3), rtol=0, atol=2e-15)
+
+
+# One step against formulas written by hand
+
+
+def one_step(problem, solver, h, which):
+    """What `solver.step` returns, its number `which`."""
+
+    @jax.jit
+    def step(y0, args):
+        t0, t1 = jnp.asarray(0.0), jnp.asarray(h)
+        return problems.first_step(solver, problem.term, t0, t1, y0, args)[which]
+
+    return step(*problems.arrays((problem.y0, problem.args)))
+
+
+def by_hand(problem, tableau, h):
+    """The end of the step in plain space, its estimate, and the stages' velocities."""
+    rates = []
+    for c, row in zip((0.0, *tableau.c), ((), *tableau.a_lower), strict=True):
+        y = problem.y0 + sum((a * k for a, k in zip(row, rates, strict=True)), 0 * problem.y0)
+        field = problem.field(c * h, jnp.asarray(y), problem.args)
+        rates.append(h * np.asarray(cfjax.tangent(field, jnp.asarray(y))))
+    pairs = zip(tableau.b_sol, tableau.b_error, rates, strict=True)
+    weighted = [(b * k, e * k) for b, e, k in pairs]
+    return problem.y0 + sum(x for x, _ in weighted), sum(x for _, x in weighted)
+
+
+@pytest.mark.parametrize("which", ["Dopri5", "Dopri8"])
+def test_one_step_is_the_unitary_matrix_nearest_to_that_of_plain_space(which):
+    given, tableau = PROBLEMS["SU(3)"], getattr(diffrax, which).tableau
+    plain, _ = by_hand(given, tableau, 0.7)
+    nearest, _ = scipy.linalg.polar(plain)
+    assert np.abs(plain - nearest).max() > 1e-9
+    found = one_step(given, cfjax.RKMK(tableau, **PROJECTED), 0.7, 0)
+    # Stages of a few rounded products.
+    np.testing.assert_allclose(found, nearest, rtol=0, atol=2e-14)
+
+
+@pytest.mark.parametrize("problem", ["SO(5)", "Riccati"])
+def test_the_estimate_is_that_of_plain_space(problem):
+    # Not first same as last: there the last velocity is that at the projected end.
+    given, tableau = PROBLEMS[problem], diffrax.Dopri8.tableau
+    _, estimate = by_hand(given, tableau, 0.7)
+    found = one_step(given, cfjax.RKMK(tableau, **PROJECTED), 0.7, 1)
+    np.testing.assert_allclose(found, estimate, rtol=0, atol=2e-14)
+
+
+def test_control_keeps_to_its_tolerance():
+    y0, args = problems.arrays((BOTH.y0, BOTH.args))
+
+    @jax.jit
+    def end(tolerance):
+        control = diffrax.PIDController(rtol=0.0, atol=tolerance)
+        options: Any = {"stepsize_controller": control}
+        sol = diffrax.diffeqsolve(BOTH.term, RKMK5, 0.0, 2.0, 0.05, y0, args, **options)
+        return jax.tree_util.tree_map(lambda y: y[-1], sol.ys)
+
+    exact, tolerances = problems.flat(BOTH.exact(2.0)), (1e-5, 1e-7, 1e-9)
+    off = [np.abs(problems.flat(end(x)) - exact).max() / x for x in tolerances]
+    # The estimate is of a step, and errors of steps add up.
+    assert max(off) < 10
+    assert min(off) > 1e-3
+
+
+# Output within steps
+
+
+@pytest.mark.parametrize(
+    "name, problem",
+    [
+        ("RKMK5", "SO(5)"),
+        ("RKMK8", "Toda"),
+        pytest.param("RKMK5", "bordered", marks=pytest.mark.slow),
+    ],
+)
+def test_output_within_steps(name, problem):
+    given, order = PROBLEMS[problem], {"RKMK5": 5, "RKMK8": 8}[name]
+    y0, args = problems.arrays((given.y0, given.args))
+    ts = np.linspace(0.05, 2.0, 16)
+    exact = np.stack([given.exact(t) for t in ts])
+    steps, off = ((10, 20), []) if order == 5 else ((4, 8), [])
+
+    @jax.jit
+    def saved(h):
+        return diffrax.diffeqsolve(
+            given.term, SOLVERS[name], 0.0, 2.0, h, y0, args, saveat=diffrax.SaveAt(ts=ts)
+        ).ys
+
+    for n in steps:
+        ys = np.asarray(saved(2.0 / n))
+        off.append(np.abs(ys - exact).max())
+        for y in ys:
+            np.testing.assert_allclose(
+                fixed_of(problem, y), fixed_of(problem, given.y0), rtol=0, atol=1e-14
+            )
+    # The end of a step has the order of the method, and is saved too.
+    assert order - 1.5 < np.log2(off[0] / off[1]) < order + 1.3
+
+
+# Derivatives
+
+
+def test_derivatives_are_those_of_difference_quotients():
+    y0, args = problems.arrays((BOTH.y0, BOTH.args))
+    weights = problems.random_like(y0, 1)
+
+    def field(t, y, s):
+        return BOTH.term.prod(BOTH.field(t, y, args), s)
+
+    def value(s):
+        ys = cfjax.integrate(cfjax.LieTerm(field), RKMK5, 0.0, 1.0, y0, s, num_steps=4).ys
+        return problems.inner(weights, jax.tree_util.tree_map(lambda y: y[-1], ys))
+
+    s = jnp.asarray(1.1)
+    expected = problems.central_difference(jax.jit(value), s, 1.0, 1e-3)
+    derivatives = (jax.grad(value), jax.jacfwd(value))
+    found = [jax.jit(f, compiler_options=problems.QUICK)(s) for f in derivatives]
+    # Rounding over the step of the quotient, and 1e-12 of its fourth power.
+    np.testing.assert_allclose(found, [expected] * 2, rtol=0, atol=2e-11)
+
+
+# Batches, precision, products of manifolds
+
+
+def each_problem(*slow):
+    given = [pytest.param(PROBLEMS[x], marks=pytest.mark.slow, id=x) for x in slow]
+    return pytest.mark.parametrize("given", [pytest.param(BOTH, id="both"), *given])
+
+
+@each_problem("SU(3)", "rows", "Riccati", "bordered", "orthonormal columns, low rank")
+def test_vmap_and_leading_axes_are_single_solves(given):
+    y0, args = problems.arrays((given.y0, given.args))
+    scales, options = jnp.asarray([0.3, 1.0]), {"num_steps": 3}
+
+    def of_one(t, y, args):
+        scale, args = args
+        return given.term.prod(given.field(t, y, args), scale)
+
+    def of_both(t, y, args):
+        scales, args = args
+        return jax.vmap(lambda scale, y: of_one(t, y, (scale, args)))(scales, y)
+
+    def solve(field, y0, scale):
+        term = cfjax.LieTerm(field)
+        ys = cfjax.integrate(term, RKMK5, 0.0, 1.0, y0, (scale, args), **options).ys
+        return jax.tree_util.tree_map(lambda y: y[-1], ys)
+
+    stack = lambda *xs: jnp.stack(xs)  # noqa: E731
+    expected = jax.tree_util.tree_map(stack, *(solve(of_one, y0, x) for x in scales))
+    assert max(np.abs(x[0] - x[1]).max() for x in jax.tree_util.tree_leaves(expected)) > 0.01
+    pairs = jax.tree_util.tree_map(stack, y0, y0)
+    problems.assert_close(solve(of_both, pairs, scales), expected, 1e-14)
+    found = jax.vmap(lambda x: solve(of_one, y0, x))(scales)
+    problems.assert_close(found, expected, 1e-14)
+
+
+def test_single_precision():
+    y0, args = jax.tree_util.tree_map(lambda x: np.asarray(x, np.float32), (BOTH.y0, BOTH.args))
+    end: Any = BOTH._replace(y0=y0, args=args).end(RKMK5, 2.0, 20)
+    assert {x.dtype for x in jax.tree_util.tree_leaves(end)} == {jnp.dtype("float32")}
+    # Some tens of roundings of numbers up to 3.
+    problems.assert_close(end, BOTH.exact(2.0), 2e-5)
+
+
+def test_products_with_arrays_and_parts_at_rest():
+    """A frame with orthonormal columns, a lattice, and how far the frame's first column leads."""
+    frame, lattice = PROBLEMS["SO(5)"], PROBLEMS["Toda"]
+
+    def field(t, y, args):
+        return {
+            "frame": frame.field(t, y["frame"], args),
+            "lattice": (lattice.field(t, y["lattice"][0], None), None),
+            "path": y["frame"][:, 0],
+        }
+
+    y0 = {
+        "frame": frame.y0,
+        "lattice": (lattice.y0, np.ones(2)),
+        "path": np.zeros(5),
+    }
+    y0, args = problems.arrays((y0, frame.args))
+    ys: Any = cfjax.integrate(cfjax.LieTerm(field), RKMK8, 0.0, 2.0, y0, args, num_steps=20).ys
+    times, weights = np.polynomial.legendre.leggauss(20)
+    path = sum(w * frame.exact(1 + t)[:, 0] for t, w in zip(times, weights, strict=True))
+    # The error of the method, as found above.
+    np.testing.assert_allclose(ys["frame"][-1], frame.exact(2.0), rtol=0, atol=1e-11)
+    np.testing.assert_allclose(ys["lattice"][0][-1], lattice.exact(2.0), rtol=0, atol=1e-11)
+    np.testing.assert_allclose(ys["path"][-1], path, rtol=0, atol=1e-11)
+    np.testing.assert_array_equal(ys["lattice"][1][-1], np.ones(2))
+
+
+# Refusals
+
+
+@pytest.mark.parametrize("make", [cfjax.RKMK5, cfjax.RKMK8])
+@pytest.mark.parametrize("name", ["cayley", "Projected", None])
+def test_other_coordinates_are_refused(make, name, no_shape_hook):
+    with pytest.raises(ValueError, match="coordinates must be 'exponential' or 'projected', got"):
+        make(coordinates=name)
+
+
+def test_coordinates_are_part_of_the_method():
+    assert cfjax.RKMK5() == cfjax.RKMK5(coordinates="exponential") != RKMK5
+    assert RKMK5 == cfjax.RKMK5(**PROJECTED)
+    for name in ("a", "b", "b_error", "c"):
+        assert getattr(RKMK5, name) == getattr(cfjax.RKMK5(), name)
+
+
+CLOSED = r'coordinates="exponential", the default'
+OTHERS = r"commutator-free method.*cfjax\.CF4\(\)"
+
+
+@pytest.mark.parametrize(
+    "field, y0, name, advice",
+    [
+        (lambda y: cfjax.Rotation(-y), np.ones(3), "Rotation", CLOSED),
+        (
+            lambda y: cfjax.QuaternionRotation(y[1:], frame="body", layout="wxyz"),
+            np.eye(4)[0],
+            "QuaternionRotation",
+            CLOSED,
+        ),
+        (
+            lambda y: cfjax.RigidMotion(omega=y[:3], v=y[:3], frame="body", layout="wxyz_xyz"),
+            np.eye(7)[0],
+            "RigidMotion",
+            CLOSED,
+        ),
+        (lambda y: cfjax.Congruence(-y, y), np.eye(2), "Congruence", OTHERS),
+        (lambda y: cfjax.SphereRotation(y), np.eye(4)[0], "SphereRotation", OTHERS),
+        (lambda y: {"a": -y["a"], "b": cfjax.Rotation(y["b"])}, None, "Rotation", CLOSED),
+        (
+            lambda y: cfjax.elementwise(problems.Growth(y[:, 0])),
+            np.ones((2, 3)),
+            "Elementwise",
+            OTHERS,
+        ),
+    ],
+)
+def test_fields_without_these_coordinates_are_refused(field, y0, name, advice):
+    y0 = {"a": jnp.ones(2), "b": jnp.ones(3)} if y0 is None else jnp.asarray(y0)
+    term = cfjax.LieTerm(lambda t, y, args: field(y))
+    with pytest.raises(TypeError, match=f"^{name} has no coordinates.*{advice}"):
+        cfjax.integrate(term, RKMK5, 0.0, 1.0, y0, num_steps=2)
+
+
+def test_more_columns_than_rows_are_refused():
+    term = cfjax.LieTerm(lambda t, y, args: cfjax.LeftMatrix(jnp.zeros((2, 2))))
+    with pytest.raises(ValueError, match=r"at most 2 vectors.*got shape \(2, 3\).*cfjax\.CF4"):
+        cfjax.integrate(term, RKMK5, 0.0, 1.0, jnp.ones((2, 3)), num_steps=2)
+
+
+# Errors at run time
+
+
+@pytest.mark.parametrize(
+    "cls", [cfjax.LeftMatrix, pytest.param(cfjax.RightMatrix, marks=pytest.mark.slow)]
+)
+def test_a_matrix_that_is_not_skew_is_an_error(cls):
+    a, y0 = jnp.asarray(skew(3)).at[0, 0].add(1e-9), jnp.eye(3)
+    term = cfjax.LieTerm(lambda t, y, args: cls(a))
+    message = "skew-Hermitian"
+    with pytest.raises(RuntimeError, match=message):
+        cfjax.integrate(term, RKMK5, 0.0, 1.0, y0, num_steps=2)
+    control = diffrax.PIDController(rtol=0.0, atol=1e-5)
+    with pytest.raises(RuntimeError, match=message):
+        diffrax.diffeqsolve(term, RKMK5, 0.0, 1.0, 0.1, y0, stepsize_controller=control)
+
+
+def test_a_matrix_that_is_not_skew_later_is_an_error():
+    """From within the first step on, one of two elements."""
+    a, y0 = jnp.asarray(skew(3)), jnp.stack([jnp.eye(3)] * 2)
+
+    def field(t, y, args):
+        # The projection alone would bring the end back.
+        later = 1e-9 * jnp.maximum(t - 0.3, 0.0)
+        return cfjax.LeftMatrix(jnp.stack([a, a.at[0, 0].add(later)]))
+
+    with pytest.raises(RuntimeError, match="without bound, or the steps"):
+        cfjax.integrate(cfjax.LieTerm(field), RKMK5, 0.0, 1.0, y0, num_steps=4)
+
+
+@pytest.mark.slow
+def test_control_does_not_pass_a_matrix_that_is_not_skew():
+    a = jnp.asarray(skew(3))
+    term = cfjax.LieTerm(
+        lambda t, y, args: cfjax.LeftMatrix(a.at[0, 0].add(jnp.maximum(t - 0.3, 0.0)))
+    )
+    control = diffrax.PIDController(rtol=0.0, atol=1e-5)
+    options: Any = {"stepsize_controller": control, "max_steps": 99}
+    with pytest.raises(RuntimeError):
+        diffrax.diffeqsolve(term, RKMK5, 0.0, 1.0, 0.1, jnp.eye(3), **options)
+
+
+def test_rounding_of_a_skew_matrix_is_none():
+    a = jnp.asarray(skew(3)).at[0, 0].add(1e-14)
+    term = cfjax.LieTerm(lambda t, y, args: cfjax.LeftMatrix(a))
+    end = cfjax.integrate(term, RKMK8, 0.0, 1.0, jnp.eye(3), num_steps=10).ys[-1]
+    np.testing.assert_allclose(end, expm(a), rtol=0, atol=1e-12)
+
+
+def fast(cls, angle):
+    """Turns by an angle in unit time."""
+    a = np.array([[0.0, -1.0, 0.0], [1.0, 0.0, 0.0], [0.0, 0.0, 0.0]])
+
+    def field(t, y, args):
+        return cls(angle * jnp.asarray(a))
+
+    def exact(t):
+        turn = expm(angle * t * a)
+        return turn @ start @ turn.T if cls is cfjax.Congruence else turn @ start
+
+    start = np.diag([1.0, 2.0, 3.0]) if cls is cfjax.Congruence else np.eye(3)
+    return Problem(field, start, None, exact)
+
+
+@pytest.mark.parametrize("cls, angle", [(cfjax.Congruence, 3.0), (cfjax.LeftMatrix, 4.0)])
+def test_a_step_that_is_too_long_fails_and_is_taken_again(cls, angle):
+    """Nearly half a turn for an element in Cayley's coordinates; of columns, an end too far off."""
+    given = fast(cls, angle)
+    with pytest.raises(RuntimeError, match="without bound, or the steps"):
+        given.end(RKMK5, 1.0, 1)
+
+    @jax.jit
+    def controlled(tolerance):
+        control = diffrax.PIDController(rtol=0.0, atol=tolerance)
+        y0 = jnp.asarray(given.y0)
+        sol = diffrax.diffeqsolve(given.term, RKMK5, 0.0, 1.0, 1.0, y0, stepsize_controller=control)
+        return sol.ys[-1], sol.stats["num_rejected_steps"]
+
+    # With such a tolerance the estimate of plain space would not reject the step.
+    assert controlled(1e3)[1] > 0
+    assert np.abs(controlled(1e-6)[0] - given.exact(1.0)).max() < 1e-5
+
+
+@pytest.mark.slow
+def test_a_rejected_step_has_no_derivative():
+    given = fast(cfjax.Congruence, 3.0)
+
+    def end(s):
+        control = diffrax.PIDController(rtol=0.0, atol=1e-8)
+        term = cfjax.LieTerm(lambda t, y, s: given.term.prod(given.field(t, y, None), s))
+        sol = diffrax.diffeqsolve(
+            term, RKMK5, 0.0, 1.0, 1.0, jnp.asarray(given.y0), s, stepsize_controller=control
+        )
+        return sol.ys[-1, 0, 0]
+
+    # y[0, 0] is (3 - cos(2 angle)) / 2.
+    found = jax.grad(end)(jnp.asarray(1.0))
+    np.testing.assert_allclose(found, 3 * np.sin(6), rtol=0, atol=1e-5)
