@@ -12,7 +12,6 @@ import pytest
 from xla import random_programs
 
 import cfjax
-from cfjax._xla.limits import FUNCTION
 from cfjax.scenes import heavy_top, rigid_body, spacecraft
 
 pytestmark = pytest.mark.usefixtures("rewritten_by_default")
@@ -125,7 +124,7 @@ def test_no_function_of_a_long_gradient_is_longer_than_those_of_xla(name):
     program = jax.jit(jax.grad(loss, (0, 1))).lower(*start).compile().as_text()
     functions = str(program).split("\n}")
     longest = max(text.count(" = ") for text in functions if "fused_computation" in text)
-    assert FUNCTION / 10 < longest < FUNCTION
+    assert 200 < longest < 2000
 
 
 def test_what_is_unrolled_has_no_terms_that_are_zero():
