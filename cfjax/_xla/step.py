@@ -333,6 +333,9 @@ def _run(*operands, program, kind):
     if few is not None or num_operations > kind.limit():
         return _as_traced(operands, program, kind)
     is_cut = kind.is_cut(program.jaxpr, num_operations)
+    if is_cut and num_turns(program.jaxpr) == 1:
+        # There is nothing to cut it at.
+        return _as_traced(operands, program, kind)
     if kind.linear and kind.levels and not is_cut and kind.max_derivatives == FLAT_MANY:
         # What is kept of many steps lies entry beside entry, and XLA would read it where it lies,
         # one member at a time: `CF4` on 1000 bodies took 6.5 ms for 50 steps, and takes 3.0 ms.

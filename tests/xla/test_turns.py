@@ -99,6 +99,7 @@ def _twist(t, y, args):
 
 LONG_GRADIENTS = {
     "pose, CF4": (_twist, cfjax.CF4(), [1.0, 0, 0, 0, 0.1, 0.2, 0.3]),
+    "pose, RKMK4": (_twist, cfjax.RKMK4(), [1.0, 0, 0, 0, 0.1, 0.2, 0.3]),
     "vector, RKMK5": (lambda t, y, args: cfjax.Rotation(-y / args), cfjax.RKMK5(), [0.6, 0, 0.8]),
 }
 
