@@ -56,7 +56,7 @@ _CONTRACTIONS = frozenset(("cumsum", "dot_general", "reduce_sum"))
 # Linear in this one of two operands.
 _LINEAR_IN_ONE = {"div": 0, "triangular_solve": 1}
 # Operations that call a jaxpr, and the parameter that holds it.
-_CALLS = {
+CALLS = {
     "cfjax_call": "program",
     "checkpoint": "jaxpr",
     "closed_call": "call_jaxpr",
@@ -111,7 +111,7 @@ def _is_number(value: Any) -> bool:
 
 def _outputs(eqn: JaxprEqn, operands: list[Linearity]) -> list[Linearity]:
     num_outputs = len(eqn.outvars)
-    jaxpr = eqn.params.get(_CALLS.get(eqn.primitive.name, ""))
+    jaxpr = eqn.params.get(CALLS.get(eqn.primitive.name, ""))
     if jaxpr is not None:
         outputs = _interpret(jaxpr, operands)
     else:

@@ -9,16 +9,8 @@ import jax.tree_util as jtu
 from jax.extend.core import Literal
 from jaxtyping import Array, PyTree, Real
 
-# Operations that call a jaxpr, and the parameter that holds it.
-_CALLS = {
-    "cfjax_call": "program",
-    "checkpoint": "jaxpr",
-    "closed_call": "call_jaxpr",
-    "custom_jvp_call": "call_jaxpr",
-    "custom_vjp_call": "call_jaxpr",
-    "jit": "jaxpr",
-    "pjit": "jaxpr",
-}
+from .._numerics.linearity import CALLS
+from .._numerics.matmul import matmul
 
 
 def dependences(
@@ -36,7 +28,7 @@ def _through(jaxpr: Any, inputs: Sequence[set[int]]) -> list[set[int]]:
     needs = lambda x: set() if isinstance(x, Literal) else known.get(x, set())  # noqa: E731
     for eqn in jaxpr.eqns:
         of_operands = [needs(x) for x in eqn.invars]
-        inner = eqn.params.get(_CALLS.get(eqn.primitive.name, ""))
+        inner = eqn.params.get(CALLS.get(eqn.primitive.name, ""))
         inner = getattr(inner, "jaxpr", inner)
         if len(getattr(inner, "invars", ())) == len(eqn.invars) and hasattr(inner, "eqns"):
             results = _through(inner, of_operands)
@@ -56,7 +48,7 @@ class Blocks:
         rows = []
         for p, s in enumerate(self.slices):
             terms = [
-                times(block, x[self.slices[q]]) for (i, q), block in self.blocks.items() if i == p
+                matmul(block, x[self.slices[q]]) for (i, q), block in self.blocks.items() if i == p
             ]
             rows.append(sum(terms[1:], terms[0]) if terms else jnp.zeros_like(x[s]))
         return jnp.concatenate(rows)
@@ -72,7 +64,3 @@ class Blocks:
     def trace(self, dtype: Any) -> Real[Array, ""]:
         diagonal = [jnp.trace(block) for (p, q), block in self.blocks.items() if p == q]
         return sum(diagonal, jnp.zeros((), dtype))
-
-
-def times(a: Real[Array, "n m"], x: Real[Array, "m k"]) -> Real[Array, "n k"]:
-    return jnp.matmul(a, x, precision=jax.lax.Precision.HIGHEST)
