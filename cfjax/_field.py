@@ -171,9 +171,8 @@ class AbstractFrozenField(eqx.Module):
 
         An `AbstractAlgebraElement` that is a translation by `tangent(point)`, with a further method
         `projection(start)`. This returns by how much the step leads from a start on the manifold to
-        an end on it, and whether it could be brought there; `cfjax._fields.projected` has such
-        classes. None, the default, if there are no such coordinates. The point need not be on the
-        manifold.
+        an end on it, and whether it could be brought there. None, the default, if there are no
+        such coordinates. The point need not be on the manifold.
         """
         del point
         return None
