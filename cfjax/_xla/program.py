@@ -52,6 +52,8 @@ from .smooth import by_fixed, has_reciprocals, scaled_reciprocal
 from .struct_of_arrays import (
     StructOfArrays,
     apart_like,
+    common,
+    conformed,
     is_small,
     is_small_shape,
     is_whole,
@@ -411,7 +413,10 @@ def _stacked(rows: Sequence[Any]) -> Any:
     if any(map(is_whole, rows)):
         return jnp.stack(list(map(_whole, rows)))
     parts = list(map(struct_of_arrays, rows))
-    return StructOfArrays([e for x in parts for e in x.entries], (len(parts), *parts[0].shape))
+    shape = parts[0].shape
+    flags = common(parts, shape)
+    entries = [e for x in parts for e in conformed(x, shape, flags).entries]
+    return StructOfArrays(entries, (len(parts), *shape), [True, *flags])
 
 
 def _is_static(x: Any) -> bool:

@@ -2,6 +2,7 @@
 
 import functools
 import math
+import warnings
 
 import diffrax
 import jax
@@ -12,7 +13,7 @@ import pytest
 from xla import random_programs
 
 import cfjax
-from cfjax.scenes import heavy_top, rigid_body, spacecraft
+from cfjax.scenes import heavy_top, rigid_body, spacecraft, spin_waves
 
 pytestmark = pytest.mark.usefixtures("rewritten_by_default")
 
@@ -311,3 +312,23 @@ def test_an_update_whose_place_is_not_known_is_left_alone():
 def test_the_switch_is_a_bool_or_none(no_shape_hook):
     with pytest.raises(TypeError, match=r"on must be True, False or None, got 'yes'"):
         cfjax.rewriting("yes")  # pyright: ignore[reportArgumentType]
+
+
+def test_results_of_all_turns_along_leading_axes():
+    """A splitting keeps what its terms compute in all turns, and some of it is sliced."""
+    magnet, y0 = spin_waves.MAGNET, jnp.asarray(spin_waves.y0(10))
+    colours = [spin_waves.colour(parity).field for parity in (0, 1)]
+    terms = diffrax.MultiTerm(
+        *(cfjax.LieTerm(lambda t, y, args, f=f: f(t, y, magnet)) for f in colours)
+    )
+
+    def solve(y):
+        return diffrax.diffeqsolve(terms, cfjax.BlanesMoan4(), 0.0, 0.2, 0.1, y).ys[-1]
+
+    with warnings.catch_warnings():
+        # What cannot be rewritten runs as it is, with a warning.
+        warnings.simplefilter("error")
+        new = jax.jit(solve)(y0)
+    with cfjax.rewriting(False):
+        expected = jax.jit(solve)(y0)
+    np.testing.assert_allclose(new, expected, rtol=0, atol=1e-14)
