@@ -51,7 +51,9 @@ from cfjax.scenes import spins as magnets
 HEAT_TARGETS, TARGETS = (2e-3, 1.5e-4, 1.5e-6), (1e-2, 1e-3, 1e-4)
 # Over these the others are measured.
 BASES = ("CF43", "Tsit5", "Kvaerno5", "Luscher3", "ETD54")
-LARGEST, FEWEST = 0.1, 1e-9
+LARGEST = 0.1
+# More than any row has. In plain space spins may leave their spheres, and rates grow without bound.
+MAX_STEPS = 5000
 DAMPINGS = (0.03, 0.1, 0.2, 0.3, 0.5, 0.7, 1.0, 1.5, 2.0, 3.0, 5.0, 10.0)
 FRAMES = ("with a part along the spin", "horizontal")
 
@@ -376,7 +378,7 @@ class Program:
                 (problem.t1 - problem.t0) / 1e4,
                 y0,
                 stepsize_controller=diffrax.PIDController(rtol=0.0, atol=tolerance * size),
-                max_steps=200_000,
+                max_steps=MAX_STEPS,
                 throw=False,
             )
             assert sol.ys is not None
