@@ -59,7 +59,8 @@ def run(file: str, doc: str | None, measure: Measure, parts: Iterable[str] = ())
         # In the order of a whole run, in which rows of no problem come first.
         rows = sorted(kept + rows, key=lambda row: ["", *parts].index(row.get("problem", "")))
         since = {"only": only, "minutes": minutes, "machine": environment}
-        save(name, **stored | {"since": [*stored.get("since", []), since]}, rows=rows)
+        older = [part for part in stored.get("since", []) if not set(part["only"]) <= set(only)]
+        save(name, **stored | {"since": [*older, since]}, rows=rows)
     else:
         save(name, machine=environment, quick=quick, minutes=minutes, rows=rows)
     show(name)
