@@ -588,11 +588,10 @@ STYLES: dict[str, tuple[str, str]] = {
     "RKL2": ("#0072B2", "o"),
     "RKL2, radius estimated": ("#56B4E9", "s"),
     "RKL3": ("#D55E00", "^"),
-    "RKG2": ("#56B4E9", "<"),
+    "RKG2": ("#009E73", "<"),
     "CF43": ("#999999", "D"),
     "Luscher3": ("#CC79A7", "v"),
     "ETD54": ("#E69F00", "P"),
-    "Kvaerno5": ("#009E73", "X"),
     "Tsit5": ("#000000", "+"),
 }
 NAMES = {"Tsit5": "diffrax, Tsit5", "Kvaerno5": "diffrax, Kvaerno5"}
