@@ -1045,6 +1045,7 @@ STABILISED = {
     "RKL2": "`RKL2`",
     "RKL2, radius estimated": "`RKL2`, radius estimated",
     "RKL3": "`RKL3`",
+    "RKG2": "`RKG2`",
     "CF43": "`CF43`",
     "Luscher3": "`Luscher3`",
     "ETD54": "`ETD54`",

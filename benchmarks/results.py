@@ -24,17 +24,25 @@ FOLDER = Path(__file__).with_name("results")
 PACKAGES = ("jax", "jaxlib", "diffrax", "equinox", "numpy", "scipy", "cfjax")
 
 Row = dict[str, Any]
-Measure = Callable[[bool], Iterable[Row]]
+Measure = Callable[..., Iterable[Row]]
 
 
-def run(file: str, doc: str | None, measure: Measure) -> None:
+def run(file: str, doc: str | None, measure: Measure, parts: Iterable[str] = ()) -> None:
     """The command of a benchmark: measures its rows, saves and prints them.
 
-    `measure` is told whether to be quick, which is for trying it; the file says so too.
+    `measure` is told whether to be quick, which is for trying it; the file says so too. `parts` are
+    the problems that may be measured alone: then `measure` is also given their names, and their
+    rows replace those in the file, which says when.
     """
     parser = argparse.ArgumentParser(description=doc)
     parser.add_argument("--quick", action="store_true", help="little time, rough numbers")
-    quick = parser.parse_args().quick
+    parts = list(parts)
+    if parts:
+        parser.add_argument("--only", nargs="+", choices=parts, default=[], help="these alone")
+    arguments = parser.parse_args()
+    quick, only = arguments.quick, tuple(getattr(arguments, "only", ()))
+    if quick and only:
+        parser.error("--only is for the stored file, where rows of --quick do not belong")
 
     # Not at import: rendering the pages needs neither.
     import jax
@@ -42,9 +50,19 @@ def run(file: str, doc: str | None, measure: Measure) -> None:
 
     jax.config.update("jax_enable_x64", True)
     name, environment, begin = Path(file).stem, machine(), time.perf_counter()
-    rows = [_json(row) for row in track(measure(quick), description=name, total=None)]
+    measured = measure(quick, only) if only else measure(quick)
+    rows = [_json(row) for row in track(measured, description=name, total=None)]
     minutes = round((time.perf_counter() - begin) / 60, 1)
-    save(name, machine=environment, quick=quick, minutes=minutes, rows=rows)
+    if only:
+        stored = load(name)
+        kept = [row for row in stored.pop("rows") if row.get("problem") not in only]
+        # In the order of a whole run, in which rows of no problem come first.
+        rows = sorted(kept + rows, key=lambda row: ["", *parts].index(row.get("problem", "")))
+        since = {"only": only, "minutes": minutes, "machine": environment}
+        older = [part for part in stored.get("since", []) if not set(part["only"]) <= set(only)]
+        save(name, **stored | {"since": [*older, since]}, rows=rows)
+    else:
+        save(name, machine=environment, quick=quick, minutes=minutes, rows=rows)
     show(name)
 
 
@@ -203,12 +221,17 @@ def two_digits(value: float) -> str:
     )
 
 
+def _minutes(stored: dict[str, Any]) -> float:
+    """Of the last whole run, and of problems measured alone since."""
+    return stored["minutes"] + sum(part["minutes"] for part in stored.get("since", []))
+
+
 def main() -> None:
     for name in names():
         stored = load(name)
         quick = " (quick)" * stored["quick"]
-        print(f"{name}: {stored['machine']['date']}, {stored['minutes']} minutes{quick}")
-    minutes = sum(load(name)["minutes"] for name in names())
+        print(f"{name}: {stored['machine']['date']}, {_minutes(stored):.1f} minutes{quick}")
+    minutes = sum(_minutes(load(name)) for name in names())
     print(f"The last measurements took {minutes:.0f} minutes in all.")
 
 

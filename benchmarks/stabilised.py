@@ -7,15 +7,19 @@ turns. A program that does not reach an error has no row with a tolerance for it
 
 Besides, how long a step of Landau, Lifshitz and Gilbert's equation may be, over its damping.
 
-The problems, the first five in plain space:
+The problems, those before the spins in plain space:
 
 - heat: `u' = div(k grad u)` on the unit square or cube without flow through its walls, to t = 0.05.
   The conductivity k is 1 - 0.9 to 1 + 0.9.
 - porous medium: `cfjax.scenes.porous_medium`.
 - p-Laplacian: `u' = div(|grad u| grad u)`, periodic.
+- Gray-Scott: the reaction of `cfjax.scenes.gray_scott` with differences in place of transforms, to
+  t = 200. Nothing flows through the walls, and the diffusivity of u varies as that of heat.
 - heat and reaction: `u' = laplacian u + 50 (u - u^3)`, periodic, which a transform diagonalises.
-- spins: `cfjax.scenes.harmonic_maps` with 32 x 32 spins, to t = 50.
+- spins: `cfjax.scenes.harmonic_maps`, random 64 x 64 spins, to t = 50.
 - Wilson flow: `cfjax.scenes.wilson_flow`, to t = 4.
+- precession: `cfjax.scenes.spins` with damping 0.1 and exchange alone, 32 x 32 spins that vary
+  smoothly, to t = 20.
 """
 
 import functools
@@ -41,12 +45,15 @@ import on_host
 import results
 from cfjax._measure import style as _style
 from cfjax._measure.work_precision import take_turns
-from cfjax.scenes import harmonic_maps, porous_medium, wilson_flow
+from cfjax.scenes import gray_scott, harmonic_maps, porous_medium, wilson_flow
+from cfjax.scenes import spins as magnets
 
 HEAT_TARGETS, TARGETS = (2e-3, 1.5e-4, 1.5e-6), (1e-2, 1e-3, 1e-4)
 # Over these the others are measured.
 BASES = ("CF43", "Tsit5", "Kvaerno5", "Luscher3", "ETD54")
-LARGEST, FEWEST = 0.1, 1e-9
+LARGEST = 0.1
+# More than any row has. In plain space spins may leave their spheres, and rates grow without bound.
+MAX_STEPS = 5000
 DAMPINGS = (0.03, 0.1, 0.2, 0.3, 0.5, 0.7, 1.0, 1.5, 2.0, 3.0, 5.0, 10.0)
 FRAMES = ("with a part along the spin", "horizontal")
 
@@ -86,42 +93,54 @@ def conductivities(shape: tuple[int, ...]) -> list[np.ndarray]:
     ]
 
 
+def spread_out(u: Any, walls: list[np.ndarray]) -> Any:
+    """`div(k grad u)` for cells of size one, without flow through the walls around all."""
+    out = jnp.zeros_like(u)
+    for axis, k in enumerate(walls):
+        flow = jnp.asarray(k) * jnp.diff(u, axis=axis)
+        pads = [(1, 1) if j == axis else (0, 0) for j in range(u.ndim)]
+        out = out + jnp.diff(jnp.pad(flow, pads), axis=axis)
+    return out
+
+
+def spread_out_matrix(walls: list[np.ndarray], shape: tuple[int, ...]) -> Any:
+    """The same as SciPy's sparse matrix, made from differences along each axis."""
+    matrix: Any = 0
+    for axis, k in enumerate(walls):
+        n = shape[axis]
+        offsets: Any = [0, 1]
+        step = diags([-np.ones(n - 1), np.ones(n - 1)], offsets, shape=(n - 1, n))
+        parts = [step if j == axis else eye(m) for j, m in enumerate(shape)]
+        gradient = functools.reduce(kron, parts).tocsr()
+        matrix = matrix - gradient.T @ diags(k.ravel()) @ gradient
+    return matrix
+
+
+def around(walls: list[np.ndarray]) -> np.ndarray:
+    """The sum of the conductivities around each cell. Gershgorin's bound is twice the largest."""
+    sides = [
+        np.pad(k, [side if j == axis else (0, 0) for j in range(len(walls))])
+        for axis, k in enumerate(walls)
+        for side in ((1, 0), (0, 1))
+    ]
+    return np.sum(sides, axis=0)
+
+
 def heat(*shape: int, peers: tuple[str, ...], targets: tuple[float, ...] = HEAT_TARGETS) -> Problem:
-    walls, t1 = conductivities(shape), 0.05
-    n, d = shape[0], len(shape)
+    walls, t1, n = conductivities(shape), 0.05, shape[0]
 
     def field(t: Any, u: Any, args: Any) -> Any:
-        out = jnp.zeros_like(u)
-        for axis, k in enumerate(walls):
-            flow = jnp.asarray(k) * jnp.diff(u, axis=axis)
-            pads = [(1, 1) if j == axis else (0, 0) for j in range(d)]
-            out = out + jnp.diff(jnp.pad(flow, pads), axis=axis)
-        return out * n**2
+        return n**2 * spread_out(u, walls)
 
     x = np.meshgrid(*((np.arange(m) + 0.5) / m for m in shape), indexing="ij")
     u0 = np.exp(-20 * sum((z - c) ** 2 for z, c in zip(x, (0.35, 0.4, 0.45), strict=False)))
 
     def reference() -> np.ndarray:
-        """By SciPy's exponential of a sparse matrix, made from differences along each axis."""
-        matrix: Any = 0
-        for axis, k in enumerate(walls):
-            offsets: Any = [0, 1]
-            step = diags([-np.ones(n - 1), np.ones(n - 1)], offsets, shape=(n - 1, n))
-            parts = [step if j == axis else eye(m) for j, m in enumerate(shape)]
-            gradient = functools.reduce(kron, parts).tocsr()
-            matrix = matrix - gradient.T @ diags(k.ravel()) @ gradient * n**2
+        """By SciPy's exponential of a sparse matrix."""
+        matrix = n**2 * spread_out_matrix(walls, shape)
         return expm_multiply(t1 * matrix, u0.ravel()).reshape(shape)
 
-    # Gershgorin: twice the largest sum of the conductivities around a cell.
-    sums = sum(
-        np.pad(k, [(1, 0) if j == axis else (0, 0) for j in range(d)])
-        for axis, k in enumerate(walls)
-    )
-    sums = sums + sum(
-        np.pad(k, [(0, 1) if j == axis else (0, 0) for j in range(d)])
-        for axis, k in enumerate(walls)
-    )
-    radius = 2 * float(np.max(sums)) * n**2
+    radius = 2 * float(np.max(around(walls))) * n**2
     return Problem(0.0, t1, jnp.asarray(u0), field, radius, reference, targets, peers, field)
 
 
@@ -198,8 +217,49 @@ def heat_and_reaction(n: int = 64) -> Problem:
     )
 
 
+def reactor(n: int = 128) -> Problem:
+    """Gray and Scott's reaction: u and v in an array of shape (2, n, n)."""
+    given, t1 = gray_scott.Reactor(), 200.0
+    per_cell = (n / given.side) ** 2
+    of_u, of_v = (d * per_cell for d in given.diffusivities)
+    walls = conductivities((n, n))
+    walls = [of_u * k for k in walls], [of_v * np.ones_like(k) for k in walls]
+
+    def field(t: Any, y: Any, args: Any) -> Any:
+        made = gray_scott.reaction(dict(u=y[0], v=y[1]), given)
+        return jnp.stack(
+            [spread_out(y[0], walls[0]) + made["u"], spread_out(y[1], walls[1]) + made["v"]]
+        )
+
+    sums = [jnp.asarray(2 * around(w)) for w in walls]
+
+    def radius(t: Any, y: Any, args: Any) -> Any:
+        """By Gershgorin: the rows of u, and those of v."""
+        u, v = y
+        rows_u = sums[0] + v**2 + given.feed + 2 * jnp.abs(u * v)
+        rows_v = sums[1] + jnp.abs(2 * u * v - given.feed - given.kill) + v**2
+        return jnp.maximum(jnp.max(rows_u), jnp.max(rows_v))
+
+    start = gray_scott.y0(n)
+    y0 = np.stack([start["u"], start["v"]])
+
+    def reference() -> np.ndarray:
+        matrices = [spread_out_matrix(w, (n, n)).tocsr() for w in walls]
+
+        def velocity(t: float, y: np.ndarray) -> np.ndarray:
+            u, v = y
+            moved = [(m @ x.ravel()).reshape(n, n) for m, x in zip(matrices, y, strict=True)]
+            fed = given.feed * (1 - u) - u * v**2
+            return np.stack([moved[0] + fed, moved[1] + u * v**2 - (given.feed + given.kill) * v])
+
+        return on_host.solve(velocity, t1, y0, rtol=1e-12)
+
+    peers = ("CF43", "Tsit5")
+    return Problem(0.0, t1, jnp.asarray(y0), field, radius, reference, TARGETS, peers, field)
+
+
 def spins() -> Problem:
-    start = harmonic_maps.y0(32)
+    start = harmonic_maps.y0()
     return Problem(
         0.0,
         50.0,
@@ -210,6 +270,37 @@ def spins() -> Problem:
         TARGETS,
         ("CF43", "Tsit5", "Luscher3"),
         harmonic_maps.velocity,
+    )
+
+
+def precession(n: int = 32) -> Problem:
+    """Spins that differ little from their neighbours, and slowly relax."""
+    given = magnets.Magnet(anisotropy=0.0, applied=(0.0, 0.0, 0.0), damping=0.1)
+    x = 2 * np.pi * np.arange(n) / n
+    waves = (
+        np.sin(x)[:, None] + 0 * x,
+        np.cos(x) * np.sin(x)[:, None],
+        1 + 0.5 * np.cos(x[:, None] + x),
+    )
+    start = np.stack(waves, axis=-1)
+    start = start / np.linalg.norm(start, axis=-1, keepdims=True)
+
+    def field(t: Any, y: Any, args: Any) -> Any:
+        return magnets.field(t, y, given)
+
+    def velocity(t: Any, y: Any, args: Any) -> Any:
+        return magnets.velocity(t, y, given)
+
+    return Problem(
+        0.0,
+        20.0,
+        jnp.asarray(start),
+        field,
+        8 / (1 + given.damping**2) ** 0.5,
+        functools.partial(magnets.reference, 20.0, start, given),
+        TARGETS,
+        ("RKG2", "CF43", "Tsit5", "Luscher3"),
+        velocity,
     )
 
 
@@ -234,9 +325,11 @@ PROBLEMS: dict[str, Callable[[], Problem]] = {
     "heat, 32 x 32 x 32": lambda: heat(32, 32, 32, peers=("Tsit5",), targets=HEAT_TARGETS[:2]),
     "porous medium": porous,
     "p-Laplacian": p_laplacian,
-    "spins, 32 x 32": spins,
-    "Wilson flow": links,
+    "Gray-Scott, 128 x 128": reactor,
     "heat and reaction": heat_and_reaction,
+    "spins, 64 x 64": spins,
+    "Wilson flow": links,
+    "precession, damping 0.1": precession,
 }
 
 
@@ -285,7 +378,7 @@ class Program:
                 (problem.t1 - problem.t0) / 1e4,
                 y0,
                 stepsize_controller=diffrax.PIDController(rtol=0.0, atol=tolerance * size),
-                max_steps=200_000,
+                max_steps=MAX_STEPS,
                 throw=False,
             )
             assert sol.ys is not None
@@ -354,6 +447,7 @@ def programs(problem: Problem) -> dict[str, Program]:
     }
     space = diffrax.ODETerm(problem.velocity) if problem.velocity else None
     peers: dict[str, tuple[Any, Any]] = {
+        "RKG2": (term, cfjax.RKG2(spectral_radius=radius)),
         "CF43": (term, cfjax.CF43()),
         "Luscher3": (term, cfjax.Luscher3()),
         "Tsit5": (space, diffrax.Tsit5()),
@@ -368,10 +462,11 @@ def programs(problem: Problem) -> dict[str, Program]:
 # Measurements.
 
 
-def measure(quick: bool) -> Iterator[results.Row]:
-    yield from stability(quick)
+def measure(quick: bool, only: tuple[str, ...] = ()) -> Iterator[results.Row]:
+    if not only:
+        yield from stability(quick)
     for name, make in PROBLEMS.items():
-        if not quick or name == "heat, 24 x 24":
+        if name in only or not (only or quick) or (quick and name == "heat, 24 x 24"):
             yield from of_problem(name, make(), *(5.0, 1.0) if quick else (60.0, 4.0))
             jax.clear_caches()
 
@@ -493,10 +588,10 @@ STYLES: dict[str, tuple[str, str]] = {
     "RKL2": ("#0072B2", "o"),
     "RKL2, radius estimated": ("#56B4E9", "s"),
     "RKL3": ("#D55E00", "^"),
+    "RKG2": ("#009E73", "<"),
     "CF43": ("#999999", "D"),
     "Luscher3": ("#CC79A7", "v"),
     "ETD54": ("#E69F00", "P"),
-    "Kvaerno5": ("#009E73", "X"),
     "Tsit5": ("#000000", "+"),
 }
 NAMES = {"Tsit5": "diffrax, Tsit5", "Kvaerno5": "diffrax, Kvaerno5"}
@@ -561,4 +656,4 @@ def _frame(axes: Axes, frame: str, rows: list[results.Row]) -> None:
 
 
 if __name__ == "__main__":
-    results.run(__file__, __doc__, measure)
+    results.run(__file__, __doc__, measure, parts=PROBLEMS)
