@@ -212,7 +212,9 @@ def test_no_measured_table_is_typed_in():
 
 
 def test_guides_are_short_and_their_measurements_elsewhere():
-    count = lambda text: len(re.findall(r"\w[\w.]*", text))
+    def count(text):
+        return len(re.findall(r"\w[\w.]*", text))
+
     for page in PAGES:
         if page.parent.name not in ("api", "benchmarks"):
             text = page.read_text()
