@@ -2,7 +2,8 @@
 
 Nothing is measured. In a page of `docs/` a table or a number is between `<!-- table: NAME -->` or
 `<!-- number: NAME -->` and `<!-- end -->`, where NAME is the name of a function below, with
-hyphens.
+hyphens. `<!-- decisions: NAME -->` is for the tables of fields and methods, which are in
+`docs/decisions.toml` (`decisions.py`).
 """
 
 import argparse
@@ -14,12 +15,15 @@ import sys
 from collections.abc import Callable, Iterable
 from pathlib import Path
 
+import decisions
 import results
 from results import Row, cell, in_units, load, one, pick, two_digits
 
 HERE = Path(__file__).parent
-PAGES = sorted((HERE.parent / "docs").rglob("*.md"))
-MARKED = re.compile(r"(<!-- (table|number): ([\w-]+) -->)(.*?)(<!-- end -->)", flags=re.DOTALL)
+PAGES = [HERE.parent / "README.md", *sorted((HERE.parent / "docs").rglob("*.md"))]
+MARKED = re.compile(
+    r"(<!-- (table|number|decisions): ([\w-]+) -->)(.*?)(<!-- end -->)", flags=re.DOTALL
+)
 # Methods that the results have by their tableaus.
 SHORT = {"RKMK(Tsit5)": "RKMK5", "RKMK(Dopri8)": "RKMK8"}
 # Names of ways to solve in the pages.
@@ -30,6 +34,7 @@ PICTURES = {
     "chain": 120,
     "charts": 200,
     "energy": 120,
+    "frozen_field": 110,
     "noise": 120,
     "peers": 120,
     "stabilised": 100,
@@ -44,23 +49,32 @@ def main() -> None:
     parser.add_argument(
         "--check", action="store_true", help="only list the pages that would change"
     )
-    is_check = parser.parse_args().check
+    parser.add_argument("--text", action="store_true", help="write no pictures")
+    options = parser.parse_args()
     texts = {page: page.read_text(encoding="utf-8") for page in PAGES}
-    new = {page: rendered for page, text in texts.items() if (rendered := render(text)) != text}
-    if is_check:
+    rendered = {page: render(text, page) for page, text in texts.items()}
+    new = {page: text for page, text in rendered.items() if text != texts[page]}
+    if options.check:
         names = ", ".join(str(page.relative_to(HERE.parent)) for page in new)
-        sys.exit(f"Not of the stored results: {names}. Run `make pages`." if new else 0)
+        what = f"Not from the stored results or docs/decisions.toml: {names}. Run `make pages`."
+        sys.exit(what if new else 0)
     for page, text in new.items():
         page.write_text(text, encoding="utf-8")
-    for path in draw():
+    for path in () if options.text else draw():
         print(f"Wrote {path.relative_to(HERE.parent)}")
 
 
-def render(text: str) -> str:
+def render(text: str, page: Path) -> str:
     def renewed(match: re.Match[str]) -> str:
         opening, kind, name, _, closing = match.groups()
-        lines = RENDERED[kind, name]()
-        return opening + (f"\n\n{lines}\n\n" if kind == "table" else lines) + closing
+        if kind == "number":
+            return opening + RENDERED[kind, name]() + closing
+        if kind == "table":
+            lines = RENDERED[kind, name]()
+        else:
+            folder = page.parent.relative_to(HERE.parent).as_posix()
+            lines = decisions.relocated(_lines(decisions.rows(name)), folder)
+        return f"{opening}\n\n{lines}\n\n{closing}"
 
     return MARKED.sub(renewed, text)
 
@@ -85,11 +99,12 @@ RENDERED: dict[tuple[str, str], Callable[[], str]] = {}
 def table(function: Callable[[], list[list[str]]]) -> None:
     """Registers a table: the heading and the rows, as cells."""
 
-    def lines() -> str:
-        head, *rows = function()
-        return "\n".join(f"| {' | '.join(row)} |" for row in (head, ["---"] * len(head), *rows))
+    RENDERED["table", _name(function)] = lambda: _lines(function())
 
-    RENDERED["table", _name(function)] = lines
+
+def _lines(rows: list[list[str]]) -> str:
+    head, *rest = rows
+    return "\n".join(f"| {' | '.join(row)} |" for row in (head, ["---"] * len(head), *rest))
 
 
 def number(function: Callable[[], str]) -> None:
@@ -129,6 +144,96 @@ def code(program: str) -> str:
         r"`\g<0>`",
         program,
     )
+
+
+# Numbers that guides keep of a table.
+
+
+def _medians(spreads: Iterable[list[float]]) -> str:
+    """The smallest and the largest median."""
+    return between(spread[2] for spread in spreads)
+
+
+@number
+def scenes_magnus() -> str:
+    rows = pick(load("scenes")["rows"], method="Magnus6", tolerance=1e-6)
+    return _medians(row["over Tsit5"] for row in rows if "over Tsit5" in row)
+
+
+@number
+def attitude_rkmk8() -> str:
+    rows = pick(load("attitude")["rows"], scene="spacecraft", to=1e-8)
+    return _medians(
+        row["over the better in plain space"]
+        for row in rows
+        if SHORT.get(row["method"], row["method"]) == "RKMK8"
+    )
+
+
+@number
+def stiff_gain() -> str:
+    rows = pick(_stiff("to"), program="ETD54", to=1e-6)
+    return _medians(row["over CF4"] for row in rows if row.get("over CF4"))
+
+
+@number
+def stiff_adaptive() -> str:
+    rows = pick(_stiff("step over an equal one"), program="ETD54 controlled", to=1e-6)
+    return _medians(row["step over an equal one"] for row in rows)
+
+
+@number
+def stiff_largest() -> str:
+    rows = pick(_stiff("in M"), program="ETD54", steps=200, **{"in M": "largest"})
+    return _short(rows[0]["error"])
+
+
+@number
+def quantum_gain() -> str:
+    rows = [row for rows in _quantum().values() for row in rows]
+    return between(1 / row[_OVER_OTHERS][2] for row in pick(rows, method="cfjax, Magnus6"))
+
+
+@number
+def lindblad_gain() -> str:
+    rows = pick(load("lindblad")["rows"], method="cfjax, Kraus4", problem="transmon and cavity")
+    return _medians(row["over best of others"] for row in rows)
+
+
+@number
+def noise_step() -> str:
+    rows = [row for row in load("noise")["rows"] if row.get("spins", 1) > 1]
+    medians = {
+        row["program"]: next(v for k, v in row.items() if k.startswith("over "))[2] for row in rows
+    }
+    return two_digits(medians["WeakOrder2"] / medians["CF2"])
+
+
+@number
+def batch_rkmk8() -> str:
+    rows = pick(load("batch")["rows"], method="RKMK8", what="end alone")
+    return _medians(row["over Tsit5"] for row in rows)
+
+
+@number
+def gpu_gain() -> str:
+    rows = pick(load("gpu")["rows"], method="CF4", members=100_000, dtype="float64")
+    rows = [row for row in rows if row["problem"] == "rigid bodies, equal steps"]
+    seconds = {row["device"] == "cpu": row["seconds"][2] for row in rows}
+    return two_digits(seconds[True] / seconds[False])
+
+
+@number
+def gradient_over_solve() -> str:
+    rows = pick(load("gradients")["rows"], program="cfjax.integrate, CF4")
+    return _medians(row["gradient over solve"] for row in rows)
+
+
+@number
+def diffusion_gain() -> str:
+    rows = pick(load("stabilised")["rows"], problem="heat, 64 x 64", to=2e-3)
+    counts = {row["program"]: row["evaluations"] for row in rows if row.get("evaluations")}
+    return two_digits(counts["RKL2"] / counts["CF43"])
 
 
 @number
@@ -210,6 +315,52 @@ def attitude() -> list[list[str]]:
         (steps,) = {row["steps"] for row in of_method}
         times = [cell(row["over the better in plain space"]) for row in of_method]
         table.append([scene, power(error), code(method), str(steps), *times])
+    return table
+
+
+@table
+def unit_quaternion() -> list[list[str]]:
+    """From the peers of the spacecraft: what leads to the same error, with equal steps."""
+    rows = [row for row in pick(load("peers")["rows"], scene="spacecraft") if "to" in row]
+    counts = values(rows, "systems")
+    names = {
+        "diffrax, Tsit5": "neither: `Tsit5` in plain space",
+        "diffrax, Tsit5, projected": "divide by the norm: `Tsit5`, after each step",
+        "RKMK(Dopri8)": "`QuaternionRotation` with `RKMK8`",
+        "CF4": "`QuaternionRotation` with `CF4`",
+    }
+    columns = ("steps", "error of the solution", "error of the length")
+    table = [["", *columns, *(f"time, {systems(n)}" for n in counts)]]
+    for program, name in names.items():
+        found = [one(rows, program=program, systems=n) for n in counts]
+        row = found[0]
+        length = power(row["distance"]) if row["distance"] else "0"
+        times = [in_units(row["seconds"][2]) for row in found]
+        table.append([name, str(row["steps"]), power(row["error"]), length, *times])
+    return table
+
+
+@table
+def million_steps() -> list[list[str]]:
+    rows = load("million_steps")["rows"]
+    counts = values(rows, "steps")
+    names = {
+        "Euler": "first order, `q + h * q_dot`",
+        "Euler, normalised": "the same, divided by the norm",
+        "exponential": "exponentials of readings, multiplied",
+        "exponential, normalised": "the same, divided by the norm",
+        "cfjax.flow": "`cfjax.flow` of readings",
+        "classical Runge-Kutta": "the classical method of Runge and Kutta",
+        "classical Runge-Kutta, normalised": "the same, divided by the norm",
+        "CF4": "`cfjax.integrate`, `CF4`",
+        "RKMK5": "`cfjax.integrate`, `RKMK5`",
+    }
+    columns = [f"{two_digits(n)} steps" for n in counts]
+    table = [["", *(f"length off by, {c}" for c in columns), *(f"angle, {c}" for c in columns)]]
+    for program, name in names.items():
+        found = [one(rows, program=program, steps=n) for n in counts]
+        lengths = [_short(abs(row["length less one"])) for row in found]
+        table.append([name, *lengths, *(_short(row["angle"]) for row in found)])
     return table
 
 
@@ -553,7 +704,7 @@ _SECOND = {
     "its gradient": "their gradient",
     "diffeqsolve": "50 steps in `diffrax.diffeqsolve`",
 }
-_OVER = "over the fastest of others"
+_OVER_OTHERS = "over the fastest of others"
 
 
 def _quantum() -> dict[tuple[str, int, float], list[Row]]:
@@ -575,11 +726,11 @@ def quantum() -> list[list[str]]:
         peers = [row for row in rows if row not in ours]
         in_lab_frame = [row for row in peers if not row["method"].endswith("frame")]
         groups = ours, peers, in_lab_frame
-        best, *fastest = (min(group, key=lambda r: r[_OVER][2]) for group in groups)
+        best, *fastest = (min(group, key=lambda r: r[_OVER_OTHERS][2]) for group in groups)
         cells = [f"{problem}, {systems(count)}", power(goal)]
         cells += [code(best["method"].removeprefix("cfjax, ")), in_units(best["seconds each"][2])]
         for row in fastest:
-            cells += [row["method"], two_digits(row[_OVER][2] / best[_OVER][2])]
+            cells += [row["method"], two_digits(row[_OVER_OTHERS][2] / best[_OVER_OTHERS][2])]
         table.append([*cells, power(best["off norm"]), power(fastest[0]["off norm"])])
     return table
 
@@ -625,7 +776,7 @@ def quantum_steps() -> list[list[str]]:
 
 @table
 def quantum_times() -> list[list[str]]:
-    return _by_method(lambda row: cell(row[_OVER]))
+    return _by_method(lambda row: cell(row[_OVER_OTHERS]))
 
 
 @number

@@ -1,12 +1,14 @@
 """The site: its code runs when pasted, it names everything public, and its numbers are measured."""
 
 import ast
+import inspect
 import json
 import os
 import pkgutil
 import re
 import subprocess
 import sys
+import tomllib
 from pathlib import Path
 
 import diffrax
@@ -49,7 +51,8 @@ def code(page):
 # One process for many pages: most of the time is imports and compilation.
 START = [ROOT / "docs" / "getting_started.md"]
 STATES = [page for page in PAGES if page.parent.name == "state"]
-OTHERS = [page for page in PAGES if page not in START + STATES]
+RECIPES = [page for page in PAGES if page.parent.name == "recipes"]
+OTHERS = [page for page in PAGES if page not in START + STATES + RECIPES]
 
 
 @pytest.mark.slow
@@ -58,6 +61,7 @@ OTHERS = [page for page in PAGES if page not in START + STATES]
     [
         pytest.param(START, id="start"),
         pytest.param(STATES, id="states"),
+        pytest.param(RECIPES, id="recipes"),
         pytest.param(OTHERS, id="others"),
     ],
 )
@@ -167,11 +171,56 @@ def test_measured_tables_and_numbers_are_those_stored():
     assert done.returncode == 0, done.stderr
 
 
+def test_methods_are_recommended_in_one_place():
+    copies = {
+        "README.md": ["fields", "reasons"],
+        "docs/index.md": ["first"],
+        "docs/getting_started.md": ["first"],
+        "docs/state/index.md": ["states"],
+        "docs/methods.md": ["methods"],
+    }
+    marks = {
+        name: re.findall("<!-- decisions: (.*?) -->", (ROOT / name).read_text()) for name in copies
+    }
+    assert marks == copies
+    source = (ROOT / "docs" / "decisions.toml").read_text()
+    # What `docs/methods.md` has in bold is what is recommended.
+    table = section("methods.md", "All methods")
+    bold = re.findall(r"\*\*`(\w+)`\*\*", table)
+    assert len(bold) >= 8
+    assert [name for name in bold if f"`{name}`" not in source] == []
+
+
+def test_every_field_is_in_the_table_of_fields():
+    rows = tomllib.loads((ROOT / "docs" / "decisions.toml").read_text())["field"]
+    calls = {row["call"].strip("`").partition("(")[0] for row in rows}
+    fields = {
+        name
+        for name in PUBLIC
+        if inspect.isclass(value := getattr(cfjax, name))
+        and issubclass(value, cfjax.AbstractFrozenField)
+        and not inspect.isabstract(value)
+    }
+    assert calls == {"an array", *fields}
+
+
 def test_no_measured_table_is_typed_in():
-    text = (ROOT / "docs" / "speed.md").read_text()
+    text = (ROOT / "docs" / "benchmarks" / "speed.md").read_text()
     assert text.count("<!-- table: ") >= 5
     typed = re.sub(r"<!-- table: .*?<!-- end -->", "", text, flags=re.DOTALL)
     assert "| --- |" not in typed
+
+
+def test_guides_are_short_and_their_measurements_elsewhere():
+    def count(text):
+        return len(re.findall(r"\w[\w.]*", text))
+
+    for page in PAGES:
+        if page.parent.name not in ("api", "benchmarks"):
+            text = page.read_text()
+            measured = "".join(re.findall(r"<!-- table: .*?<!-- end -->", text, re.DOTALL))
+            assert text.count("\n") <= 250, page
+            assert count(measured) <= 0.15 * count(text), page
 
 
 def test_every_benchmark_has_stored_results():
