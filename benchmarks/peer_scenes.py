@@ -299,7 +299,7 @@ def of_kuramoto() -> Scene:
         return -derivative / 2 * mask * like.fft.rfft(u**2)
 
     def field(t: Any, c: Any, args: Any) -> Any:
-        return cfjax.Affine(1.0, square(c, jnp), spectrum)
+        return cfjax.Affine(square(c, jnp), spectrum)
 
     def velocity(u: Any, like: Any) -> Any:
         c = like.fft.rfft(u)

@@ -136,7 +136,7 @@ FIELDS = {
         ON_SPHERE,
     ),
     "Affine": (
-        lambda t, y, args: cfjax.Affine(1.0, jnp.sin(y), -args, cfjax.SineTransform()),
+        lambda t, y, args: cfjax.Affine(jnp.sin(y), -args, cfjax.SineTransform()),
         ON_SPHERE,
     ),
 }

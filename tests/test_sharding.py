@@ -19,7 +19,7 @@ def rotation(t, y, args):
 
 def affine(t, y, args):
     # A spectrum that is made anew is compared with the others, in each step.
-    return cfjax.Affine(1.0, -(y**3), -jnp.square(args), cfjax.SineTransform())
+    return cfjax.Affine(-(y**3), -jnp.square(args), cfjax.SineTransform())
 
 
 def sphere(t, y, args):

@@ -253,7 +253,10 @@ def test_multi_term_adds_fields_and_not_their_arrays(way):
     """Two Affine fields share their spectrum, which is no coordinate."""
     spectrum, b, y0 = -np.array([0.5, 1.0, 2.0]), np.array([0.3, -0.2, 0.1]), np.ones(3)
     terms = diffrax.MultiTerm(
-        *(LieTerm(lambda t, y, args, w=w: cfjax.Affine(w, w * b, spectrum)) for w in (0.25, 0.75))
+        *(
+            LieTerm(lambda t, y, args, w=w: cfjax.Affine(w * b, spectrum, alpha=w))
+            for w in (0.25, 0.75)
+        )
     )
     if way == "integrate":
         found = cfjax.integrate(terms, CF4(), 0.0, 2.0, jnp.asarray(y0), num_steps=3).ys[-1]

@@ -95,7 +95,11 @@ def order(tableau: Any) -> int:
 
 @lru_cache
 def error_constant(tableau: Tableau) -> float:
-    """The 2-norm of the defects over the words of order q + 1, for a method of order q."""
+    """The size of the leading error term of a `tableau`.
+
+    For a method of order q it is the 2-norm of the residuals of all order conditions of order
+    q + 1.
+    """
     defects = _defects(_end_weights(tableau), exact_weight)
     for _ in range(order(tableau)):
         next(defects)

@@ -352,7 +352,7 @@ CASES = {
         has_bracket=False,
     ),
     "Affine": Case(
-        lambda alpha, b: cfjax.Affine(alpha, b, SPECTRUM.astype(b.dtype)),
+        lambda alpha, b: cfjax.Affine(b, SPECTRUM.astype(b.dtype), alpha=alpha),
         lambda: unit(alpha=np.abs(normal()), b=normal(4)),
         normal(4),
         lambda x, alpha, b: (alpha * np.diag(SPECTRUM).astype(LONG), b),

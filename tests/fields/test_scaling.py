@@ -233,7 +233,7 @@ def soliton(t):
 TERMS = diffrax.MultiTerm(
     cfjax.LieTerm(lambda t, psi, args: Scaling(1j * (jnp.abs(psi) ** 2).astype(psi.dtype))),
     cfjax.LieTerm(
-        lambda t, psi, args: cfjax.Affine(1.0, jnp.zeros_like(psi), KINETIC, FOURIER),
+        lambda t, psi, args: cfjax.Affine(jnp.zeros_like(psi), KINETIC, FOURIER),
     ),
 )
 

@@ -96,12 +96,12 @@ def test_the_sum_of_two_affine_fields_keeps_their_operator(solver):
     directions = np.array([[1.0, -0.5, 0.3], [0.2, 0.8, -1.0]])
 
     def kick(k):
-        return lambda t, y, args, dw: cfjax.Affine(dw[k], directions[k] * dw[k], spectrum)
+        return lambda t, y, args, dw: cfjax.Affine(directions[k] * dw[k], spectrum, alpha=dw[k])
 
     both = [cfjax.LieControlTerm(kick(k), GIVEN) for k in (0, 1)]
 
     def joined(t, y, args, dw):
-        return cfjax.Affine(dw[0] + dw[1], dw @ jnp.asarray(directions), spectrum)
+        return cfjax.Affine(dw @ jnp.asarray(directions), spectrum, alpha=dw[0] + dw[1])
 
     expected = step(solver, cfjax.LieControlTerm(joined, GIVEN))
     close(step(solver, diffrax.MultiTerm(*both)), expected)

@@ -148,7 +148,7 @@ def test_grid_values_with_a_transform_give_the_same_steps(solver):
     def field(t, u, args):
         spectrum = heat.field(t, u, args).spectrum
         b = heat.grid_field(t, u, args._replace(mu=args.mu - args.constant))
-        return cfjax.Affine(1.0, b, spectrum, cfjax.SineTransform())
+        return cfjax.Affine(b, spectrum, cfjax.SineTransform())
 
     y0, args = jnp.asarray(heat.y0(20)), arguments(20)
     kwargs = dict(num_steps=20)

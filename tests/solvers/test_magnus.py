@@ -176,7 +176,10 @@ FIELDS = {
     ),
     "Affine": (
         lambda t, y, _: cfjax.Affine(
-            1.0 + 0.5 * jnp.sin(t), wave(t, (3,)), -jnp.arange(1.0, 4.0), cfjax.SineTransform()
+            wave(t, (3,)),
+            -jnp.arange(1.0, 4.0),
+            cfjax.SineTransform(),
+            alpha=1.0 + 0.5 * jnp.sin(t),
         ),
         START,
     ),
