@@ -337,9 +337,11 @@ def combine(weights: Sequence[Weight], fields: Sequence[PyTree]) -> PyTree:
         if len({_combining_class(leaf) for leaf in leaves}) > 1:
             names = " and ".join(dict.fromkeys(map(_name, leaves)))
             place = jtu.keystr(path) and f" at {jtu.keystr(path)}"
+            advice = _motion_advice(leaves)
             raise TypeError(
-                f"Only fields of one kind can be added, got {names}{place}. If these are the terms "
-                "of a diffrax.MultiTerm, give each its own part of the state."
+                f"Only fields of one kind can be added, got {names}{place}.{advice} If these are "
+                "the terms of a diffrax.MultiTerm that move different parts of the state, return "
+                "None for the part that a term does not move."
             )
         if is_field(leaves[0]):
             return type(leaves[0]).combine(part_weights, leaves)
@@ -348,6 +350,15 @@ def combine(weights: Sequence[Weight], fields: Sequence[PyTree]) -> PyTree:
 
     columns = zip(parts, *later_parts, strict=True)
     return treedef.unflatten(combine_part(path, part, *later) for (path, part), *later in columns)
+
+
+def _motion_advice(parts: Sequence[Any]) -> str:
+    if {_name(part) for part in parts} != {"Rotation", "a translation"}:
+        return ""
+    return (
+        " For points that turn and move return one field for both, "
+        'cfjax.RigidMotion(omega=omega, v=v, frame="fixed").'
+    )
 
 
 def _name(x: Any) -> str:

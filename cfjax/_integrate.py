@@ -28,7 +28,10 @@ from ._solvers.solver import AbstractSolver, as_own
 from ._step_back import repeat_and_undo
 from ._xla import repeat
 
-_NOT_FINITE = "y0 must be finite, got an entry that is not."
+_NOT_FINITE = (
+    "y0 must be finite, got NaN or infinity. Find the entries with jax.tree.map(jnp.isfinite, y0), "
+    "and check how they were computed."
+)
 _BLOW_UP = (
     f"{diffrax.RESULTS[diffrax.RESULTS.nonfinite].rstrip('.')}: the solution grows without bound, "
     "or the steps are too long, which more num_steps cure. (A step of a Munthe-Kaas method, such "
@@ -122,7 +125,7 @@ def integrate(
         )
     if step_back and is_driven(term):
         raise ValueError(
-            "step_back takes no noise, or what else a path drives: use checkpoint_every."
+            "step_back does not support noise or other path-driven terms: use checkpoint_every."
         )
     dtype = time_dtype(y0)
     if num_steps > _max_steps(dtype):

@@ -864,7 +864,11 @@ OFF = r"y must start on the manifold that QuaternionRotation acts on: y0 must ha
     "y0, options, message",
     [
         (FAR, {}, OFF + r"\(in y0 @ y0\), and is off by more than 0.1\.$"),
-        (NEAR.at[1].set(np.nan), {}, "y0 must be finite, got an entry that is not.$"),
+        (
+            NEAR.at[1].set(np.nan),
+            {},
+            r"y0 must be finite, got NaN or infinity\. .* how they were computed\.$",
+        ),
         (NEAR, {"rate": np.inf}, "Nonfinite"),
     ],
     ids=["off the manifold", "not finite", "blow-up"],

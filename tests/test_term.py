@@ -116,7 +116,11 @@ def test_wrong_values_are_refused_with_their_place(value, y, text, promotion, no
 @pytest.mark.parametrize(
     ("value", "y", "text"),
     [
-        (Rotation(F32), V3, r"Rotation for y, .*f64\[3\]\. Its \.omega is f32\[3\]"),
+        (
+            Rotation(F32),
+            V3,
+            r"Rotation for y, .*f64\[3\]\. Its \.omega is f32\[3\].*asarray\(x, y.dtype",
+        ),
         (LeftMatrix(jnp.eye(3, dtype=jnp.float32)), V3, "LeftMatrix for y, "),
         (LeftMatrix(jnp.eye(3, dtype=jnp.complex64)), V3.astype(complex), "LeftMatrix for y, "),
         (Doubling(F32), V3, "Doubling for y, "),

@@ -105,9 +105,9 @@ def check_point(
 def check_other(field: AbstractFrozenField, other: Any) -> None:
     """Raises `TypeError` unless `other` is of the field's class, as its bracket needs."""
     if not isinstance(other, type(field)):
-        name = type(field).__name__
         raise TypeError(
-            f"{name} has a bracket with another {name} only, got {type(other).__name__}."
+            f"Cannot compute the bracket of {type(field).__name__} and {type(other).__name__}: "
+            "both must be of one class."
         )
 
 

@@ -195,7 +195,7 @@ class CommutatorFree(
         if is_driven(terms) and self.order(terms) < 2:
             raise TypeError(
                 "CommutatorFree takes noise in the sense of Stratonovich, for which its tableau "
-                "must have order 2 or more. Of order 1 is cfjax.LieEuler, in the sense of Itô."
+                "must have order 2 or more. Use cfjax.LieEuler for order 1, in the sense of Itô."
             )
         return super().for_terms(terms)
 

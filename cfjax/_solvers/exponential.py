@@ -66,8 +66,8 @@ class AbstractExponential(AbstractTableauSolver, AbstractChartSolver):
     def for_terms(self, terms):
         if is_driven(terms):
             raise TypeError(
-                f"{type(self).__name__} takes no terms that a path drives: use a commutator-free "
-                "method, for example cfjax.CF4()."
+                f"{type(self).__name__} does not support noise or other path-driven terms: use a "
+                "commutator-free method, for example cfjax.CF4()."
             )
         return self
 

@@ -66,8 +66,8 @@ class AbstractSplitting(AbstractLieSolver, diffrax.AbstractStratonovichSolver):
             )
         if is_driven(summands[:-1]):
             raise TypeError(
-                f"{name} takes noise, or what else a path drives, in its last term only: move it "
-                "there, together with what acts at the same time, as a diffrax.MultiTerm."
+                f"{name} supports noise and other path-driven terms only as its last term: move "
+                "them there, together with what acts at the same time, as a diffrax.MultiTerm."
             )
         return self
 

@@ -384,7 +384,7 @@ def test_leading_axes_of_one_are_broadcast():
         (
             lambda: Conjugation(np.eye(3)).bracket(Congruence(np.eye(3))),
             TypeError,
-            "Conjugation has a bracket with another Conjugation only, got Congruence",
+            "Cannot compute the bracket of Conjugation and Congruence: both must be of one class",
         ),
         (
             lambda: cfjax.combine((1.0, 1.0), (Conjugation(np.eye(3)), Congruence(np.eye(3)))),

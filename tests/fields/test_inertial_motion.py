@@ -426,13 +426,13 @@ def ones(layout: Any = "wxyz_v_p", dtype=np.float64, **shapes):
         (
             lambda: ones().bracket(ones(layout="p_v_wxyz")),
             ValueError,
-            "has a bracket with a motion of the same layout only, got layout='wxyz_v_p' and "
+            "two InertialMotions: both must have the same layout, got layout='wxyz_v_p' and "
             "layout='p_v_wxyz'",
         ),
         (
             lambda: ones().bracket(cfjax.Rotation(np.ones(3))),
             TypeError,
-            "InertialMotion has a bracket with another InertialMotion only, got Rotation",
+            "Cannot compute the bracket of InertialMotion and Rotation: both must be of one class",
         ),
     ],
 )

@@ -472,7 +472,7 @@ NO_LAYOUT = (
         (
             lambda: cfjax.bracket(rigid("body"), rigid("fixed")),
             ValueError,
-            "with a motion of the same frame and layout only, got frame='body', "
+            "both must have the same frame and layout, got frame='body', "
             "layout='wxyz_xyz' and frame='fixed', layout='wxyz_xyz'",
         ),
         (
@@ -518,7 +518,7 @@ NO_LAYOUT = (
         (
             lambda: planar().bracket(cfjax.Rotation(np.ones(3))),
             TypeError,
-            "PlanarMotion has a bracket with another PlanarMotion only, got Rotation",
+            "Cannot compute the bracket of PlanarMotion and Rotation: both must be of one class",
         ),
     ],
 )

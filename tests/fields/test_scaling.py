@@ -195,7 +195,7 @@ def test_a_munthe_kaas_method_acts_on_logarithms(solver):
         (
             lambda: Scaling(np.ones(3)).bracket(cfjax.LeftMatrix(np.eye(3))),
             TypeError,
-            "Scaling has a bracket with another Scaling only, got LeftMatrix",
+            "Cannot compute the bracket of Scaling and LeftMatrix: both must be of one class",
         ),
     ],
 )
