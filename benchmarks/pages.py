@@ -2,7 +2,8 @@
 
 Nothing is measured. In a page of `docs/` a table or a number is between `<!-- table: NAME -->` or
 `<!-- number: NAME -->` and `<!-- end -->`, where NAME is the name of a function below, with
-hyphens.
+hyphens. `<!-- decisions: NAME -->` is for the tables of fields and methods, which are in
+`docs/decisions.toml` (`decisions.py`).
 """
 
 import argparse
@@ -14,12 +15,15 @@ import sys
 from collections.abc import Callable, Iterable
 from pathlib import Path
 
+import decisions
 import results
 from results import Row, cell, in_units, load, one, pick, two_digits
 
 HERE = Path(__file__).parent
-PAGES = sorted((HERE.parent / "docs").rglob("*.md"))
-MARKED = re.compile(r"(<!-- (table|number): ([\w-]+) -->)(.*?)(<!-- end -->)", flags=re.DOTALL)
+PAGES = [HERE.parent / "README.md", *sorted((HERE.parent / "docs").rglob("*.md"))]
+MARKED = re.compile(
+    r"(<!-- (table|number|decisions): ([\w-]+) -->)(.*?)(<!-- end -->)", flags=re.DOTALL
+)
 # Methods that the results have by their tableaus.
 SHORT = {"RKMK(Tsit5)": "RKMK5", "RKMK(Dopri8)": "RKMK8"}
 # Names of ways to solve in the pages.
@@ -44,23 +48,32 @@ def main() -> None:
     parser.add_argument(
         "--check", action="store_true", help="only list the pages that would change"
     )
-    is_check = parser.parse_args().check
+    parser.add_argument("--text", action="store_true", help="write no pictures")
+    options = parser.parse_args()
     texts = {page: page.read_text(encoding="utf-8") for page in PAGES}
-    new = {page: rendered for page, text in texts.items() if (rendered := render(text)) != text}
-    if is_check:
+    rendered = {page: render(text, page) for page, text in texts.items()}
+    new = {page: text for page, text in rendered.items() if text != texts[page]}
+    if options.check:
         names = ", ".join(str(page.relative_to(HERE.parent)) for page in new)
-        sys.exit(f"Not of the stored results: {names}. Run `make pages`." if new else 0)
+        what = f"Not from the stored results or docs/decisions.toml: {names}. Run `make pages`."
+        sys.exit(what if new else 0)
     for page, text in new.items():
         page.write_text(text, encoding="utf-8")
-    for path in draw():
+    for path in () if options.text else draw():
         print(f"Wrote {path.relative_to(HERE.parent)}")
 
 
-def render(text: str) -> str:
+def render(text: str, page: Path) -> str:
     def renewed(match: re.Match[str]) -> str:
         opening, kind, name, _, closing = match.groups()
-        lines = RENDERED[kind, name]()
-        return opening + (f"\n\n{lines}\n\n" if kind == "table" else lines) + closing
+        if kind == "number":
+            return opening + RENDERED[kind, name]() + closing
+        if kind == "table":
+            lines = RENDERED[kind, name]()
+        else:
+            folder = page.parent.relative_to(HERE.parent).as_posix()
+            lines = decisions.relocated(_lines(decisions.rows(name)), folder)
+        return f"{opening}\n\n{lines}\n\n{closing}"
 
     return MARKED.sub(renewed, text)
 
@@ -85,11 +98,12 @@ RENDERED: dict[tuple[str, str], Callable[[], str]] = {}
 def table(function: Callable[[], list[list[str]]]) -> None:
     """Registers a table: the heading and the rows, as cells."""
 
-    def lines() -> str:
-        head, *rows = function()
-        return "\n".join(f"| {' | '.join(row)} |" for row in (head, ["---"] * len(head), *rows))
+    RENDERED["table", _name(function)] = lambda: _lines(function())
 
-    RENDERED["table", _name(function)] = lines
+
+def _lines(rows: list[list[str]]) -> str:
+    head, *rest = rows
+    return "\n".join(f"| {' | '.join(row)} |" for row in (head, ["---"] * len(head), *rest))
 
 
 def number(function: Callable[[], str]) -> None:

@@ -1,12 +1,14 @@
 """The site: its code runs when pasted, it names everything public, and its numbers are measured."""
 
 import ast
+import inspect
 import json
 import os
 import pkgutil
 import re
 import subprocess
 import sys
+import tomllib
 from pathlib import Path
 
 import diffrax
@@ -165,6 +167,39 @@ def test_measured_tables_and_numbers_are_those_stored():
     command = [sys.executable, "benchmarks/pages.py", "--check"]
     done = subprocess.run(command, capture_output=True, text=True, cwd=ROOT)
     assert done.returncode == 0, done.stderr
+
+
+def test_methods_are_recommended_in_one_place():
+    copies = {
+        "README.md": ["fields", "reasons"],
+        "docs/index.md": ["first"],
+        "docs/getting_started.md": ["first"],
+        "docs/state/index.md": ["states"],
+        "docs/methods.md": ["methods"],
+    }
+    marks = {
+        name: re.findall("<!-- decisions: (.*?) -->", (ROOT / name).read_text()) for name in copies
+    }
+    assert marks == copies
+    source = (ROOT / "docs" / "decisions.toml").read_text()
+    # What `docs/methods.md` has in bold is what is recommended.
+    table = section("methods.md", "All methods")
+    bold = re.findall(r"\*\*`(\w+)`\*\*", table)
+    assert len(bold) >= 8
+    assert [name for name in bold if f"`{name}`" not in source] == []
+
+
+def test_every_field_is_in_the_table_of_fields():
+    rows = tomllib.loads((ROOT / "docs" / "decisions.toml").read_text())["field"]
+    calls = {row["call"].strip("`").partition("(")[0] for row in rows}
+    fields = {
+        name
+        for name in PUBLIC
+        if inspect.isclass(value := getattr(cfjax, name))
+        and issubclass(value, cfjax.AbstractFrozenField)
+        and not inspect.isabstract(value)
+    }
+    assert calls == {"an array", *fields}
 
 
 def test_no_measured_table_is_typed_in():
