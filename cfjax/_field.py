@@ -387,8 +387,8 @@ def bracket(a: PyTree, b: PyTree) -> PyTree:
     def bracket_leaf(x, y):
         if is_field(x) != is_field(y):
             raise TypeError(
-                "bracket: a translation has no bracket with a frozen field, got "
-                f"{type(x).__name__} and {type(y).__name__}."
+                f"Cannot compute the bracket of {type(x).__name__} and {type(y).__name__}: a "
+                "frozen field has none with a translation."
             )
         if isinstance(x, AbstractAlgebraElement):
             return x.bracket(y)
