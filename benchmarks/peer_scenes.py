@@ -38,7 +38,7 @@ class Scene(NamedTuple):
     # The distance from the group, if there is one.
     distance: Callable[[Any], float] | None
     target: float
-    # Of a program in one turn: a single one may be too short for the clock.
+    # Runs of a program in one turn: a single one may be too short for the clock.
     repeats: int
     programs: dict[str, Program]
 

@@ -232,7 +232,7 @@ def allen_cahn_periodic() -> Problem:
 
 
 def convection(n: int, derivative: np.ndarray, scale: float) -> Callable:
-    """Of u in its conservative form, with two thirds of the wave numbers kept."""
+    """The convection of u in its conservative form, with two thirds of the wave numbers kept."""
     mask = dealiasing_mask(np.arange(n // 2 + 1), n, 2 / 3)
 
     def g(t: Any, c: Any) -> Any:

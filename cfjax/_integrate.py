@@ -260,8 +260,8 @@ def equal_steps(
         prepend = lambda initial, saved: jnp.concatenate([initial[None], saved])  # noqa: E731
         ts, ys = jtu.tree_map(prepend, (t0, start), (ts, ys))
     ts, end = needing(zero, (ts, t1))
-    # Of the saved states alone, outside the loop: sums and products keep infinity and NaN, so a
-    # blow-up shows in what is saved after it.
+    # Only the saved states are checked, outside the loop: sums and products keep infinity and NaN,
+    # so a blow-up shows in what is saved after it.
     result = result_of(ys)
     ended = solver.ended(carry[2], fault)
     if throw and ended is not fault:

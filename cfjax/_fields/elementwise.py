@@ -33,7 +33,7 @@ def each(fun: Callable[..., PyTree], num_axes: int) -> Callable[..., PyTree]:
         if len(lengths - {1}) > 1:
             raise ValueError(f"The leading axes must agree or be 1, got lengths {sorted(lengths)}.")
         axes = [None if len(lengths) > 1 and x.shape[0] == 1 else 0 for x in distinct]
-        # Those that `jax.vmap` has returned may be of NumPy.
+        # `jax.vmap` may have returned NumPy arrays.
         operands = [
             jnp.asarray(x[0] if axis is None else x) for x, axis in zip(distinct, axes, strict=True)
         ]

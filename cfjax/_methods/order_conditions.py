@@ -74,8 +74,8 @@ Defects: TypeAlias = list[tuple[Fraction, float]]
 def order(tableau: Any) -> int:
     """The order of a commutator-free method, at least 1 as every tableau is consistent.
 
-    Of an exponential Runge-Kutta method it is the classical order, for steps that are short for the
-    linear part too; `cfjax.stiff_order` is the order for long ones.
+    The order of an exponential Runge-Kutta method is the classical one, for steps that are short
+    for the linear part too; `cfjax.stiff_order` is the order for long ones.
 
     For exact tableaus the result is exact. Floats are taken as rounded coefficients, and the result
     is the order that the unrounded method may have; see `_defects`.

@@ -232,7 +232,8 @@ class _PolynomialPath(AbstractPath):
     first: PyTree
     start: PyTree
     velocity: PyTree
-    # Of g less its value at the start, the coefficients of the powers of the time from the first.
+    # The coefficients of the powers of the time, from the first on, of g less its value at the
+    # start.
     powers: list[PyTree]
 
     def point(self, theta: Any) -> PyTree:

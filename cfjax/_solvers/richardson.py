@@ -95,7 +95,7 @@ class Richardson(AbstractSolver, diffrax.AbstractAdaptiveSolver, diffrax.Abstrac
 
     @property
     def root_finder(self) -> Any:
-        """That of an implicit solver: diffrax gives it the controller's tolerances."""
+        """The root finder of an implicit solver: diffrax gives it the controller's tolerances."""
         return cast(diffrax.AbstractImplicitSolver, self.solver).root_finder
 
     @property

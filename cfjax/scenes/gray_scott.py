@@ -37,7 +37,7 @@ from ._scene import by_dop853, by_name, in_plain_space, solve
 t0, t1 = 0.0, 100.0
 solver = cfjax.ETD54()
 
-# Of u and v, with the keys "u" and "v".
+# The concentrations u and v, with the keys "u" and "v".
 State = dict[str, Float[Array | np.ndarray, "n n"]]
 
 
