@@ -204,7 +204,7 @@ def test_scenes_solve_with_the_method_that_readme_recommends():
             # With variations by the method for the state.
             problem |= {"term": problem["term"].term, "y0": problem["y0"].state}
         if not isinstance(problem["term"], cfjax.LieTerm):
-            # Of splittings and of noise: the pages on them.
+            # The pages on splittings and on noise recommend these.
             assert chosen in ("BlanesMoan4", "Strang", "WeakOrder2"), name
             continue
         arrays = problem["t0"], problem["y0"], problem.get("args")

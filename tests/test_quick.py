@@ -33,7 +33,7 @@ def of_time(t, y, args):
 
 
 def decay(t, y, args):
-    """Of density matrices, and not of the state."""
+    """The decay of density matrices, which does not depend on the state."""
     return cfjax.Lindblad(jnp.diag(args * t), [args[:, None] * np.eye(3, k=1)])
 
 

@@ -26,7 +26,7 @@ def sphere(t, y, args):
     return cfjax.SphereRotation(args * y)
 
 
-# Of the kinds of loops and checks: stages written out, in a loop, of one point.
+# A solve for each kind of loops and checks: stages written out, in a loop, of one point.
 SOLVES = {
     "CF4": (rotation, cfjax.CF4()),
     "RKMK4": (rotation, cfjax.RKMK4()),

@@ -147,7 +147,7 @@ FADING = diffrax.MultiTerm(cfjax.LieTerm(source), cfjax.LieTerm(decay))
 
 @pytest.mark.parametrize("throw", [True, False])
 def test_step_back_that_misses_the_start(throw):
-    """Of what has decayed by exp(-40) no digits are left beside the source."""
+    """No digits are left beside the source of what has decayed by exp(-40)."""
 
     def end(y0):
         options = dict(num_steps=10, step_back=True, throw=throw)

@@ -418,7 +418,7 @@ def test_boundary_values_by_lifting():
 
 
 def test_a_state_that_is_a_number():
-    """Of no axes, so neither has its spectrum any."""
+    """A number has no axes, so its spectrum has none either."""
     found = cfjax.flow(Affine(jnp.asarray(3.0), jnp.asarray(-0.5), alpha=2.0), jnp.asarray(1.0))
     np.testing.assert_allclose(found, np.exp(-1) + 3 * (1 - np.exp(-1)), rtol=4 * EPS)
 

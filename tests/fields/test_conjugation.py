@@ -186,7 +186,7 @@ class Plain(Conjugation):
 
 
 def drift(cls, a, x):
-    """Of the spectrum over 10^4 steps, relative, for each of a batch."""
+    """The relative drift of the spectrum over 10^4 steps, for each of a batch."""
     term = cfjax.LieTerm(lambda t, y, args: cls((1 + 0.3 * jnp.sin(t)) * args))
     sol = cfjax.integrate(term, cfjax.LieEuler(), 0.0, 1e4, x, a, num_steps=10_000)
     ends = [np.sort(np.real(np.linalg.eigvals(y)), axis=1) for y in (x, np.asarray(sol.ys[-1]))]

@@ -136,7 +136,7 @@ def test_promises(kind, axes):
 
 
 def test_brackets_are_commutators():
-    """Of both matrices; the bracket of two plain motions has shifts, and no gravity or time."""
+    """As of both matrices; the bracket of two plain motions has shifts, and no gravity or time."""
     a, b = (0.3 * AXIS, FORCE, GRAVITY, 1.0), (-FORCE, AXIS, FORCE, 0.25)
     found = imu(*a).bracket(imu(*b))
     a, b = ((*x, np.zeros(3), np.zeros(3)) for x in (a, b))
@@ -184,7 +184,7 @@ def test_constant_readings_are_exact_in_one_step(kind):
         ends = [scipy.linalg.expm(7 * part(*coordinates)) for part in (from_left, from_right)]
         want, found = ends[0] @ MATRIX @ ends[1], sol.ys[-1]
         found = to_matrix(np.asarray(found)) if kind == "vector" else found
-        # Of numbers of 40, with an angle of 14.
+        # The numbers are 40, with an angle of 14.
         np.testing.assert_allclose(found, want, rtol=0, atol=40 * 40 * EPS)
 
 

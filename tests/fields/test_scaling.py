@@ -37,7 +37,7 @@ def test_every_entry_is_relatively_accurate(dtype, point_dtype):
     rate = (LARGEST[str(info.dtype)] * RATES).astype(dtype)
     if np.iscomplexobj(rate):
         rate += (1j * np.linspace(-30, 30, len(rate))).astype(dtype)
-    # Of all sizes from 1e-3 to 1e3, and of both signs.
+    # The entries have all sizes from 1e-3 to 1e3, and both signs.
     point = (10.0 ** np.linspace(-3, 3, len(rate)) * (-1) ** np.arange(len(rate))).astype(dtype)
     if point_dtype.startswith("complex"):
         point = (point * np.exp(1j * np.arange(len(rate)))).astype(point_dtype)

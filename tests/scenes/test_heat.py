@@ -97,7 +97,7 @@ def test_reference():
 
 
 def test_reference_solves_the_large_system():
-    # Of order 4 in time with steps of 1e-3 at t = 0.3, where rates up to 20 are left.
+    # Differences of order 4 in time with steps of 1e-3 at t = 0.3, where rates up to 20 are left.
     mu = np.asarray(heat.diffusivity(100).mu)
     u = heat.reference(0.3 + 1e-3 * np.arange(-2, 3), mu)
     slope = (u[0] - u[4] - 8 * (u[1] - u[3])) / 0.012

@@ -117,7 +117,7 @@ def interpreted(tableau, theta=THETA):
         )
 
     def flow(c):
-        """Of the first g alone."""
+        """The flow of the first g alone."""
         return phi(0, c * H * first) @ u + c * H * phi(1, c * H * first) @ stages[0]
 
     for c, columns in list(zip(map(float, tableau.c), tableau.a, strict=True))[1:]:
@@ -436,7 +436,9 @@ def test_evaluations_of_a_step(name):
 
 @pytest.mark.slow
 def test_gradients_against_the_variational_equation():
-    """Of the end by the diffusivity and the start, in both modes, also of controlled steps."""
+    """The end is differentiated by the diffusivity and the start, in both modes, and with adaptive
+    steps too.
+    """
     n = 15
     x = np.arange(1, n + 1) / (n + 1)
     second = (n + 1) ** 2 * (np.eye(n, k=1) - 2 * np.eye(n) + np.eye(n, k=-1))
