@@ -77,12 +77,12 @@ def integrate(
     - `checkpoint_every`: for reverse mode with little memory. Reverse mode then keeps one state for
       each group of this many steps, and computes the steps between a second time. About
       `sqrt(num_steps)` is best, and makes the memory proportional to `sqrt(num_steps)` states.
-    - `step_back`: for reverse mode in constant memory. Reverse mode then keeps the saved states
-      alone, and computes all others by steps backwards. For symmetric solvers, which undo a step to
-      rounding: `cfjax.Strang` and other splittings, `cfjax.ImplicitMidpoint`, `cfjax.Composition`
-      and Magnus methods. What grows forwards in time is well conditioned, but what decays grows on
-      the way back, and so does its rounding. Forward mode and noise are
-      not possible, and fields must have a derivative in time too.
+    - `step_back`: for reverse mode in constant memory. Reverse mode then stores only the saved
+      states, and computes all others by stepping backwards. This works with symmetric solvers,
+      which undo a step up to rounding: `cfjax.Strang` and other splittings,
+      `cfjax.ImplicitMidpoint`, `cfjax.Composition` and Magnus methods. Stepping backwards amplifies
+      whatever the equation damps, rounding included, so do not use it for strongly damped problems.
+      It does not support forward mode or noise, and fields must have a derivative in time too.
     - `throw`: whether a failure is an error, as in diffrax. If not, `result` of the solution says
       what happened, and invalid values of the arguments give NaN. In a batch made by `jax.vmap` one
       failure is an error for the whole batch. An error check within a function that you compile is

@@ -203,8 +203,8 @@ class CommutatorFree(
 class LieEuler(AbstractCommutatorFree, diffrax.AbstractItoSolver):
     """The exponential Euler step. Order 1, 1 evaluation, 1 flow. Dense output of order 1.
 
-    Noise is in the sense of Itô in the frame: the coefficients of the fields are taken before the
-    increment. In a linear space that is Itô's equation.
+    It evaluates the field at the start of the step, so with noise it solves the Itô equation in the
+    coordinates of the frame. In a linear space that is Itô's equation.
 
     `estimate` and `unroll` are those of `cfjax.CommutatorFree`.
     """
