@@ -228,6 +228,52 @@ def attitude() -> list[list[str]]:
 
 
 @table
+def unit_quaternion() -> list[list[str]]:
+    """From the peers of the spacecraft: what leads to the same error, with equal steps."""
+    rows = [row for row in pick(load("peers")["rows"], scene="spacecraft") if "to" in row]
+    counts = values(rows, "systems")
+    names = {
+        "diffrax, Tsit5": "neither: `Tsit5` in plain space",
+        "diffrax, Tsit5, projected": "divide by the norm: `Tsit5`, after each step",
+        "RKMK(Dopri8)": "`QuaternionRotation` with `RKMK8`",
+        "CF4": "`QuaternionRotation` with `CF4`",
+    }
+    columns = ("steps", "error of the solution", "error of the length")
+    table = [["", *columns, *(f"time, {systems(n)}" for n in counts)]]
+    for program, name in names.items():
+        found = [one(rows, program=program, systems=n) for n in counts]
+        row = found[0]
+        length = power(row["distance"]) if row["distance"] else "0"
+        times = [in_units(row["seconds"][2]) for row in found]
+        table.append([name, str(row["steps"]), power(row["error"]), length, *times])
+    return table
+
+
+@table
+def million_steps() -> list[list[str]]:
+    rows = load("million_steps")["rows"]
+    counts = values(rows, "steps")
+    names = {
+        "Euler": "first order, `q + h * q_dot`",
+        "Euler, normalised": "the same, divided by the norm",
+        "exponential": "exponentials of readings, multiplied",
+        "exponential, normalised": "the same, divided by the norm",
+        "cfjax.flow": "`cfjax.flow` of readings",
+        "classical Runge-Kutta": "the classical method of Runge and Kutta",
+        "classical Runge-Kutta, normalised": "the same, divided by the norm",
+        "CF4": "`cfjax.integrate`, `CF4`",
+        "RKMK5": "`cfjax.integrate`, `RKMK5`",
+    }
+    columns = [f"{two_digits(n)} steps" for n in counts]
+    table = [["", *(f"length off by, {c}" for c in columns), *(f"angle, {c}" for c in columns)]]
+    for program, name in names.items():
+        found = [one(rows, program=program, steps=n) for n in counts]
+        lengths = [_short(abs(row["length less one"])) for row in found]
+        table.append([name, *lengths, *(_short(row["angle"]) for row in found)])
+    return table
+
+
+@table
 def gradients() -> list[list[str]]:
     rows = load("gradients")["rows"]
     cases = list(itertools.product(values(rows, "state"), values(rows, "systems")))

@@ -51,7 +51,8 @@ def code(page):
 # One process for many pages: most of the time is imports and compilation.
 START = [ROOT / "docs" / "getting_started.md"]
 STATES = [page for page in PAGES if page.parent.name == "state"]
-OTHERS = [page for page in PAGES if page not in START + STATES]
+RECIPES = [page for page in PAGES if page.parent.name == "recipes"]
+OTHERS = [page for page in PAGES if page not in START + STATES + RECIPES]
 
 
 @pytest.mark.slow
@@ -60,6 +61,7 @@ OTHERS = [page for page in PAGES if page not in START + STATES]
     [
         pytest.param(START, id="start"),
         pytest.param(STATES, id="states"),
+        pytest.param(RECIPES, id="recipes"),
         pytest.param(OTHERS, id="others"),
     ],
 )

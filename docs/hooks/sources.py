@@ -20,6 +20,7 @@ ROOT = Path(__file__).parents[2]
 PAGES = {
     "architecture.md": "ARCHITECTURE.md",
     "changelog.md": "CHANGELOG.md",
+    "contributing.md": "CONTRIBUTING.md",
     "xla.md": "cfjax/_xla/README.md",
 }
 NOTEBOOKS = sorted((ROOT / "notebooks").glob("*.ipynb"))
@@ -37,7 +38,8 @@ SOURCES = {place: source for source, place in PLACES.items()}
 
 def on_config(config):
     titles = [{title(path): f"notebooks/{path.stem}.md"} for path in NOTEBOOKS]
-    (gallery,) = (entry["Gallery"] for entry in config.nav if "Gallery" in entry)
+    (recipes,) = (entry["Recipes"] for entry in config.nav if "Recipes" in entry)
+    (gallery,) = (e["Gallery"] for e in recipes if isinstance(e, dict) and "Gallery" in e)
     gallery.extend(entry for entry in titles if entry not in gallery)
     return config
 
