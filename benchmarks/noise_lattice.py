@@ -59,9 +59,10 @@ def solve(
     )
     start = jnp.zeros(shape).at[..., 2].set(1.0)
     unit = round(1 / step)
-    return cfjax.integrate(
+    sol = cfjax.integrate(
         term, solver, 0.0, float(end), start, num_steps=end * unit, save_every=unit
-    ).ys
+    )
+    return jnp.asarray(sol.ys)
 
 
 def neighbours(m: Rings) -> Rings:

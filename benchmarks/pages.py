@@ -274,6 +274,26 @@ def million_steps() -> list[list[str]]:
 
 
 @table
+def projected() -> list[list[str]]:
+    rows = load("projected")["rows"]
+    names = {
+        "CF4": "`CF4`",
+        "CF54": "`CF54`",
+        "RKMK5, projected": "`RKMK5`, projected",
+        "RKMK8, projected": "`RKMK8`, projected",
+        "Dopri8": "Dopri8, in plain space",
+    }
+
+    def text(problem: str, method: str) -> str:
+        of_method = pick(rows, problem=problem, method=method)
+        return " / ".join(two_digits(row["over Tsit5"][2]) for row in of_method)
+
+    return [["", *names.values()]] + [
+        [problem, *(text(problem, name) for name in names)] for problem in values(rows, "problem")
+    ]
+
+
+@table
 def gradients() -> list[list[str]]:
     rows = load("gradients")["rows"]
     cases = list(itertools.product(values(rows, "state"), values(rows, "systems")))
