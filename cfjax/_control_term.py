@@ -23,7 +23,7 @@ _HAS_DRIFT = (
 )
 _IS_NOT_LINEAR = (
     "The field of a cfjax.LieControlTerm must be linear in increment, and that of a sum of two "
-    "increments is not the sum of their fields. Coefficients may depend on t, y and args alone."
+    "increments is not the sum of their fields. Coefficients may depend only on t, y and args."
 )
 _INTERPOLATIONS = diffrax.AbstractGlobalInterpolation, diffrax.AbstractLocalInterpolation
 

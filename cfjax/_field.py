@@ -276,7 +276,7 @@ def flow(field: PyTree, point: PyTree) -> PyTree:
 
     `field` is a pytree whose structure is a prefix of `point`'s. An array in it is a constant
     field, whose flow is a translation; an `AbstractFrozenField` acts on the part of `point` at the
-    same place; where there is None, the part rests.
+    same place. A part with None does not move.
     """
 
     def flow_leaf(f, p):

@@ -38,7 +38,7 @@ class Affine(AbstractAlgebraElement, AbstractSemilinearField):
     exponential, a division and a polynomial for each eigenvalue. With a transform they are points.
     A step then works in coefficients: it transforms the start, each b, and each point at which it
     evaluates the field or ends, so `cfjax.CF4` takes 9 transforms. Outside of a step a flow takes
-    three. A state of coefficients needs transforms for g alone.
+    three. A state of coefficients needs transforms only for g.
 
     The coordinates are `(alpha, b)`. **The spectrum is not a coordinate**: a linear combination has
     the spectrum of its first field, so the spectrum must not depend on time or state. It may depend

@@ -16,7 +16,7 @@ from .._field import AbstractAlgebraElement, AbstractFrozenField, combine, is_fi
 def each(fun: Callable[..., PyTree], num_axes: int) -> Callable[..., PyTree]:
     """Maps `fun`, a function of arrays without leading axes, over so many leading axes.
 
-    An axis of 1 is broadcast, and what depends on such arrays alone is computed once. An array that
+    An axis of 1 is broadcast, and what depends only on such arrays is computed once. An array that
     `fun` returns unchanged stays the same object, and arguments that are one object stay one.
 
     **Raises** `ValueError` where the axes do not broadcast.

@@ -72,7 +72,7 @@ class AbstractExponential(AbstractTableauSolver, AbstractChartSolver):
         return self
 
     def for_equal_steps(self, terms, length, t0, y0, args) -> Any:
-        """The same method for steps of this length alone, with the coefficients of all linear parts
+        """The same method for steps of this length only, with the coefficients of all linear parts
         that depend on neither time nor state.
         """
         solver: Any = self._with(equal_length=length)

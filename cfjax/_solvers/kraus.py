@@ -115,7 +115,7 @@ def _is_no_lindblad(place: str, part: Any) -> str:
     if isinstance(part, Rest):
         name = "None"
     return (
-        "Kraus4 takes density matrices alone: the field of each part of the state must be "
+        "Kraus4 takes only density matrices: the field of each part of the state must be "
         f"cfjax.Lindblad, and for y{place} it is {name}. Use a commutator-free method, for example "
         "cfjax.CF4()."
     )
