@@ -105,6 +105,7 @@ def start(dtype: type) -> dict[str, Array]:
 def by_solver(solver: cfjax.AbstractSolver, count: int, dtype: type = jnp.float32) -> Array:
     t1 = jnp.asarray(STEP * count, dtype)
     sol = cfjax.integrate(cfjax.LieTerm(field), solver, 0 * t1, t1, start(dtype), num_steps=count)
+    assert sol.ys is not None
     return sol.ys["q"][-1]
 
 

@@ -34,6 +34,7 @@ PICTURES = {
     "chain": 120,
     "charts": 200,
     "energy": 120,
+    "frozen_field": 110,
     "noise": 120,
     "peers": 120,
     "stabilised": 100,

@@ -18,7 +18,7 @@ CHECKS = {"eqx.error_if", "with_case"}
 
 
 def on_page_markdown(markdown, *, page, **_):
-    if page.file.src_uri != "errors.md":
+    if page.file.src_uri != "messages.md":
         return markdown
     return markdown.replace("<!-- messages -->", "\n\n".join(sections()))
 
@@ -26,7 +26,7 @@ def on_page_markdown(markdown, *, page, **_):
 def sections():
     for paths, title in FOLDERS.items():
         lines = [f"- *{kind}*: {escaped(text)}" for text, kind in messages(paths)]
-        yield f"### {title}\n\n" + "\n".join(lines)
+        yield f"## {title}\n\n" + "\n".join(lines)
 
 
 def escaped(text):
