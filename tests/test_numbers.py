@@ -34,6 +34,8 @@ MEASURED = re.compile(
         [
             rf"(?:{RANGE} |\d)(?:{TIME}|{MEMORY}|%|per cent|percent)(?!\w)",
             rf"{RANGE} times (?:{COMPARED}|(?:the|its|their) (?:{COST}))\b",
+            # Instants are times too: "at 20 times".
+            rf"(?<!at ){RANGE} times(?=[.,;:)])",
             rf"\btwice (?:{COMPARED}|(?:the|its|their) (?:{COST}))\b",
             rf"\b(?:{PART})(?: of)? (?:the|its|their|that) (?:{COST})\b",
             r"\bhalf as (?:long|large|much|many|fast)\b",
@@ -97,6 +99,7 @@ def test_facts_are_on_the_pages():
         "for some 40 % more time",
         "| 1.5 GiB | 64 bytes |",
         "in about half of the time",
+        "with `CF54` on a rigid body 12 times.",
     ],
 )
 def test_measured_numbers_are_seen(text):
@@ -110,7 +113,7 @@ def test_measured_numbers_are_seen(text):
         "```bash\nsleep 14 s\n```",
         "The rate is $`2 s`$, and `5 s` is code.",
         "See [Speed](speed.md#10-s).",
-        "momenta at 20 times",
+        "momenta at 20 times.",
         "the 2-norm of order 5, in 100 steps",
         "photons in threes",
         "several times as long",
