@@ -46,7 +46,7 @@ def draw() -> dict[str, Figure]:
         axes.plot(*curve.T, color=color, linestyle=style, linewidth=2.2, label=label)
     axes.quiver(*y, *(0.3 * velocity), color="black", linewidth=1.8, arrow_length_ratio=0.22)
     axes.scatter(*y, color="black", s=30, zorder=10)
-    axes.text(*(np.asarray(y) + np.array([-0.12, 0, 0.1])), "$y$", fontsize=13)
+    axes.text(y[0] - 0.12, y[1], y[2] + 0.1, "$y$", fontsize=13)
     axes.set(xlim=(-1, 1), ylim=(-1, 1), zlim=(-1, 1))
     figure.legend(loc="outside lower center", frameon=False, fontsize=9)
     return {"frozen_field": figure}

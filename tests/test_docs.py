@@ -205,10 +205,22 @@ def test_every_field_is_in_the_table_of_fields():
 
 
 def test_no_measured_table_is_typed_in():
-    text = (ROOT / "docs" / "speed.md").read_text()
+    text = (ROOT / "docs" / "benchmarks" / "speed.md").read_text()
     assert text.count("<!-- table: ") >= 5
     typed = re.sub(r"<!-- table: .*?<!-- end -->", "", text, flags=re.DOTALL)
     assert "| --- |" not in typed
+
+
+def test_guides_are_short_and_their_measurements_elsewhere():
+    def count(text):
+        return len(re.findall(r"\w[\w.]*", text))
+
+    for page in PAGES:
+        if page.parent.name not in ("api", "benchmarks"):
+            text = page.read_text()
+            measured = "".join(re.findall(r"<!-- table: .*?<!-- end -->", text, re.DOTALL))
+            assert text.count("\n") <= 250, page
+            assert count(measured) <= 0.15 * count(text), page
 
 
 def test_every_benchmark_has_stored_results():
