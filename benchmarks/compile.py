@@ -33,11 +33,13 @@ def second_derivative(name: str) -> Callable[[Any], Any]:
     return {"gradient": gradient, "product": product, "Hessian": jax.hessian(loss)}[name]
 
 
-def measure(quick: bool) -> Iterator[results.Row]:
+def measure(quick: bool, only: tuple[str, ...] = ()) -> Iterator[results.Row]:
     repeats = 1 if quick else 2
     # Warm-up: the first program pays for what all of them share.
     compiled(SCENES["rigid body"](), "gradient", "Tsit5")
     for name, make in [*SCENES.items()][: 1 if quick else None]:
+        if only and name not in only:
+            continue
         scene = make()
         methods = [scene.base, *scene.methods]
         for program in scene.programs:
@@ -55,6 +57,8 @@ def measure(quick: bool) -> Iterator[results.Row]:
                     "instructions": number,
                     "instructions, ratio": number / sizes[0],
                 }
+    if only:
+        return
     for name in ("gradient", "product", "Hessian"):
         seconds = [seconds_of(second_derivative(name)) for _ in range(repeats)]
         yield {"derivative": name, "CPU seconds": results.spread(seconds)}
@@ -68,11 +72,11 @@ def compiled(scene: Scene, program: str, method: str) -> tuple[float, int]:
 
 
 def seconds_of(fun: Callable[[Any], Any]) -> float:
-    """Seconds of the processor, for a new function each time, as jax caches programs."""
+    """Of the processor. A new function each time, or jax would use its cached program."""
     begin = time.process_time()
     jax.jit(fun).lower(jnp.asarray(rigid_body.inertia)).compile()
     return time.process_time() - begin
 
 
 if __name__ == "__main__":
-    results.run(__file__, __doc__, measure)
+    results.run(__file__, __doc__, measure, parts=SCENES, key="scene")

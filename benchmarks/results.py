@@ -27,12 +27,18 @@ Row = dict[str, Any]
 Measure = Callable[..., Iterable[Row]]
 
 
-def run(file: str, doc: str | None, measure: Measure, parts: Iterable[str] = ()) -> None:
+def run(
+    file: str,
+    doc: str | None,
+    measure: Measure,
+    parts: Iterable[str] = (),
+    key: str = "problem",
+) -> None:
     """The command of a benchmark: measures its rows, saves and prints them.
 
     `measure` is told whether to be quick, which is for trying it; the file says so too. `parts` are
-    the problems that may be measured alone: then `measure` is also given their names, and their
-    rows replace those in the file, which says when.
+    what may be measured alone, such as problems, and `key` is the column that names them. Then
+    `measure` is also given their names, and their rows replace those in the file, which says when.
     """
     parser = argparse.ArgumentParser(description=doc)
     parser.add_argument("--quick", action="store_true", help="little time, rough numbers")
@@ -55,9 +61,10 @@ def run(file: str, doc: str | None, measure: Measure, parts: Iterable[str] = ())
     minutes = round((time.perf_counter() - begin) / 60, 1)
     if only:
         stored = load(name)
-        kept = [row for row in stored.pop("rows") if row.get("problem") not in only]
-        # In the order of a whole run, in which rows of no problem come first.
-        rows = sorted(kept + rows, key=lambda row: ["", *parts].index(row.get("problem", "")))
+        older_rows = stored.pop("rows")
+        order = list(dict.fromkeys([row.get(key) for row in older_rows] + parts))
+        kept = [row for row in older_rows if row.get(key) not in only]
+        rows = sorted(kept + rows, key=lambda row: order.index(row.get(key)))
         since = {"only": only, "minutes": minutes, "machine": environment}
         older = [part for part in stored.get("since", []) if not set(part["only"]) <= set(only)]
         save(name, **stored | {"since": [*older, since]}, rows=rows)
