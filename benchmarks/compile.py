@@ -68,7 +68,7 @@ def compiled(scene: Scene, program: str, method: str) -> tuple[float, int]:
 
 
 def seconds_of(fun: Callable[[Any], Any]) -> float:
-    """Of the processor. A new function each time, or jax would use its cached program."""
+    """Seconds of the processor, for a new function each time, as jax caches programs."""
     begin = time.process_time()
     jax.jit(fun).lower(jnp.asarray(rigid_body.inertia)).compile()
     return time.process_time() - begin

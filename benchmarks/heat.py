@@ -47,7 +47,7 @@ def measure(quick: bool) -> Iterator[results.Row]:
 def grid_field(t, u, args: heat.Diffusivity) -> cfjax.Affine:
     spectrum = heat.field(t, u, args).spectrum
     b = heat.grid_field(t, u, args._replace(mu=args.mu - args.constant))
-    return cfjax.Affine(1.0, b, spectrum, cfjax.SineTransform())
+    return cfjax.Affine(b, spectrum, cfjax.SineTransform())
 
 
 def compiled(size: int, steps: int, *, spectral: bool) -> Callable[[], np.ndarray]:

@@ -70,7 +70,7 @@ IN_SPACE: dict[str, Any] = {
 }
 PROJECTED = {f"{name}, projected": Projected(solver) for name, solver in IN_SPACE.items()}
 SOLVERS = ON_SPHERE | IN_SPACE | PROJECTED
-# Those that use the space-time area of the path.
+# Solvers that use the space-time area of the path.
 WITH_AREA = ("WeakOrder2", "ShiftedNoise", "SPaRK", "SPaRK, projected")
 BLOCK = 8  # steps of a loop, in a program for any number of them
 
@@ -257,7 +257,7 @@ PROJECTION = (np.arange(DEGREE + 1) + 0.5)[:, None] * (
 
 
 def strength(z: Any) -> Any:
-    """Of the noise, which depends on the state."""
+    """The strength of the noise, which depends on the state."""
     return STRENGTH * (1 + z / 2)
 
 
@@ -327,7 +327,7 @@ def legendre(z: Array) -> Array:
 
 
 def generator(*, is_ito: bool) -> np.ndarray:
-    """Of the heights of the equation, as a matrix on Legendre polynomials."""
+    """The generator of the heights of the equation, as a matrix on Legendre polynomials."""
     polynomial = np.polynomial.Polynomial
     columns, g, round_z = [], strength(polynomial([0, 1])), polynomial([1, 0, -1])
     for n in range(DEGREE + 1):

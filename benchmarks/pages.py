@@ -149,7 +149,7 @@ def code(program: str) -> str:
 # Numbers that guides keep of a table.
 
 
-def _medians(spreads: Iterable[list[float]]) -> str:
+def _middle(spreads: Iterable[list[float]]) -> str:
     """The smallest and the largest median."""
     return between(spread[2] for spread in spreads)
 
@@ -157,13 +157,13 @@ def _medians(spreads: Iterable[list[float]]) -> str:
 @number
 def scenes_magnus() -> str:
     rows = pick(load("scenes")["rows"], method="Magnus6", tolerance=1e-6)
-    return _medians(row["over Tsit5"] for row in rows if "over Tsit5" in row)
+    return _middle(row["over Tsit5"] for row in rows if "over Tsit5" in row)
 
 
 @number
 def attitude_rkmk8() -> str:
     rows = pick(load("attitude")["rows"], scene="spacecraft", to=1e-8)
-    return _medians(
+    return _middle(
         row["over the better in plain space"]
         for row in rows
         if SHORT.get(row["method"], row["method"]) == "RKMK8"
@@ -173,13 +173,13 @@ def attitude_rkmk8() -> str:
 @number
 def stiff_gain() -> str:
     rows = pick(_stiff("to"), program="ETD54", to=1e-6)
-    return _medians(row["over CF4"] for row in rows if row.get("over CF4"))
+    return _middle(row["over CF4"] for row in rows if row.get("over CF4"))
 
 
 @number
 def stiff_adaptive() -> str:
     rows = pick(_stiff("step over an equal one"), program="ETD54 controlled", to=1e-6)
-    return _medians(row["step over an equal one"] for row in rows)
+    return _middle(row["step over an equal one"] for row in rows)
 
 
 @number
@@ -191,28 +191,19 @@ def stiff_largest() -> str:
 @number
 def quantum_gain() -> str:
     rows = [row for rows in _quantum().values() for row in rows]
-    return between(1 / row[_OVER_OTHERS][2] for row in pick(rows, method="cfjax, Magnus6"))
+    return between(1 / row[_OVER][2] for row in pick(rows, method="cfjax, Magnus6"))
 
 
 @number
 def lindblad_gain() -> str:
     rows = pick(load("lindblad")["rows"], method="cfjax, Kraus4", problem="transmon and cavity")
-    return _medians(row["over best of others"] for row in rows)
-
-
-@number
-def noise_step() -> str:
-    rows = [row for row in load("noise")["rows"] if row.get("spins", 1) > 1]
-    medians = {
-        row["program"]: next(v for k, v in row.items() if k.startswith("over "))[2] for row in rows
-    }
-    return two_digits(medians["WeakOrder2"] / medians["CF2"])
+    return _middle(row["over best of others"] for row in rows)
 
 
 @number
 def batch_rkmk8() -> str:
     rows = pick(load("batch")["rows"], method="RKMK8", what="end alone")
-    return _medians(row["over Tsit5"] for row in rows)
+    return _middle(row["over Tsit5"] for row in rows)
 
 
 @number
@@ -226,7 +217,7 @@ def gpu_gain() -> str:
 @number
 def gradient_over_solve() -> str:
     rows = pick(load("gradients")["rows"], program="cfjax.integrate, CF4")
-    return _medians(row["gradient over solve"] for row in rows)
+    return _middle(row["gradient over solve"] for row in rows)
 
 
 @number
@@ -362,6 +353,26 @@ def million_steps() -> list[list[str]]:
         lengths = [_short(abs(row["length less one"])) for row in found]
         table.append([name, *lengths, *(_short(row["angle"]) for row in found)])
     return table
+
+
+@table
+def projected() -> list[list[str]]:
+    rows = load("projected")["rows"]
+    names = {
+        "CF4": "`CF4`",
+        "CF54": "`CF54`",
+        "RKMK5, projected": "`RKMK5`, projected",
+        "RKMK8, projected": "`RKMK8`, projected",
+        "Dopri8": "Dopri8, in plain space",
+    }
+
+    def text(problem: str, method: str) -> str:
+        of_method = pick(rows, problem=problem, method=method)
+        return " / ".join(two_digits(row["over Tsit5"][2]) for row in of_method)
+
+    return [["", *names.values()]] + [
+        [problem, *(text(problem, name) for name in names)] for problem in values(rows, "problem")
+    ]
 
 
 @table
@@ -670,14 +681,15 @@ def compiling_families() -> list[list[str]]:
 @number
 def first_line() -> str:
     (row,) = load("getting_started")["rows"]
-    return two_digits(row["seconds"][2])
+    return two_digits(row["CPU seconds"][2])
 
 
 @table
 def first_call() -> list[list[str]]:
     rows = load("first_call")["rows"]
     methods = values(rows, "method")
-    table = [["", "", "diffrax, Tsit5", *(f"`{method}`" for method in methods[1:])]]
+    names = (f"`{SHORT.get(method, method)}`" for method in methods[1:])
+    table = [["", "", "diffrax, Tsit5", *names]]
     for problem, way in itertools.product(values(rows, "problem"), values(rows, "way")):
         base, *compared = (one(rows, problem=problem, way=way, method=m) for m in methods)
         cells = [f"1 ({cell(base['CPU seconds'])} s)"]
@@ -704,7 +716,7 @@ _SECOND = {
     "its gradient": "their gradient",
     "diffeqsolve": "50 steps in `diffrax.diffeqsolve`",
 }
-_OVER_OTHERS = "over the fastest of others"
+_OVER = "over the fastest of others"
 
 
 def _quantum() -> dict[tuple[str, int, float], list[Row]]:
@@ -726,11 +738,11 @@ def quantum() -> list[list[str]]:
         peers = [row for row in rows if row not in ours]
         in_lab_frame = [row for row in peers if not row["method"].endswith("frame")]
         groups = ours, peers, in_lab_frame
-        best, *fastest = (min(group, key=lambda r: r[_OVER_OTHERS][2]) for group in groups)
+        best, *fastest = (min(group, key=lambda r: r[_OVER][2]) for group in groups)
         cells = [f"{problem}, {systems(count)}", power(goal)]
         cells += [code(best["method"].removeprefix("cfjax, ")), in_units(best["seconds each"][2])]
         for row in fastest:
-            cells += [row["method"], two_digits(row[_OVER_OTHERS][2] / best[_OVER_OTHERS][2])]
+            cells += [row["method"], two_digits(row[_OVER][2] / best[_OVER][2])]
         table.append([*cells, power(best["off norm"]), power(fastest[0]["off norm"])])
     return table
 
@@ -776,7 +788,7 @@ def quantum_steps() -> list[list[str]]:
 
 @table
 def quantum_times() -> list[list[str]]:
-    return _by_method(lambda row: cell(row[_OVER_OTHERS]))
+    return _by_method(lambda row: cell(row[_OVER]))
 
 
 @number
@@ -1045,7 +1057,7 @@ STIFF = {
     "Tsit5": "diffrax, Tsit5, adaptive",
 }
 
-# Of a step.
+# The evaluations of a step.
 EVALUATIONS = {"CF4": 4, "ETDRK4": 4, "ETD43": 5, "ETD54": 8}
 
 
@@ -1305,9 +1317,231 @@ def energy_longest() -> list[list[str]]:
     ]
 
 
+def _medians(rows: Iterable[Row], key: str) -> str:
+    """The smallest and the largest median of the rows."""
+    return between(row[key][2] for row in rows)
+
+
+@number
+def batch_output() -> str:
+    """How much longer a batch takes with output at times."""
+    rows = [row for row in load("batch")["rows"] if "what" in row and row["method"] != "Tsit5"]
+    seconds = {(row["method"], row["what"]): row["seconds"][2] for row in rows}
+    end, output = values(rows, "what")[:2]
+    return between(seconds[m, output] / seconds[m, end] for m in values(rows, "method"))
+
+
+def _gpu(**where: object) -> list[Row]:
+    """The rows of compiled solves of cfjax on a GPU, in float64."""
+    rows = pick(load("gpu")["rows"], dtype="float64", **where)
+    return [row for row in rows if row["device"] != "cpu" and "as traced" not in row["method"]]
+
+
+@number
+def gpu_speed_up() -> str:
+    """The gain over the processor, of batches of many members and of lattices."""
+    rows = [row for row in _gpu() if row["method"] != "Tsit5"]
+    large = [row for row in rows if row["members"] > 1000 or " x " in row["problem"]]
+    keys = ("problem", "members", "method", "dtype")
+    slow = pick(load("gpu")["rows"], device="cpu")
+    return between(
+        one(slow, **{key: row[key] for key in keys})["seconds"][2] / row["seconds"][2]
+        for row in large
+    )
+
+
+def _gpu_step(method: str) -> str:
+    (row,) = _gpu(problem="rigid bodies, equal steps", members=1, method=method)
+    return in_units(row["seconds"][2] / 100)
+
+
+@number
+def gpu_step() -> str:
+    return _gpu_step("CF4")
+
+
+@number
+def gpu_step_of_tsit5() -> str:
+    return _gpu_step("Tsit5")
+
+
+@number
+def gpu_compile() -> str:
+    rows = _gpu(problem="rigid bodies, equal steps", method="CF4")
+    return between(row["compile seconds"] for row in rows)
+
+
+@number
+def gpu_compile_output() -> str:
+    (row,) = _gpu(problem="rigid bodies, adaptive steps, 21 times", method="RKMK8")
+    return two_digits(row["compile seconds"])
+
+
+@number
+def noise_gain() -> str:
+    """The error and the time of 16 steps of WeakOrder2 over those of 64 of CF4."""
+    rows = _noise("in the mean")
+
+    def error_and_time(method: str, steps: int) -> tuple[float, float]:
+        (time,) = (row["seconds a step"][2] for row in rows[method] if "seconds a step" in row)
+        return one(rows[method], steps=steps)["error"], steps * time
+
+    (error, time), (base_error, base_time) = (
+        error_and_time("WeakOrder2", 16),
+        error_and_time("CF4", 64),
+    )
+    return f"{two_digits(error / base_error)} of the error of `CF4` with 64 steps, in " + (
+        f"{two_digits(time / base_time)} of the time"
+    )
+
+
+@number
+def noise_weak_step() -> str:
+    """The time of a step of WeakOrder2 over that of CF2."""
+    rows = [row for row in load("noise")["rows"] if "spins" in row]
+    seconds = {(row["program"], row["spins"]): row["seconds a step"][2] for row in rows}
+    return between(seconds["WeakOrder2", n] / seconds["CF2", n] for n in values(rows, "spins"))
+
+
+@table
+def noise_lattice() -> list[list[str]]:
+    rows = load("noise_lattice")["rows"]
+    methods = values(rows, "method")
+    table = [["kT", "h", *(f"`{method}`" for method in methods), "standard error"]]
+    for kT, step in itertools.product(values(rows, "kT"), values(rows, "step")):
+        of_step = [one(rows, kT=kT, step=step, method=method) for method in methods]
+        cells = [f"{100 * row['off by']:.1f} %" for row in of_step]
+        error = max(row["standard error"] for row in of_step)
+        table.append([f"{kT:g}", f"{step:g}", *cells, f"{100 * error:.1f} %"])
+    return table
+
+
+@number
+def noise_of_a_tree() -> str:
+    """How much longer steps with a VirtualBrownianTree take."""
+    rows = [row for row in load("noise")["rows"] if "spins" in row]
+    seconds = {(row["program"], row["spins"]): row["seconds a step"][2] for row in rows}
+    return between(
+        time / seconds[program.removesuffix(", tree"), n]
+        for (program, n), time in seconds.items()
+        if program.endswith(", tree")
+    )
+
+
+@number
+def noise_checkpoints() -> str:
+    """How much longer a gradient takes with few states kept."""
+    rows = [row for row in load("noise")["rows"] if "gradient of steps" in row]
+    few = [row for row in rows if row["keeps a state"] != "every step"]
+    return between(
+        row["seconds"][2]
+        / one(
+            rows, **{"gradient of steps": row["gradient of steps"], "keeps a state": "every step"}
+        )["seconds"][2]
+        for row in few
+    )
+
+
+@number
+def lindblad_over_rouchon() -> str:
+    """How many times as fast Kraus4 is."""
+    rows = pick(load("lindblad")["rows"], method="cfjax, Kraus4")
+    return between(1 / row["over Rouchon3"][2] for row in rows if row["over Rouchon3"])
+
+
+@number
+def lindblad_smooth() -> str:
+    """How much longer Kraus4 takes than the best in plain space on small smooth problems."""
+    rows = pick(load("lindblad")["rows"], method="cfjax, Kraus4")
+    smooth = [row for row in rows if row["problem"] in ("thermal oscillator", "Dicke ladder")]
+    return _medians(smooth, "over best of others")
+
+
+def _fast_drive(goal: float) -> str:
+    """How many times as fast Magnus6 is as the fastest of others."""
+    rows = pick(load("quantum")["rows"], problem="transmon", goal=goal, method="cfjax, Magnus6")
+    return between(1 / row[_OVER][2] for row in rows)
+
+
+@number
+def quantum_fast_drive() -> str:
+    return _fast_drive(1e-6)
+
+
+@number
+def quantum_fast_drive_accurate() -> str:
+    return _fast_drive(1e-9)
+
+
+@number
+def stiff_limit() -> str:
+    (seconds,) = values(_stiff("not in seconds"), "not in seconds")
+    return f"{seconds:.0f} s"
+
+
+def _scene(scene: str, tolerance: float) -> str:
+    row = one(load("scenes")["rows"], scene=scene, tolerance=tolerance)
+    return two_digits(row["over Tsit5"][2])
+
+
+@number
+def scenes_top() -> str:
+    return _scene("heavy top", 1e-11)
+
+
+@number
+def scenes_spacecraft() -> str:
+    return _scene("spacecraft", 1e-11)
+
+
+@number
+def scenes_body() -> str:
+    return _scene("rigid body", 1e-11)
+
+
+@number
+def scenes_others() -> str:
+    """The times over those of Tsit5, of scenes where a step takes more work than in plain space."""
+    rows = [row for row in load("scenes")["rows"] if row["tolerance"] in (1e-6, 1e-8)]
+    others = ("spins", "Wilson flow", "Stiefel, first", "Stiefel, second", "Toda", "Zeitlin")
+    rows = [row for row in rows if row["scene"] in (*others, "covariance")]
+    return _medians((row for row in rows if "over Tsit5" in row), "over Tsit5")
+
+
 def _seconds_of(derivative: str) -> str:
     row = one(load("compile")["rows"], derivative=derivative)
     return two_digits(row["CPU seconds"][2])
+
+
+def _first_derivative(program: str, method: str) -> str:
+    """Processor seconds to compile one of a spacecraft, in `cfjax.integrate`."""
+    where = {"scene": "spacecraft", "program": f"`integrate`, {program}", "method": method}
+    return two_digits(one(load("compile")["rows"], **where)["CPU seconds"][2])
+
+
+@number
+def compile_reverse_cf4() -> str:
+    return _first_derivative("gradient", "CF4")
+
+
+@number
+def compile_reverse_cf54() -> str:
+    return _first_derivative("gradient", "CF54")
+
+
+@number
+def compile_reverse_rkmk8() -> str:
+    return _first_derivative("gradient", "RKMK8")
+
+
+@number
+def compile_forward_cf54() -> str:
+    return _first_derivative("Jacobian", "CF54")
+
+
+@number
+def compile_forward_rkmk8() -> str:
+    return _first_derivative("Jacobian", "RKMK8")
 
 
 @number

@@ -38,7 +38,7 @@ class Scene(NamedTuple):
     # The distance from the group, if there is one.
     distance: Callable[[Any], float] | None
     target: float
-    # Of a program in one turn: a single one may be too short for the clock.
+    # Runs of a program in one turn: a single one may be too short for the clock.
     repeats: int
     programs: dict[str, Program]
 
@@ -299,7 +299,7 @@ def of_kuramoto() -> Scene:
         return -derivative / 2 * mask * like.fft.rfft(u**2)
 
     def field(t: Any, c: Any, args: Any) -> Any:
-        return cfjax.Affine(1.0, square(c, jnp), spectrum)
+        return cfjax.Affine(square(c, jnp), spectrum)
 
     def velocity(u: Any, like: Any) -> Any:
         c = like.fft.rfft(u)

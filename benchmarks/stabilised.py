@@ -183,7 +183,7 @@ def heat_and_reaction(n: int = 64) -> Problem:
         return (around - 4 * u) * n**2 + 50 * (u - u**3)
 
     def semilinear(t: Any, u: Any, args: Any) -> cfjax.Affine:
-        return cfjax.Affine(1.0, 50 * (u - u**3), spectrum, transform)
+        return cfjax.Affine(50 * (u - u**3), spectrum, transform)
 
     x = 2 * np.pi * np.arange(n) / n
     u0 = 0.5 * np.sin(x)[:, None] * np.cos(x) + 0.3 * np.cos(2 * x + 1)

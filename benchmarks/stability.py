@@ -315,7 +315,7 @@ def _growth(solver: Any, exact: np.ndarray, explicit: np.ndarray) -> np.ndarray:
     """The growth of one step of length 1 from u = 1, computed with the solver."""
 
     def field(t, u, explicit):
-        return cfjax.Affine(1.0, explicit * u, exact)
+        return cfjax.Affine(explicit * u, exact)
 
     w = jnp.asarray(explicit)
     u0 = jnp.ones_like(w)

@@ -231,7 +231,7 @@ def programs(problem: Problem, reference: np.ndarray) -> dict[str, Program]:
 
 
 def measure(quick: bool) -> Iterator[results.Row]:
-    # Of diffrax, about the coefficients: the errors of all runs are in the rows.
+    # diffrax warns of complex coefficients: the errors of all runs are in the rows.
     warnings.filterwarnings("ignore", "Complex dtype support")
     for name, make in PROBLEMS.items():
         problem = make()

@@ -59,7 +59,7 @@ def dirichlet(
     spectrum = jnp.asarray(scale * sine.second_difference(n))
 
     def field(t: Any, c: Any, args: Any) -> cfjax.Affine:
-        return cfjax.Affine(1.0, sine.forward(g(t, sine.inverse(c))), spectrum)
+        return cfjax.Affine(sine.forward(g(t, sine.inverse(c))), spectrum)
 
     def velocity(t: Any, u: Any, args: Any) -> Any:
         return scale * jnp.diff(jnp.pad(u, 1), 2) + g(t, u)
@@ -81,7 +81,7 @@ def periodic(t1: float, spectrum: Any, u0: np.ndarray, g: Callable, **options: A
         return jnp.fft.rfftn(u, axes=axes)
 
     def field(t: Any, c: Any, args: Any) -> cfjax.Affine:
-        return cfjax.Affine(1.0, g(t, c), spectrum)
+        return cfjax.Affine(g(t, c), spectrum)
 
     def velocity(t: Any, u: Any, args: Any) -> Any:
         c = coefficients(u)
@@ -127,7 +127,7 @@ def heat_diagonalised() -> Problem:
     spectrum, transform = cfjax.diagonalised(np.asarray(matrix))
     return problem._replace(
         y0=transform.forward(problem.values(problem.y0)),
-        field=lambda t, c, _: cfjax.Affine(1.0, jnp.zeros_like(c), spectrum),
+        field=lambda t, c, _: cfjax.Affine(jnp.zeros_like(c), spectrum),
         values=transform.inverse,
         coefficients=transform.forward,
     )
@@ -232,7 +232,7 @@ def allen_cahn_periodic() -> Problem:
 
 
 def convection(n: int, derivative: np.ndarray, scale: float) -> Callable:
-    """Of u in its conservative form, with two thirds of the wave numbers kept."""
+    """The convection of u in its conservative form, with two thirds of the wave numbers kept."""
     mask = dealiasing_mask(np.arange(n // 2 + 1), n, 2 / 3)
 
     def g(t: Any, c: Any) -> Any:
@@ -316,7 +316,7 @@ def schrodinger() -> Problem:
         return -1j * (np.cos(x) + jnp.abs(psi) ** 2) * psi
 
     def field(t: Any, c: Any, args: Any) -> cfjax.Affine:
-        return cfjax.Affine(1.0, jnp.fft.fft(g(jnp.fft.ifft(c))), spectrum)
+        return cfjax.Affine(jnp.fft.fft(g(jnp.fft.ifft(c))), spectrum)
 
     def real_and_imaginary(psi: Any) -> Any:
         return jnp.stack([psi.real, psi.imag])

@@ -93,7 +93,7 @@ class Program:
     def run(self, tolerance: float) -> "Run":
         y, num_steps = self.solve(self.y0, jnp.asarray(tolerance))
         errors = np.linalg.norm(y - self.exact, axis=-1)
-        # Of a batch the root mean square of the errors, and the steps of the median member.
+        # A batch has the root mean square of the errors, and the steps of the median member.
         return Run(tolerance, float(np.sqrt(np.mean(errors**2))), int(np.median(num_steps)))
 
     def to_error(self, target: float) -> "Run":

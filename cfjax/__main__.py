@@ -35,9 +35,9 @@ _WITHOUT_CHART = {
 }
 
 # On two cores with nothing else to do.
-_PAPER_TIME = "Takes 2 to 4 minutes, more on a busy machine."
-_CHART_TIME = "Compiles for 10 to 50 seconds, more on a busy machine."
-_SCENE_TIME = "Takes 10 to 60 seconds, more on a busy machine."
+_PAPER_TIME = "Takes some minutes."
+_CHART_TIME = "Compiles for some seconds."
+_SCENE_TIME = "Takes up to some minutes."
 
 
 class _Parser(argparse.ArgumentParser):

@@ -23,7 +23,7 @@ _HAS_DRIFT = (
 )
 _IS_NOT_LINEAR = (
     "The field of a cfjax.LieControlTerm must be linear in increment, and that of a sum of two "
-    "increments is not the sum of their fields. Coefficients may depend on t, y and args alone."
+    "increments is not the sum of their fields. Coefficients may depend only on t, y and args."
 )
 _INTERPOLATIONS = diffrax.AbstractGlobalInterpolation, diffrax.AbstractLocalInterpolation
 
@@ -44,8 +44,8 @@ class LieControlTerm(diffrax.AbstractTerm):
     term = diffrax.MultiTerm(cfjax.LieTerm(drift), cfjax.LieControlTerm(thermal, noise))
     ```
 
-    With Brownian motion this is noise in the sense of Stratonovich, but with `cfjax.LieEuler`,
-    which takes it in the sense of Itô. The noise of n sites with m channels each is one field of an
+    cfjax interprets Brownian motion as Stratonovich noise. With `cfjax.LieEuler` it is Itô noise.
+    The noise of n sites with m channels each is one field of an
     increment of shape (n, m): one evaluation, whatever the numbers. The path's value is read once
     a step.
 

@@ -276,7 +276,7 @@ def flow(field: PyTree, point: PyTree) -> PyTree:
 
     `field` is a pytree whose structure is a prefix of `point`'s. An array in it is a constant
     field, whose flow is a translation; an `AbstractFrozenField` acts on the part of `point` at the
-    same place; where there is None, the part rests.
+    same place. A part with None does not move.
     """
 
     def flow_leaf(f, p):
@@ -337,9 +337,11 @@ def combine(weights: Sequence[Weight], fields: Sequence[PyTree]) -> PyTree:
         if len({_combining_class(leaf) for leaf in leaves}) > 1:
             names = " and ".join(dict.fromkeys(map(_name, leaves)))
             place = jtu.keystr(path) and f" at {jtu.keystr(path)}"
+            advice = _motion_advice(leaves)
             raise TypeError(
-                f"Only fields of one kind can be added, got {names}{place}. If these are the terms "
-                "of a diffrax.MultiTerm, give each its own part of the state."
+                f"Only fields of one kind can be added, got {names}{place}.{advice} If these are "
+                "the terms of a diffrax.MultiTerm that move different parts of the state, return "
+                "None for the part that a term does not move."
             )
         if is_field(leaves[0]):
             return type(leaves[0]).combine(part_weights, leaves)
@@ -348,6 +350,15 @@ def combine(weights: Sequence[Weight], fields: Sequence[PyTree]) -> PyTree:
 
     columns = zip(parts, *later_parts, strict=True)
     return treedef.unflatten(combine_part(path, part, *later) for (path, part), *later in columns)
+
+
+def _motion_advice(parts: Sequence[Any]) -> str:
+    if {_name(part) for part in parts} != {"Rotation", "a translation"}:
+        return ""
+    return (
+        " For points that turn and move return one field for both, "
+        'cfjax.RigidMotion(omega=omega, v=v, frame="fixed").'
+    )
 
 
 def _name(x: Any) -> str:
@@ -376,8 +387,8 @@ def bracket(a: PyTree, b: PyTree) -> PyTree:
     def bracket_leaf(x, y):
         if is_field(x) != is_field(y):
             raise TypeError(
-                "bracket: a translation has no bracket with a frozen field, got "
-                f"{type(x).__name__} and {type(y).__name__}."
+                f"Cannot compute the bracket of {type(x).__name__} and {type(y).__name__}: a "
+                "frozen field has none with a translation."
             )
         if isinstance(x, AbstractAlgebraElement):
             return x.bracket(y)

@@ -28,7 +28,10 @@ from ._solvers.solver import AbstractSolver, as_own
 from ._step_back import repeat_and_undo
 from ._xla import repeat
 
-_NOT_FINITE = "y0 must be finite, got an entry that is not."
+_NOT_FINITE = (
+    "y0 must be finite, got NaN or infinity. Find the entries with jax.tree.map(jnp.isfinite, y0), "
+    "and check how they were computed."
+)
 _BLOW_UP = (
     f"{diffrax.RESULTS[diffrax.RESULTS.nonfinite].rstrip('.')}: the solution grows without bound, "
     "or the steps are too long, which more num_steps cure. (A step of a Munthe-Kaas method, such "
@@ -74,12 +77,12 @@ def integrate(
     - `checkpoint_every`: for reverse mode with little memory. Reverse mode then keeps one state for
       each group of this many steps, and computes the steps between a second time. About
       `sqrt(num_steps)` is best, and makes the memory proportional to `sqrt(num_steps)` states.
-    - `step_back`: for reverse mode in constant memory. Reverse mode then keeps the saved states
-      alone, and computes all others by steps backwards. For symmetric solvers, which undo a step to
-      rounding: `cfjax.Strang` and other splittings, `cfjax.ImplicitMidpoint`, `cfjax.Composition`
-      and Magnus methods. What grows forwards in time is well conditioned, but what decays grows on
-      the way back, and so does its rounding. Forward mode and noise are
-      not possible, and fields must have a derivative in time too.
+    - `step_back`: for reverse mode in constant memory. Reverse mode then stores only the saved
+      states, and computes all others by stepping backwards. This works with symmetric solvers,
+      which undo a step up to rounding: `cfjax.Strang` and other splittings,
+      `cfjax.ImplicitMidpoint`, `cfjax.Composition` and Magnus methods. Stepping backwards amplifies
+      whatever the equation damps, rounding included, so do not use it for strongly damped problems.
+      It does not support forward mode or noise, and fields must have a derivative in time too.
     - `throw`: whether a failure is an error, as in diffrax. If not, `result` of the solution says
       what happened, and invalid values of the arguments give NaN. In a batch made by `jax.vmap` one
       failure is an error for the whole batch. An error check within a function that you compile is
@@ -122,7 +125,7 @@ def integrate(
         )
     if step_back and is_driven(term):
         raise ValueError(
-            "step_back takes no noise, or what else a path drives: use checkpoint_every."
+            "step_back does not support noise or other path-driven terms: use checkpoint_every."
         )
     dtype = time_dtype(y0)
     if num_steps > _max_steps(dtype):
@@ -257,8 +260,8 @@ def equal_steps(
         prepend = lambda initial, saved: jnp.concatenate([initial[None], saved])  # noqa: E731
         ts, ys = jtu.tree_map(prepend, (t0, start), (ts, ys))
     ts, end = needing(zero, (ts, t1))
-    # Of the saved states alone, outside the loop: sums and products keep infinity and NaN, so a
-    # blow-up shows in what is saved after it.
+    # Only the saved states are checked, outside the loop: sums and products keep infinity and NaN,
+    # so a blow-up shows in what is saved after it.
     result = result_of(ys)
     ended = solver.ended(carry[2], fault)
     if throw and ended is not fault:

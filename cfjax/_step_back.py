@@ -16,9 +16,9 @@ from ._solvers.base import size
 Step = Callable[[PyTree], PyTree]
 
 _MISSED = (
-    "step_back led back to a start that is off by more than half of the digits: the way back "
-    "multiplies rounding too often. Take fewer steps between two saved states, or checkpoint_every "
-    "in place of step_back."
+    "step_back led back to a start that is wrong in more than half of its digits: rounding errors "
+    "grew too much on the way back. Take fewer steps between two saved states, or use "
+    "checkpoint_every instead of step_back."
 )
 
 

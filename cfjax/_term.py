@@ -114,9 +114,9 @@ def checked(field: PyTree, y: PyTree) -> PyTree:
     """
     if field is None and y is not None:
         raise ValueError(
-            "The field of a term must return one field for each part of the state, got None. Has "
-            "its function a return? A part at rest is None where the state has parts, and zero "
-            "otherwise."
+            "The field of a term must return one field for each part of the state, got None. Does "
+            "the function have a return statement? For a part at rest return None if the state has "
+            "several parts, and zeros otherwise."
         )
     is_part = lambda x: x is None or is_field(x)  # noqa: E731
     parts, treedef = jtu.tree_flatten_with_path(field, is_leaf=is_part)
@@ -194,7 +194,7 @@ def _check_precision(place: str, field: Any, point: PyTree) -> None:
             raise TypeError(
                 f"The field returned {type(field).__name__} for {place}, where the state is "
                 f"{describe(point)}. Its {jtu.keystr(path)} is {describe(leaf)}. Both must have "
-                "one precision."
+                "one precision: convert what the field is made of with jnp.asarray(x, y.dtype)."
             )
 
 

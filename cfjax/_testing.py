@@ -283,7 +283,7 @@ def _of_combine(fields: Sequence[Any], charted: Sequence[Any], start: Any) -> _C
     y = charted[0].from_chart(start)
     weights = [0.7 * (-0.6) ** k for k in range(len(fields))]
     tangents = [field.tangent(y) for field in fields]
-    # Of arrays, without the method of the class.
+    # The sum of arrays, without the method of the class.
     expected = combine(weights, tangents)
     scale = _scale((y, tangents))
     return [

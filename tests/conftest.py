@@ -70,7 +70,7 @@ def no_shape_hook():
 
 @pytest.hookimpl(tryfirst=True)
 def pytest_collection_modifyitems(items):
-    """Of a test marked `representatives(n)` all but n sets of parameters are slow.
+    """Makes all but n sets of parameters of a test marked `representatives(n)` slow.
 
     Those that stay quick have as many values of single parameters as n sets can have: in a product
     the first, then one that differs in all parameters.

@@ -195,7 +195,7 @@ def first_step(solver, term, t0, t1, y0, args) -> Any:
 
 
 def num_operations(jaxpr: Any) -> int:
-    """Of a program as it is written, with those of its functions, loops and branches."""
+    """The operations of a program as it is written, with its functions, loops and branches."""
     inner = (x for eqn in jaxpr.eqns for x in jaxprs_in_params(eqn.params))
     return len(jaxpr.eqns) + sum(map(num_operations, inner))
 
@@ -236,7 +236,7 @@ QUICK: Any = {"xla_backend_optimization_level": 0, "xla_llvm_disable_expensive_p
 
 
 def central_difference(fun: Callable[[Any], Any], x: Any, direction: Any, step: float) -> Any:
-    """Of order 4: error of about step^4 (fifth derivative) / 30 and 1.5 rounding / step."""
+    """Order 4: an error of about step^4 (fifth derivative) / 30 and 1.5 rounding / step."""
     f = [
         fun(jtu.tree_map(lambda a, d, k=k: a + k * step * d, x, direction)) for k in (-2, -1, 1, 2)
     ]

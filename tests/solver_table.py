@@ -56,7 +56,7 @@ class Row(NamedTuple):
     make: Callable[[], Any]
     kind: Kind
     order: int
-    # Those that may be None are integers else.
+    # These are integers, or None.
     embedded: Any
     evaluations: Any
     first: int
@@ -133,7 +133,7 @@ SOLVERS = {
     ),
     # Its estimate falls like that of an embedded method of one order below.
     "Richardson": Row(lambda: cfjax.Richardson(cfjax.CF2()), "step doubling", 2, 1, 6, 0, 2),
-    # Of an equation without noise the order is that of the inner solver, `CF4`.
+    # Without noise the order is that of the inner solver, `CF4`.
     "WeakOrder2": Row(cfjax.WeakOrder2, "noise", 4, None, 8, 0, None, "noise"),
     "ShiftedNoise": Row(cfjax.ShiftedNoise, "noise", 4, None, 4, 0, None, "noise"),
 }
@@ -164,10 +164,10 @@ MUNTHE_KAAS = {
 
 
 def solvers(*kinds: Kind) -> dict[str, Row]:
-    """Those of some kinds."""
+    """The rows of some kinds."""
     return {name: row for name, row in SOLVERS.items() if row.kind in kinds}
 
 
 def named(*kinds: Kind) -> dict[str, Row]:
-    """Those of some kinds whose class is one method."""
+    """The rows of some kinds whose class is one method."""
     return {name: row for name, row in solvers(*kinds).items() if row.is_named}

@@ -265,5 +265,5 @@ def test_an_import_loads_what_solves_and_nothing_else(loaded):
 def test_an_import_loads_few_modules_of_others(loaded):
     """Time is what it is about, and a test cannot tell time. Ours are 45 small files."""
     foreign = [name for name in loaded if room(name) != "cfjax"]
-    # Of jax, for batches over hosts and for attributes of calls; of Python, for fractions.
+    # Modules of jax, for batches over hosts and for attributes of calls; of Python, for fractions.
     assert len(foreign) <= 10, foreign

@@ -43,11 +43,11 @@ BUILT_IN: dict[str, tuple[Any, Any]] = {
         random(F32, 4),
     ),
     "Affine": (
-        lambda: cfjax.Affine(random(F32), random(F32, 4), SPECTRUM.astype(F32)),
+        lambda: cfjax.Affine(random(F32, 4), SPECTRUM.astype(F32), alpha=random(F32)),
         random(F32, 4),
     ),
     "Affine, transform": (
-        lambda: cfjax.Affine(random(F64), random(F64, 4), SPECTRUM, cfjax.SineTransform()),
+        lambda: cfjax.Affine(random(F64, 4), SPECTRUM, cfjax.SineTransform(), alpha=random(F64)),
         random(F64, 4),
     ),
     "Scaling": (lambda: cfjax.Scaling(random(C64, 3, 1)), random(C64, 3, 4)),

@@ -242,7 +242,7 @@ def strings(paths):
 def test_messages_that_are_explained_are_those_that_are_raised():
     folders = [ROOT / "cfjax", *(Path(m.__file__).parent for m in (diffrax, optimistix))]
     paths = [path for folder in folders for path in folder.rglob("*.py")]
-    # Of JAX and of Python.
+    # Messages of JAX and of Python.
     others = {
         "can't apply forward-mode autodiff (jvp) to a custom_vjp function",
         "missing 2 required keyword-only arguments: 'frame' and 'layout'",

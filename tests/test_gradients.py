@@ -175,12 +175,12 @@ def bordered(t, y, args):
 
 def affine(t, y, args):
     b, spectrum = args
-    return cfjax.Affine(1.0, b * jnp.sin(y + t), spectrum)
+    return cfjax.Affine(b * jnp.sin(y + t), spectrum)
 
 
 def affine_on_points(t, y, args):
     b, spectrum = args
-    return cfjax.Affine(1.0, b * jnp.sin(y + t), spectrum, cfjax.SineTransform())
+    return cfjax.Affine(b * jnp.sin(y + t), spectrum, cfjax.SineTransform())
 
 
 def translation(t, y, args):
@@ -500,7 +500,7 @@ def test_a_linear_flow_in_its_spectrum(solver):
     weights = jnp.asarray([1.0, -2.0, 0.5, 3.0, 4.0])
 
     def value(spectrum, b, y0, t):
-        term = cfjax.LieTerm(lambda t, y, args: cfjax.Affine(1.0, b, spectrum))
+        term = cfjax.LieTerm(lambda t, y, args: cfjax.Affine(b, spectrum))
         return cfjax.integrate(term, solver, 0.0, t, y0, num_steps=2).ys[-1] @ weights
 
     t = 0.8

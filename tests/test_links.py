@@ -31,7 +31,7 @@ def targets(page):
 
 
 def anchors(page):
-    """Of its headings, as GitHub and GitLab make them."""
+    """The anchors of its headings, as GitHub and GitLab make them."""
     text = re.sub(r"^```.*?^```", "", page.read_text(), flags=re.DOTALL | re.MULTILINE)
     headings = re.findall(r"^#+ (.*)$", text, flags=re.MULTILINE)
     shown = (re.sub(r"\[(.*?)\]\(.*?\)", r"\1", heading) for heading in headings)

@@ -204,7 +204,7 @@ def test_scenes_solve_with_the_method_that_readme_recommends():
             # With variations by the method for the state.
             problem |= {"term": problem["term"].term, "y0": problem["y0"].state}
         if not isinstance(problem["term"], cfjax.LieTerm):
-            # Of splittings and of noise: the pages on them.
+            # The pages on splittings and on noise recommend these.
             assert chosen in ("BlanesMoan4", "Strang", "WeakOrder2"), name
             continue
         arrays = problem["t0"], problem["y0"], problem.get("args")
@@ -213,15 +213,15 @@ def test_scenes_solve_with_the_method_that_readme_recommends():
         kinds = {methods.get(type(part).__name__) for part in parts}
         if name in WITH_REASONS:
             assert chosen == WITH_REASONS[name]
-        elif "`RKMK8`" in kinds:
+        elif any(str(kind).startswith("`RKMK8`") for kind in kinds):
             assert chosen == "RKMK8", name
-        elif "`ETD54`" in kinds:
+        elif any(str(kind).startswith("`ETD54`") for kind in kinds):
             assert chosen == "ETD54", name
         elif any("`Kraus4`" in str(kind) for kind in kinds):
             levels = jtu.tree_leaves(problem["y0"])[0].shape[-1]
             assert chosen == ("Magnus4" if levels <= 4 else "Kraus4"), name
         else:
-            assert kinds <= {"Magnus or CF", "CF"}, (name, kinds)
+            assert all(f"`{chosen}`" in str(kind) for kind in kinds), (name, kinds)
             # A Magnus method refuses fields that depend on the state.
             assert chosen in ("CF4", "Magnus6"), name
         seen.add(chosen)

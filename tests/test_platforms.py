@@ -30,7 +30,7 @@ def complex_matrix(t, y, args):
 
 
 def affine(t, y, args):
-    return cfjax.Affine(1.0, -(y**3), -jnp.square(args), cfjax.SineTransform())
+    return cfjax.Affine(-(y**3), -jnp.square(args), cfjax.SineTransform())
 
 
 def low_rank(t, y, args):

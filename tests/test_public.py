@@ -3,6 +3,7 @@
 import ast
 import inspect
 import json
+import re
 import subprocess
 import sys
 from pathlib import Path
@@ -96,6 +97,13 @@ def test_public_methods_have_docstrings(name):
             if not attribute.startswith("_") and inspect.isfunction(member):
                 # `getdoc` takes it from the abstract class or from diffrax where it is overridden.
                 assert inspect.getdoc(getattr(value, attribute)), attribute
+
+
+@pytest.mark.parametrize("name", SOLVERS)
+def test_solvers_explain_their_arguments_and_no_others(name):
+    solver = getattr(cfjax, name.partition("(")[0])
+    named = set(re.findall(r"`([a-z_]+)`", solver.__doc__))
+    assert set(inspect.signature(solver).parameters) <= named
 
 
 def test_nothing_but_the_package_is_public():

@@ -33,7 +33,7 @@ def of_time(t, y, args):
 
 
 def decay(t, y, args):
-    """Of density matrices, and not of the state."""
+    """The decay of density matrices, which does not depend on the state."""
     return cfjax.Lindblad(jnp.diag(args * t), [args[:, None] * np.eye(3, k=1)])
 
 
@@ -136,7 +136,7 @@ FIELDS = {
         ON_SPHERE,
     ),
     "Affine": (
-        lambda t, y, args: cfjax.Affine(1.0, jnp.sin(y), -args, cfjax.SineTransform()),
+        lambda t, y, args: cfjax.Affine(jnp.sin(y), -args, cfjax.SineTransform()),
         ON_SPHERE,
     ),
 }

@@ -19,14 +19,14 @@ def rotation(t, y, args):
 
 def affine(t, y, args):
     # A spectrum that is made anew is compared with the others, in each step.
-    return cfjax.Affine(1.0, -(y**3), -jnp.square(args), cfjax.SineTransform())
+    return cfjax.Affine(-(y**3), -jnp.square(args), cfjax.SineTransform())
 
 
 def sphere(t, y, args):
     return cfjax.SphereRotation(args * y)
 
 
-# Of the kinds of loops and checks: stages written out, in a loop, of one point.
+# A solve for each kind of loops and checks: stages written out, in a loop, of one point.
 SOLVES = {
     "CF4": (rotation, cfjax.CF4()),
     "RKMK4": (rotation, cfjax.RKMK4()),

@@ -68,7 +68,7 @@ def num_marked(jaxpr, used=None):
             continue
         used.update(x for x in eqn.invars if not isinstance(x, Literal))
         total += eqn.primitive.name == "lgamma"
-        # Of a loop all results count as used.
+        # All results of a loop count as used.
         times = eqn.params["length"] if eqn.primitive.name == "scan" else 1
         total += times * sum(map(num_marked, jaxprs_in_params(eqn.params)))
     return total

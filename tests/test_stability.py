@@ -131,7 +131,7 @@ def test_how_long_a_step_of_cf54_may_be(dtype, limit):
 
     def step(solver, length):
         spectrum = jnp.asarray([-1.0, -100.0], dtype)
-        term = cfjax.LieTerm(lambda t, u, args: cfjax.Affine(1.0, jnp.cos(u), spectrum))
+        term = cfjax.LieTerm(lambda t, u, args: cfjax.Affine(jnp.cos(u), spectrum))
         times = jnp.zeros((), dtype), jnp.asarray(length / 100, dtype)
         return problems.first_step(solver, term, *times, jnp.ones(2, dtype), None)[:2]
 

@@ -147,7 +147,7 @@ FADING = diffrax.MultiTerm(cfjax.LieTerm(source), cfjax.LieTerm(decay))
 
 @pytest.mark.parametrize("throw", [True, False])
 def test_step_back_that_misses_the_start(throw):
-    """Of what has decayed by exp(-40) no digits are left beside the source."""
+    """No digits are left beside the source of what has decayed by exp(-40)."""
 
     def end(y0):
         options = dict(num_steps=10, step_back=True, throw=throw)
@@ -236,7 +236,7 @@ def test_step_back_refuses_other_solvers_and_options():
     path = diffrax.UnsafeBrownianPath((3,), jax.random.key(0))
     bath = cfjax.LieControlTerm(lambda t, y, args, dw: {"q": None, "p": dw}, path)
     noisy = diffrax.MultiTerm(*SPLIT.terms, bath)
-    with pytest.raises(ValueError, match="step_back takes no noise"):
+    with pytest.raises(ValueError, match="step_back does not support noise"):
         loss(jnp.asarray(0.7), START, noisy, cfjax.Strang(), step_back=True)
     with pytest.raises(ValueError, match="either step_back or checkpoint_every, got both"):
         loss(jnp.asarray(0.7), START, SPLIT, cfjax.Strang(), step_back=True, checkpoint_every=4)

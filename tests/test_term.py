@@ -116,7 +116,11 @@ def test_wrong_values_are_refused_with_their_place(value, y, text, promotion, no
 @pytest.mark.parametrize(
     ("value", "y", "text"),
     [
-        (Rotation(F32), V3, r"Rotation for y, .*f64\[3\]\. Its \.omega is f32\[3\]"),
+        (
+            Rotation(F32),
+            V3,
+            r"Rotation for y, .*f64\[3\]\. Its \.omega is f32\[3\].*asarray\(x, y.dtype",
+        ),
         (LeftMatrix(jnp.eye(3, dtype=jnp.float32)), V3, "LeftMatrix for y, "),
         (LeftMatrix(jnp.eye(3, dtype=jnp.complex64)), V3.astype(complex), "LeftMatrix for y, "),
         (Doubling(F32), V3, "Doubling for y, "),
@@ -253,7 +257,10 @@ def test_multi_term_adds_fields_and_not_their_arrays(way):
     """Two Affine fields share their spectrum, which is no coordinate."""
     spectrum, b, y0 = -np.array([0.5, 1.0, 2.0]), np.array([0.3, -0.2, 0.1]), np.ones(3)
     terms = diffrax.MultiTerm(
-        *(LieTerm(lambda t, y, args, w=w: cfjax.Affine(w, w * b, spectrum)) for w in (0.25, 0.75))
+        *(
+            LieTerm(lambda t, y, args, w=w: cfjax.Affine(w * b, spectrum, alpha=w))
+            for w in (0.25, 0.75)
+        )
     )
     if way == "integrate":
         found = cfjax.integrate(terms, CF4(), 0.0, 2.0, jnp.asarray(y0), num_steps=3).ys[-1]

@@ -77,7 +77,7 @@ def map_batch(
       files without this function; the page on batches shows how.
     - `mesh`: a `jax.sharding.Mesh`; each chunk is spread over all of its axes. With several
       processes (`jax.distributed`) every process makes the same call and gets the whole result;
-      process 0 alone reads and writes files. By default one device.
+      only process 0 reads and writes files. By default one device.
     - `progress`: whether to show a progress bar with the time left, on a terminal. Without `rich`
       there is none.
 

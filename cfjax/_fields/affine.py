@@ -23,7 +23,7 @@ class Affine(AbstractAlgebraElement, AbstractSemilinearField):
     M is diagonal in the coefficients of a transform, with the eigenvalues `spectrum`. The flow of
     the field is `exp(alpha M) x + phi_1(alpha M) b` with `phi_1(z) = (exp(z) - 1) / z`, exact
     however stiff M is. So to solve `u' = M u + g(u)` return
-    `Affine(1.0, g(u), spectrum, transform)`, and use `cfjax.ETD54`. On a grid the transform is a
+    `Affine(g(u), spectrum, transform)`, and use `cfjax.ETD54`. On a grid the transform is a
     `cfjax.TensorTransform` and u has the shape of the grid.
 
     M should contain at least four fifths of the stiffness, or half for `CF4`. So if a coefficient
@@ -38,7 +38,7 @@ class Affine(AbstractAlgebraElement, AbstractSemilinearField):
     exponential, a division and a polynomial for each eigenvalue. With a transform they are points.
     A step then works in coefficients: it transforms the start, each b, and each point at which it
     evaluates the field or ends, so `cfjax.CF4` takes 9 transforms. Outside of a step a flow takes
-    three. A state of coefficients needs transforms for g alone.
+    three. A state of coefficients needs transforms only for g.
 
     The coordinates are `(alpha, b)`. **The spectrum is not a coordinate**: a linear combination has
     the spectrum of its first field, so the spectrum must not depend on time or state. It may depend
@@ -47,7 +47,6 @@ class Affine(AbstractAlgebraElement, AbstractSemilinearField):
 
     **Arguments:**
 
-    - `alpha`: a real scalar.
     - `b`: shaped like the state, `(n,)` or `(n, k)` or any other shape. float32, float64,
       complex64 or complex128.
     - `spectrum`: the eigenvalues, shaped like the coefficients of `b` or, if these have more axes,
@@ -56,6 +55,7 @@ class Affine(AbstractAlgebraElement, AbstractSemilinearField):
     - `transform`: a `cfjax.AbstractTransform`, for example `cfjax.SineTransform()` or that of
       `cfjax.diagonalised`, or None. A transform of your own provides `forward(point)`, the
       coefficients, and `inverse(coefficients)`.
+    - `alpha`: a real scalar, the factor of M.
 
     **Raises** `ValueError` for shapes that do not match, `TypeError` for dtypes that do not match,
     or for another kind of transform.
@@ -72,10 +72,11 @@ class Affine(AbstractAlgebraElement, AbstractSemilinearField):
 
     def __init__(
         self,
-        alpha: Any,
         b: Inexact[Array | np.ndarray, "*point"],
         spectrum: Inexact[Array | np.ndarray, "*coefficients"],
         transform: AbstractTransform | None = None,
+        *,
+        alpha: Any = 1.0,
     ):
         self.b, self.spectrum, self.transform = jnp.asarray(b), jnp.asarray(spectrum), transform
         if self.b.dtype.name not in DTYPES:

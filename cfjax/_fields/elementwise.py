@@ -16,7 +16,7 @@ from .._field import AbstractAlgebraElement, AbstractFrozenField, combine, is_fi
 def each(fun: Callable[..., PyTree], num_axes: int) -> Callable[..., PyTree]:
     """Maps `fun`, a function of arrays without leading axes, over so many leading axes.
 
-    An axis of 1 is broadcast, and what depends on such arrays alone is computed once. An array that
+    An axis of 1 is broadcast, and what depends only on such arrays is computed once. An array that
     `fun` returns unchanged stays the same object, and arguments that are one object stay one.
 
     **Raises** `ValueError` where the axes do not broadcast.
@@ -33,7 +33,7 @@ def each(fun: Callable[..., PyTree], num_axes: int) -> Callable[..., PyTree]:
         if len(lengths - {1}) > 1:
             raise ValueError(f"The leading axes must agree or be 1, got lengths {sorted(lengths)}.")
         axes = [None if len(lengths) > 1 and x.shape[0] == 1 else 0 for x in distinct]
-        # Those that `jax.vmap` has returned may be of NumPy.
+        # `jax.vmap` may have returned NumPy arrays.
         operands = [
             jnp.asarray(x[0] if axis is None else x) for x, axis in zip(distinct, axes, strict=True)
         ]
@@ -105,9 +105,9 @@ def check_point(
 def check_other(field: AbstractFrozenField, other: Any) -> None:
     """Raises `TypeError` unless `other` is of the field's class, as its bracket needs."""
     if not isinstance(other, type(field)):
-        name = type(field).__name__
         raise TypeError(
-            f"{name} has a bracket with another {name} only, got {type(other).__name__}."
+            f"Cannot compute the bracket of {type(field).__name__} and {type(other).__name__}: "
+            "both must be of one class."
         )
 
 

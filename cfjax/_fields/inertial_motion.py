@@ -43,8 +43,8 @@ class InertialMotion(AbstractMotion):
     - `time`: shape `()`, or the leading axes of `omega`.
     - `layout`: needed for poses of shape `(10,)`, as in `cfjax.ExtendedMotion`: for example
       `"wxyz_v_p"`.
-    - `body_shift`, `fixed_shift`: shape `(3,)`, or that of `omega`: velocities of the position
-      alone, in the coordinates of the body and in fixed ones. They are zero by default; brackets
+    - `body_shift`, `fixed_shift`: shape `(3,)`, or that of `omega`: velocities of only the
+      position, in the coordinates of the body and in fixed ones. They are zero by default; brackets
       need them.
 
     **Raises** `ValueError` for another shape or layout; `TypeError` for another dtype, or for shape

@@ -47,7 +47,7 @@ class LowRankSkew(AbstractSkew):
     """The field `x' = (g y^T - y g^T) x` at points near y, the point where it is frozen.
 
     It acts on a matrix with orthonormal columns, shape `(n, p)`, and keeps them orthonormal. The
-    point y is the one that `field(t, y, args)` was called with, so `g` alone determines the field,
+    point y is the one that `field(t, y, args)` was called with, so only `g` determines the field,
     and sums of such fields at one point are fields of the same form.
 
     No n x n matrix is formed. Within a step the points and fields stay in the span of its first

@@ -92,8 +92,8 @@ class AbstractMotion(AbstractAlgebraElement):
         if mine != its:
             got = " and ".join(", ".join(f"{k}={x!r}" for k, x in d.items()) for d in (mine, its))
             raise ValueError(
-                f"{type(self).__name__} has a bracket with a motion of the same "
-                f"{' and '.join(self.conventions)} only, got {got}."
+                f"Cannot compute the bracket of two {type(self).__name__}s: both must have the "
+                f"same {' and '.join(self.conventions)}, got {got}."
             )
         fun = each(fun, self._num_axes)
         arrays = fun(*(self._sign * x for x in self._arrays), *other._arrays)

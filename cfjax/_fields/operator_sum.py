@@ -36,7 +36,7 @@ class OperatorSum(AbstractFrozenField):
     """The field `x' = sum_k c_k A_k x` with fixed operators A_k.
 
     It is for controlled, driven and annealed systems, `i psi' = (H_0 + u(t) H_1) psi` and the like,
-    up to sizes whose matrices do not fit in memory. The coordinates are the coefficients alone, so
+    up to sizes whose matrices do not fit in memory. The only coordinates are the coefficients, so
     a linear combination of fields costs K numbers. **The operators are not coordinates**: they must
     be the same at every time and state. They may depend on `args`, and have derivatives. There is
     no bracket, as the commutator of two operators is another operator, so use commutator-free
@@ -49,8 +49,8 @@ class OperatorSum(AbstractFrozenField):
 
     The flow needs products with vectors only. It is the Taylor series of the exponential or, if
     `is_skew`, its Chebyshev series, to rounding. Arrays are added up first, which takes as long as
-    a product with each; a field of arrays alone then works as `LeftMatrix` does, by a dense
-    exponential if that is faster.
+    a product with each. If all operators are arrays, the field then works as `LeftMatrix` does, by
+    a dense exponential if that is faster.
 
     **Arguments:**
 

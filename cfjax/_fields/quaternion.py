@@ -81,8 +81,8 @@ class QuaternionRotation(AbstractAlgebraElement):
     def _with(self, fun: Any, other: Any) -> "QuaternionRotation":
         if jtu.tree_structure(self) != jtu.tree_structure(other):
             raise TypeError(
-                "QuaternionRotation has a bracket with another QuaternionRotation of the same "
-                f"frame and layout only, got {describe(self)} and {describe(other)}."
+                f"Cannot compute the bracket of {describe(self)} and {describe(other)}: both must "
+                "be a QuaternionRotation of the same frame and layout."
             )
         # Flows from the right compose in the reverse order, as those of -omega from the left.
         sign = 1 if self.frame == "fixed" else -1

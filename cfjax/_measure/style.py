@@ -22,7 +22,7 @@ STYLES: dict[str, dict[str, Any]] = {
     "RKMK4, full series": dict(color="#E69F00", linestyle=":", marker="D", linewidth=1.9),
     "RKR-C4": dict(color="#56B4E9", linestyle="-.", marker="v"),
 }
-# Of all other methods, in turn.
+# The styles of all other methods, in turn.
 _OTHER_STYLES = [
     dict(color="#56B4E9", linestyle="-", marker="D"),
     dict(color="#E69F00", linestyle="--", marker="P"),

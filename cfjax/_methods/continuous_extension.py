@@ -23,7 +23,7 @@ from .tableau import Tableau
 # the right-hand sides, one column for each power.
 Conditions: TypeAlias = tuple[np.ndarray, np.ndarray]
 
-# Of words, the conditions of order 5 are no longer all linear.
+# The conditions of order 5 on words are no longer all linear.
 _MAX_ORDER = 4
 # The highest power of theta.
 _MAX_POWER = 8

@@ -70,7 +70,7 @@ class ExponentialTableau:
         )
         weights = _columns("b", b, F(1), s)
         if any(k < 2 or x != 1 for _, terms in weights for k, x, _ in terms):
-            raise ValueError("b must be made of phi_2(z) to phi_5(z) alone beyond column 1.")
+            raise ValueError("b must be made only of phi_2(z) to phi_5(z) beyond column 1.")
         estimate = None if error is None else _columns("error", error, F(1), s + 1)
         for name, value in dict(c=nodes, a=rows, b=weights, error=estimate).items():
             # The only way to set a field of a frozen dataclass; it is never changed after this.

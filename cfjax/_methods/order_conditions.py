@@ -74,8 +74,8 @@ Defects: TypeAlias = list[tuple[Fraction, float]]
 def order(tableau: Any) -> int:
     """The order of a commutator-free method, at least 1 as every tableau is consistent.
 
-    Of an exponential Runge-Kutta method it is the classical order, for steps that are short for the
-    linear part too; `cfjax.stiff_order` is the order for long ones.
+    The order of an exponential Runge-Kutta method is the classical one, for steps that are short
+    for the linear part too; `cfjax.stiff_order` is the order for long ones.
 
     For exact tableaus the result is exact. Floats are taken as rounded coefficients, and the result
     is the order that the unrounded method may have; see `_defects`.
@@ -95,7 +95,11 @@ def order(tableau: Any) -> int:
 
 @lru_cache
 def error_constant(tableau: Tableau) -> float:
-    """The 2-norm of the defects over the words of order q + 1, for a method of order q."""
+    """The size of the leading error term of a `tableau`.
+
+    For a method of order q it is the 2-norm of the residuals of all order conditions of order
+    q + 1.
+    """
     defects = _defects(_end_weights(tableau), exact_weight)
     for _ in range(order(tableau)):
         next(defects)

@@ -33,7 +33,7 @@ def diagonalised(
 
     ```python
     spectrum, transform = cfjax.diagonalised(matrix)
-    field = lambda t, u, args: cfjax.Affine(1.0, g(t, u), spectrum, transform)
+    field = lambda t, u, args: cfjax.Affine(g(t, u), spectrum, transform)
     ```
 
     The matrix acts along the first axis; further axes are columns. It may also be the operator of

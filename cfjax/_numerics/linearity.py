@@ -176,6 +176,6 @@ def _without_rule(operands: Sequence[Linearity]) -> Linearity:
 
 
 def _join(a: Linearity, b: Linearity) -> Linearity:
-    """Of an array with entries of both kinds."""
+    """The linearity of an array with entries of both kinds."""
     power = a.power if a.power == b.power else 1 if max(a.power, b.power) == 1 else 3
     return Linearity(power, a.constant if a.constant == b.constant else "unknown")

@@ -27,7 +27,7 @@ from .polynomial import polynomial
 from .squaring import max_over_batch
 from .vectors import materialised_in_rows
 
-# Of the Taylor polynomials that `phi_1_times` chooses from.
+# The degrees of the Taylor polynomials that `phi_1_times` chooses from.
 _DEGREES = {"float32": (5, 10, 15), "float64": (12, 16, 20, 25)}
 # A matrix a and a vector v, for the block matrix `[[a, v], [0, 0]]`.
 _Pair = tuple[Array, Array]

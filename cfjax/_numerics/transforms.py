@@ -121,7 +121,7 @@ class FourierTransform(AbstractTransform):
 
 
 class RealFourierTransform(AbstractTransform):
-    """The unitary discrete Fourier transform of real points: coefficients `k = 0..n//2` alone.
+    """The unitary discrete Fourier transform of real points: coefficients `k = 0..n//2` only.
 
     Otherwise it is like `FourierTransform`. Costs a real FFT of length `n`. A difference operator
     of odd order must have the eigenvalue zero at `k = n/2`, if n is even: for real points no other

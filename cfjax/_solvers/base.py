@@ -87,8 +87,8 @@ class AbstractLieSolver(AbstractSolver):
     def for_terms(self, terms: PyTree[diffrax.AbstractTerm]) -> "AbstractLieSolver":
         """The same method for these terms: without its estimate where a path drives one of them.
 
-        It would compare two methods on the same chord of the path, and not see that the path is
-        not straight.
+        An embedded method takes the same straight line for the path in a step, so it cannot see the
+        error of the noise.
 
         **Raises** `TypeError` if the method cannot take such terms.
         """

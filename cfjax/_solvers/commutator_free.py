@@ -26,30 +26,14 @@ from .step import AbstractChartSolver, Chart, Step
 class AbstractCommutatorFree(AbstractTableauSolver, AbstractChartSolver):
     """Flows of linear combinations of frozen fields, and no commutator.
 
-    If the tableau has an embedded method, the error estimate is `y1 - embedded`, the difference of
-    the end points of both methods. With `estimate="algebra"` the fields of all flows are added up
-    for each method, and the estimate is the velocity at `y1` of the difference of the two sums.
-    This is a linear combination of the stages' fields, which costs no flow. For fields that do not
-    depend on the state and are linear in time, as in the Landau-Zener problem, these sums cancel,
-    so this estimate does not see the error that the commutators make.
-
-    Constant steps do not need an estimate, and small systems take up to twice as long with it on
-    CPU. `estimate=None` switches it off. (`cfjax.integrate` does so.)
-
     A class whose tableau has an embedded method is a `diffrax.AbstractAdaptiveSolver`.
-
-    `unroll` says how the stages of a step are compiled, like `scan_kind` in diffrax: unrolled
-    (True), or rolled into one loop if the fields allow it (False), which is a shorter program.
-    None, the default, picks what measures best.
-
-    **Raises** `ValueError` for another `estimate` or `unroll`.
+    `CommutatorFree` explains `estimate` and `unroll`.
     """
 
     tableau: eqx.AbstractVar[Tableau]
     estimate: Literal["group", "algebra"] | None = eqx.field(
         static=True, default="group", kw_only=True
     )
-    # Whether the stages stand one by one in the program instead of in a loop. None: what is faster.
     unroll: bool | None = eqx.field(static=True, default=None, kw_only=True)
 
     def __check_init__(self):
@@ -181,7 +165,24 @@ class CommutatorFree(
     It is a `diffrax.AbstractAdaptiveSolver` for every tableau, as its class does not depend on the
     tableau. diffrax checks for the estimate itself, and refuses adaptive steps without one.
 
-    **Raises** `TypeError` if `tableau` is not a `cfjax.Tableau`.
+    **Arguments:**
+
+    - `tableau`: a `cfjax.Tableau`.
+    - `estimate`: the estimate of the error, if the tableau has an embedded method. `"group"`, the
+      default, is the difference between the end points of the method and of the embedded method.
+      `"algebra"` saves the flows of the embedded method: it adds up the fields of all flows of each
+      method, and is the velocity of the difference of both sums at the end of the step. For fields
+      that do not depend on the state and are linear in time, both sums are the same except in `CF2`
+      and `CF4`, and this estimate misses the error that commutators cause. None leaves out the
+      estimate, which constant steps do not need: small systems are faster without it on CPU.
+      `cfjax.integrate` leaves it out.
+    - `unroll`: how the stages of a step are compiled, like `scan_kind` in diffrax. True writes them
+      one after the other into the program. False rolls them into one loop if the fields allow it,
+      which makes the program shorter and quicker to compile. None, the default, chooses by the size
+      of the state and the number of stages, for the fastest program.
+
+    **Raises** `TypeError` if `tableau` is not a `cfjax.Tableau`; `ValueError` for another
+    `estimate` or `unroll`.
     """
 
     tableau: Tableau = eqx.field(static=True)
@@ -194,7 +195,7 @@ class CommutatorFree(
         if is_driven(terms) and self.order(terms) < 2:
             raise TypeError(
                 "CommutatorFree takes noise in the sense of Stratonovich, for which its tableau "
-                "must have order 2 or more. Of order 1 is cfjax.LieEuler, in the sense of Itô."
+                "must have order 2 or more. Use cfjax.LieEuler for order 1, in the sense of Itô."
             )
         return super().for_terms(terms)
 
@@ -202,8 +203,10 @@ class CommutatorFree(
 class LieEuler(AbstractCommutatorFree, diffrax.AbstractItoSolver):
     """The exponential Euler step. Order 1, 1 evaluation, 1 flow. Dense output of order 1.
 
-    Noise is in the sense of Itô in the frame: the coefficients of the fields are taken before the
-    increment. In a linear space that is Itô's equation.
+    It evaluates the field at the start of the step, so with noise it solves the Itô equation in the
+    coordinates of the frame. In a linear space that is Itô's equation.
+
+    `estimate` and `unroll` are those of `cfjax.CommutatorFree`.
     """
 
     tableau: ClassVar[Tableau] = _tableau.LIE_EULER
@@ -215,6 +218,8 @@ class CF2(
     """The midpoint rule. Order 2, 2 evaluations, 2 flows. Dense output of order 2.
 
     The estimate compares with a step of `LieEuler` and costs 1 flow more.
+
+    `estimate` and `unroll` are those of `cfjax.CommutatorFree`.
     """
 
     tableau: ClassVar[Tableau] = _tableau.CF2
@@ -227,6 +232,8 @@ class CF3(
 
     The estimate, with an embedded method of order 2, costs 1 flow more. Dense output of order 2.
     `cfjax.third_order_a` and `cfjax.third_order_b` give the families it belongs to.
+
+    `estimate` and `unroll` are those of `cfjax.CommutatorFree`.
 
     Source: Commutator-free Lie group methods, FGCS 19 (2003), equation (6),
     doi:10.1016/S0167-739X(02)00161-9.
@@ -248,6 +255,8 @@ class CF4(
     estimate is replaced by the distance of the last stage from the end, times the ratio of this
     distance to the distance from the start. Dense output of order 3.
 
+    `estimate` and `unroll` are those of `cfjax.CommutatorFree`.
+
     Source: Commutator-free Lie group methods, FGCS 19 (2003), equation (7),
     doi:10.1016/S0167-739X(02)00161-9.
     """
@@ -262,6 +271,8 @@ class CF43(
 
     Its error constant is 15 times smaller than that of `CF4`, and it is stable for undamped
     oscillations up to 3.85 and decay up to 5.84 (`CF4`: 2.83, 2.79). Dense output of order 3.
+
+    `estimate` and `unroll` are those of `cfjax.CommutatorFree`.
 
     Source: derived for this package from the order conditions; see `cfjax.order`.
     """
@@ -285,6 +296,8 @@ class CF54(
     tight ones. For strong dissipation use `CF4` or `CF43`, whose flows go forwards: no
     commutator-free method of an order above 4 has positive weights.
 
+    `estimate` and `unroll` are those of `cfjax.CommutatorFree`.
+
     Source: derived for this package from the order conditions; see `cfjax.order`. Weights:
     Hofstätter & Koch, Numer. Math. 141 (2019), arXiv:1709.08473.
     """
@@ -301,6 +314,8 @@ class CG3(
     The estimate, with an embedded method of order 2, costs 3 flows more. Dense output of order 2.
     Some flows go backwards in time, so do not use it for strong dissipation: see `CF54`.
 
+    `estimate` and `unroll` are those of `cfjax.CommutatorFree`.
+
     Source: Crouch & Grossman, J. Nonlinear Sci. 3 (1993), doi:10.1007/BF02429858; coefficients of
     Owren & Marthinsen, BIT 39 (1999), doi:10.1023/A:1022325426017.
     """
@@ -313,6 +328,8 @@ class CG4(AbstractCommutatorFree, diffrax.AbstractStratonovichSolver):
 
     Dense output of order 3.
     Some flows go backwards in time, so do not use it for strong dissipation: see `CF54`.
+
+    `estimate` and `unroll` are those of `cfjax.CommutatorFree`.
 
     Source: Jackiewicz, Marthinsen & Owren, Adv. Comput. Math. 13 (2000),
     doi:10.1023/A:1016645730465.
@@ -327,6 +344,8 @@ class CG5(AbstractCommutatorFree, diffrax.AbstractStratonovichSolver):
 
     Dense output of order 4, which uses the field at the end of the step.
     Some flows go backwards in time, so do not use it for strong dissipation: see `CF54`.
+
+    `estimate` and `unroll` are those of `cfjax.CommutatorFree`.
 
     Source: Jackiewicz, Marthinsen & Owren, Adv. Comput. Math. 13 (2000),
     doi:10.1023/A:1016645730465.

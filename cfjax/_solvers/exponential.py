@@ -42,7 +42,7 @@ class AbstractExponential(AbstractTableauSolver, AbstractChartSolver):
     The functions `phi_k(c h L)` are made for each step. `cfjax.integrate` makes them once, if L
     depends on neither time nor state.
 
-    `estimate=None` switches off the estimate of the error. (`cfjax.integrate` does so.)
+    `ExponentialRungeKutta` explains `estimate`.
 
     **Raises** `TypeError` when the program is traced for a field of another class, or a term that a
     path drives; `ValueError` for another `estimate`.
@@ -52,9 +52,9 @@ class AbstractExponential(AbstractTableauSolver, AbstractChartSolver):
     estimate: Literal["group"] | None = eqx.field(static=True, default="group", kw_only=True)
     # For equal steps: their length, as differences of times would differ from step to step by their
     # rounding, and for each part of the field the coefficients of its linear part, where that is
-    # the same in all steps.
-    equal_length: Real[Array, ""] | None = eqx.field(default=None, kw_only=True)
-    known: tuple[Any, ...] | None = eqx.field(default=None, kw_only=True)
+    # the same in all steps. `for_equal_steps` sets them.
+    equal_length: Real[Array, ""] | None = eqx.field(default=None, init=False)
+    known: tuple[Any, ...] | None = eqx.field(default=None, init=False)
 
     def __check_init__(self):
         check_choice("estimate", self.estimate, "group", None)
@@ -66,13 +66,13 @@ class AbstractExponential(AbstractTableauSolver, AbstractChartSolver):
     def for_terms(self, terms):
         if is_driven(terms):
             raise TypeError(
-                f"{type(self).__name__} takes no terms that a path drives: use a commutator-free "
-                "method, for example cfjax.CF4()."
+                f"{type(self).__name__} does not support noise or other path-driven terms: use a "
+                "commutator-free method, for example cfjax.CF4()."
             )
         return self
 
     def for_equal_steps(self, terms, length, t0, y0, args) -> Any:
-        """The same method for steps of this length alone, with the coefficients of all linear parts
+        """The same method for steps of this length only, with the coefficients of all linear parts
         that depend on neither time nor state.
         """
         solver: Any = self._with(equal_length=length)
@@ -232,7 +232,8 @@ class _PolynomialPath(AbstractPath):
     first: PyTree
     start: PyTree
     velocity: PyTree
-    # Of g less its value at the start, the coefficients of the powers of the time from the first.
+    # The coefficients of the powers of the time, from the first on, of g less its value at the
+    # start.
     powers: list[PyTree]
 
     def point(self, theta: Any) -> PyTree:
@@ -259,7 +260,16 @@ class ExponentialRungeKutta(AbstractExponential, diffrax.AbstractAdaptiveSolver)
     It is a `diffrax.AbstractAdaptiveSolver` for every tableau, as its class does not depend on the
     tableau. diffrax refuses adaptive steps if the tableau has no estimate.
 
-    **Raises** `TypeError` if `tableau` is not a `cfjax.ExponentialTableau`.
+    **Arguments:**
+
+    - `tableau`: a `cfjax.ExponentialTableau`.
+    - `estimate`: `"group"`, the default, estimates the error by the embedded method of the tableau,
+      if it has one. None leaves out the estimate, which constant steps do not need.
+      `cfjax.integrate` leaves it out.
+
+    **Raises** `TypeError` if `tableau` is not a `cfjax.ExponentialTableau`, and when the program is
+    traced for a field of another class or a term that a path drives; `ValueError` for another
+    `estimate`.
     """
 
     tableau: ExponentialTableau = eqx.field(static=True)
@@ -275,6 +285,8 @@ class ETDRK4(AbstractExponential):
     It has no estimate of the error. Dense output of order 3. `ETD43` has a stiff order of 4 for one
     evaluation more.
 
+    `estimate` is that of `cfjax.ExponentialRungeKutta`.
+
     Source: Cox & Matthews, Exponential time differencing for stiff systems, J. Comput. Phys. 176
     (2002), doi:10.1006/jcph.2002.6995.
     """
@@ -289,6 +301,8 @@ class ETD43(AbstractExponential, diffrax.AbstractAdaptiveSolver):
     Its estimate uses the field at the end, with which the next step begins. For stiff problems and
     errors of about 1e-3. Dense output of order 3.
 
+    `estimate` is that of `cfjax.ExponentialRungeKutta`.
+
     Source: derived for this package, with the conditions of Hochbruck & Ostermann, Explicit
     exponential Runge-Kutta methods for semilinear parabolic problems, SIAM J. Numer. Anal. 43
     (2005), doi:10.1137/040611434.
@@ -302,6 +316,8 @@ class ETD54(AbstractExponential, diffrax.AbstractAdaptiveSolver):
     """Order 5 and stiff order 5, with an embedded method of order 4: 8 evaluations.
 
     The choice for stiff semilinear problems. Dense output of order 4.
+
+    `estimate` is that of `cfjax.ExponentialRungeKutta`.
 
     Source: derived for this package, with the conditions of Luan & Ostermann, Exponential B-series:
     the stiff case, SIAM J. Numer. Anal. 51 (2013), doi:10.1137/130920204.

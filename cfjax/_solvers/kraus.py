@@ -115,7 +115,7 @@ def _is_no_lindblad(place: str, part: Any) -> str:
     if isinstance(part, Rest):
         name = "None"
     return (
-        "Kraus4 takes density matrices alone: the field of each part of the state must be "
+        "Kraus4 takes only density matrices: the field of each part of the state must be "
         f"cfjax.Lindblad, and for y{place} it is {name}. Use a commutator-free method, for example "
         "cfjax.CF4()."
     )
@@ -213,20 +213,20 @@ def _increment(
     increment = increment - scaled(jnp.trace(increment).real / len(x), eye)
     if not estimate:
         return increment, None
-    # Of the jumps: with a stage at a quarter the weights 0, 4/9, 1/9, 2/9, 2/9 are of order 3. The
-    # motion to there must have an error of order 3, so it takes a correction.
+    # The error of the jumps: with a stage at a quarter the weights 0, 4/9, 1/9, 2/9, 2/9 are of
+    # order 3. The motion to there must have an error of order 3, so it takes a correction.
     correction = (k0 - k2) / 16
     j1 = f1.jump(_moved(correction, _congruence(quarter, y + f0.jump(y) / 4)))
     j1 = _congruence(quarter, _moved(-correction, j1))
     error = _congruence(b, a1 / 6 - 4 / 9 * j1 + 2 / 9 * j2 + 1 / 9 * j3) - j4 / 18
-    # Of the motion without jumps: one exponential for all of the step. It starts from y, and the
-    # other from x: so this sees the congruence too, the error of stiff steps.
+    # The error of the motion without jumps: one exponential for all of the step. It starts from y,
+    # and the other from x: so this sees the congruence too, the error of stiff steps.
     coarse = expm(_exponent(1.0, k0, k2, k4))
     return increment, error + _congruence(small_product(b, a), x) - _congruence(coarse, y)
 
 
 def _exponent(c: float, k0: Array, k1: Array, k2: Array) -> Array:
-    """Of order 4 by Magnus, for a part c of the step: from k at its start, middle and end."""
+    """Magnus' exponent of order 4 for a part c of the step, from k at its start, middle and end."""
     commutator = small_product(k0, k2) - small_product(k2, k0)
     return c / 6 * (k0 + 4 * k1 + k2) - c**2 / 12 * commutator
 

@@ -96,6 +96,8 @@ def _tableau(a: Row, b: Row, embedded: Callable[[Product], Any] | None = None) -
 class Williamson3(AbstractLowStorage):
     """Order 3, 3 evaluations, 3 flows. Dense output of order 2.
 
+    `estimate` and `unroll` are those of `cfjax.CommutatorFree`.
+
     Source: Williamson, J. Comput. Phys. 35 (1980), doi:10.1016/0021-9991(80)90033-9; Bazavov,
     BIT 62 (2022), doi:10.1007/s10543-021-00892-x.
     """
@@ -108,6 +110,8 @@ class Williamson3(AbstractLowStorage):
 class BWRRK33(AbstractLowStorage):
     """Order 3, 3 evaluations, 3 flows. Dense output of order 2.
 
+    `estimate` and `unroll` are those of `cfjax.CommutatorFree`.
+
     Source: Bazavov, BIT 62 (2022), doi:10.1007/s10543-021-00892-x.
     """
 
@@ -119,6 +123,8 @@ class BWRRK33(AbstractLowStorage):
 class BWRRK53(AbstractLowStorage, diffrax.AbstractAdaptiveSolver):
     """Order 3, 5 evaluations, 5 flows. The estimate, of order 2, comes at no extra cost.
     Dense output of order 3.
+
+    `estimate` and `unroll` are those of `cfjax.CommutatorFree`.
 
     Source: Bazavov, BIT 62 (2022), doi:10.1007/s10543-021-00892-x.
     """
@@ -144,6 +150,8 @@ class CK34(AbstractLowStorage, diffrax.AbstractAdaptiveSolver):
     """Order 3, 4 evaluations, 4 flows. The estimate, of order 2, comes at no extra cost.
     Dense output of order 3.
 
+    `estimate` and `unroll` are those of `cfjax.CommutatorFree`.
+
     Source: Carpenter & Kennedy, NASA TM-109112 (1994).
     """
 
@@ -159,6 +167,8 @@ class CK34(AbstractLowStorage, diffrax.AbstractAdaptiveSolver):
 
 class CK54(AbstractLowStorage):
     """Order 4, 5 evaluations, 5 flows. Dense output of order 3.
+
+    `estimate` and `unroll` are those of `cfjax.CommutatorFree`.
 
     Source: Carpenter & Kennedy, NASA TM-109112 (1994).
     """
@@ -185,6 +195,8 @@ class Luscher3(AbstractLowStorage, diffrax.AbstractAdaptiveSolver):
     """Order 3, 3 evaluations, 3 flows. The estimate, of order 2, costs 1 flow more, and two more
     copies of the state. Dense output of order 2.
 
+    `estimate` and `unroll` are those of `cfjax.CommutatorFree`.
+
     Source: Lüscher, JHEP 08 (2010) 071, doi:10.1007/JHEP08(2010)071; estimate: Fritzsch & Ramos,
     JHEP 10 (2013) 008, doi:10.1007/JHEP10(2013)008.
     """
@@ -198,6 +210,8 @@ class YRK135(AbstractLowStorage):
     """Order 5, 13 evaluations, 13 flows. Dense output of order 4.
 
     Some flows go backwards in time, so do not use it for strong dissipation: see `CF54`.
+
+    `estimate` and `unroll` are those of `cfjax.CommutatorFree`.
 
     Source: Yan (2017); Bazavov, BIT 62 (2022), doi:10.1007/s10543-021-00892-x.
     """
@@ -240,6 +254,8 @@ class CFEES25(AbstractLowStorage, diffrax.AbstractAdaptiveSolver):
     """Order 2, 3 evaluations, 3 flows; a backward step undoes a step to order 5. The estimate, of
     order 1, costs 1 flow more, and one more copy of the state. Dense output of order 2.
 
+    `estimate` and `unroll` are those of `cfjax.CommutatorFree`.
+
     Source: Shmelev, Thompson & Salvi, arXiv:2509.20599 (2025).
     """
 
@@ -253,6 +269,8 @@ class CFEES25(AbstractLowStorage, diffrax.AbstractAdaptiveSolver):
 class CFEES27(AbstractLowStorage):
     """Order 2, 4 evaluations, 4 flows; a backward step undoes a step to order 7. Dense output of
     order 2.
+
+    `estimate` and `unroll` are those of `cfjax.CommutatorFree`.
 
     Source: Shmelev, Thompson & Salvi, arXiv:2509.20599 (2025).
     """

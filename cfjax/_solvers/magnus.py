@@ -51,12 +51,7 @@ class AbstractMagnus(AbstractOfTime):
 
     For `y' = A(t) y`, and any other field whose coordinates depend on t but not on y.
 
-    If the method has an embedded method, the error estimate is `y1 - embedded`, the difference of
-    the end points of both. Constant steps do not need it: `estimate=None` switches it off.
-    (`cfjax.integrate` does so.)
-
-    `unroll` says whether the flows are unrolled in the program (True) or rolled into a loop
-    (False); None, the default, picks what measures best.
+    `Magnus6` explains `estimate` and `unroll`.
 
     If the nodes include both ends of the step, the last evaluation of a step is the first one of
     the next.
@@ -68,7 +63,6 @@ class AbstractMagnus(AbstractOfTime):
 
     tableau: eqx.AbstractVar[MagnusTableau]
     estimate: Literal["group"] | None = eqx.field(static=True, default="group", kw_only=True)
-    # Whether the stages stand one by one in the program instead of in a loop. None: what is faster.
     unroll: bool | None = eqx.field(static=True, default=None, kw_only=True)
 
     def __check_init__(self):
@@ -143,6 +137,8 @@ class Magnus2(AbstractMagnus):
 
     This is the exponential midpoint rule. Dense output of order 1. It has no estimate, but
     `cfjax.Richardson(cfjax.Magnus2())` has one.
+
+    `estimate` and `unroll` are those of `cfjax.Magnus6`.
     """
 
     tableau: ClassVar[MagnusTableau] = _magnus.MAGNUS2
@@ -155,6 +151,8 @@ class Magnus4(AbstractMagnus, diffrax.AbstractAdaptiveSolver):
     order 4 some flow of every method goes backwards. The estimate, with an embedded method of order
     2, costs 1 flow more and leads to small steps: `cfjax.Richardson(cfjax.Magnus4())` takes fewer
     steps. Dense output of order 3.
+
+    `estimate` and `unroll` are those of `cfjax.Magnus6`.
 
     Source: Alvermann & Fehske, High-order commutator-free exponential time-propagation of driven
     quantum systems, J. Comput. Phys. 230 (2011), doi:10.1016/j.jcp.2011.04.006. The embedded method
@@ -170,6 +168,8 @@ class Magnus4Lobatto(AbstractMagnus, diffrax.AbstractAdaptiveSolver):
     On such fields it gives the same result as `CF4` up to rounding, which takes 4 evaluations and 5
     flows. The estimate, with the midpoint rule, costs 1 flow more. Dense output of order 3.
     `Magnus4` has an error constant 50 times smaller for one evaluation and one flow more.
+
+    `estimate` and `unroll` are those of `cfjax.Magnus6`.
     """
 
     tableau: ClassVar[MagnusTableau] = _magnus.MAGNUS4_LOBATTO
@@ -180,6 +180,19 @@ class Magnus6(AbstractMagnus, diffrax.AbstractAdaptiveSolver):
 
     The embedded method has order 4. Dense output of order 5. One flow goes backwards in time, by
     0.09 of the step, so do not use it for strong dissipation: see `CF54`.
+
+    **Arguments:**
+
+    - `estimate`: `"group"`, the default, estimates the error as the difference between the end
+      points of the method and of the embedded method. None leaves out the estimate, which constant
+      steps do not need. `cfjax.integrate` leaves it out.
+    - `unroll`: how the flows of a step are compiled. True writes them one after the other into the
+      program. False rolls them into a loop, which makes the program shorter and quicker to compile.
+      None, the default, chooses by the size of the state, for the fastest program.
+
+    **Raises** `TypeError` when the program is traced if the field depends on the state, including a
+    field that is frozen at the state, such as `cfjax.LowRankSkew`, and a field that gives the state
+    to a function of the host; `ValueError` for another `estimate` or `unroll`.
 
     Source: derived for this package from the order conditions.
     """
@@ -192,6 +205,8 @@ class Magnus8(AbstractMagnus, diffrax.AbstractAdaptiveSolver):
 
     The embedded method is `Magnus6` on these nodes. Dense output of order 7. Two flows go backwards
     in time, each by 0.44 of the step, so do not use it for strong dissipation: see `CF54`.
+
+    `estimate` and `unroll` are those of `cfjax.Magnus6`.
 
     Source: Hofstätter, arXiv:1902.11256. The nodes, seven of Lobatto's, and the estimate were
     chosen for this package.
@@ -209,6 +224,8 @@ class Magnus10(AbstractMagnus, diffrax.AbstractAdaptiveSolver):
 
     Output within a step has a rounding error of some 1e-12, a hundred times that of the end of the
     step.
+
+    `estimate` and `unroll` are those of `cfjax.Magnus6`.
 
     Source: `CF10` of Hofstätter's TimeDependentLinearODESystems.jl. The nodes, nine of Lobatto's,
     and the estimate were chosen for this package.

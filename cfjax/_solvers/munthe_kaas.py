@@ -56,9 +56,7 @@ class AbstractMuntheKaas(AbstractChartSolver, diffrax.AbstractStratonovichSolver
     `estimate="group"` it is the difference of the end points, for 1 flow more. `estimate=None`
     switches it off.
 
-    `unroll` says how the stages of a step are compiled, like `scan_kind` in diffrax: unrolled
-    (True), or rolled into one loop if the fields allow it (False), which is a shorter program.
-    None, the default, picks what measures best.
+    `unroll` is that of `cfjax.CommutatorFree`.
 
     **Raises** `ValueError` for another `estimate` or `unroll`.
     """
@@ -182,6 +180,8 @@ class RKMK3(AbstractMuntheKaas, diffrax.AbstractAdaptiveSolver):
     The estimate, with the midpoint rule as embedded method, comes at no extra cost. Dense output of
     order 2.
 
+    `estimate` and `unroll` are those of `cfjax.RKMK`.
+
     Source: Munthe-Kaas & Owren, Computations in a free Lie algebra, Phil. Trans. R. Soc. A 357
     (1999), doi:10.1098/rsta.1999.0361.
     """
@@ -206,6 +206,8 @@ class RKMK4(AbstractMuntheKaas):
     """Munthe-Kaas method of order 4 with two commutators: 4 evaluations, 4 flows.
 
     Dense output of order 3.
+
+    `estimate` and `unroll` are those of `cfjax.RKMK`.
 
     Source: Munthe-Kaas & Owren, Computations in a free Lie algebra, Phil. Trans. R. Soc. A 357
     (1999), doi:10.1098/rsta.1999.0361. Their two brackets of the last line,
@@ -237,13 +239,13 @@ class RKMK(AbstractMuntheKaas, diffrax.AbstractAdaptiveSolver):
     """The Munthe-Kaas method of any explicit Runge-Kutta method, with its order and its estimate.
 
     Each stage but the first takes the inverse derivative of the exponential, `dexpinv` of the
-    field: a closed form for `Rotation`, `QuaternionRotation`, `RigidMotion`, `PlanarMotion` and
-    `ExtendedMotion`, otherwise a series. The series of a method of order q has up to q - 2
-    commutators, or q - 3 if q is odd and above 3. From a full turn on the exponential cannot be
-    inverted. For these fields and `InertialMotion`, a step where one of them, times the step size,
-    is an angular velocity of 2 pi or more at some stage is an error, or taken again, shorter, with
-    adaptive steps. The series of other fields converges below this bound only, and the step is as
-    wrong as any that is too long.
+    field: a closed form for `Rotation`, `QuaternionRotation`, `RigidMotion`, `PlanarMotion`,
+    `ExtendedMotion` and `Scaling`, otherwise a series. The series of a method of order q has up to
+    q - 2 commutators, or q - 3 if q is odd and above 3. From a full turn on the exponential cannot
+    be inverted. For these fields and `InertialMotion`, a step where one of them, times the step
+    size, is an angular velocity of 2 pi or more at some stage is an error, or taken again, shorter,
+    with adaptive steps. The series of other fields converges below this bound only, and the step is
+    as wrong as any that is too long.
 
     The estimate comes at no extra cost, unless the tableau is first same as last: then it needs the
     field at the end of the step, which is the first field of the next step. Dense output has order
@@ -268,9 +270,16 @@ class RKMK(AbstractMuntheKaas, diffrax.AbstractAdaptiveSolver):
     The function of the term is called off the manifold, and must return elements of the same
     algebra there.
 
-    **Arguments:** `tableau`, a `diffrax.ButcherTableau`, for example `diffrax.Dopri5.tableau`;
-    `coordinates`, `"exponential"` or `"projected"`; `estimate`, `"algebra"`, `"group"` or None, and
-    `unroll`, as in the other methods.
+    **Arguments:**
+
+    - `tableau`: a `diffrax.ButcherTableau`, for example `diffrax.Dopri5.tableau`.
+    - `coordinates`: `"exponential"` or `"projected"`.
+    - `estimate`: the estimate of the error, if the tableau has an embedded method, which gives
+      another element of the algebra. `"algebra"`, the default, is the velocity of the difference of
+      both elements at the end of the step, and takes no flow. `"group"` is the difference between
+      the end points of both methods, for 1 flow more. None leaves out the estimate, which constant
+      steps do not need. `cfjax.integrate` leaves it out.
+    - `unroll`: whether the stages are unrolled in the program, as in `cfjax.CommutatorFree`.
 
     **Raises** `TypeError` if the tableau is something else, `ValueError` if the method is implicit,
     or for other `coordinates`, `estimate` or `unroll`. With `coordinates="projected"`: `TypeError`
@@ -434,7 +443,9 @@ class RKMK5(RKMK):
     This is `RKMK(diffrax.Tsit5.tableau)`, without commutators for a field whose `dexpinv` is a
     closed form, otherwise with 10. The estimate takes no flow, but needs the field at the end of
     the step, which is the first field of the next step, and 2 commutators for this field. Dense
-    output of order 4. With `coordinates="projected"`, as in `RKMK`, it takes no commutators.
+    output of order 4. With `coordinates="projected"` it takes no commutators.
+
+    `coordinates`, `estimate` and `unroll` are those of `cfjax.RKMK`.
 
     Source: Tsitouras, Runge-Kutta pairs of order 5(4) satisfying only the first column simplifying
     assumption, Comput. Math. Appl. 62 (2011), doi:10.1016/j.camwa.2011.06.002.
@@ -457,8 +468,10 @@ class RKMK8(RKMK):
 
     This is `RKMK(diffrax.Dopri8.tableau)`, for fields whose `dexpinv` is a closed form: with other
     fields it takes 72 commutators a step. The estimate comes at no extra cost. Dense output of
-    order 7, for 4 evaluations and flows more. With `coordinates="projected"`, as in `RKMK`, it
-    takes no commutators.
+    order 7, for 4 evaluations and flows more. With `coordinates="projected"` it takes
+    no commutators.
+
+    `coordinates`, `estimate` and `unroll` are those of `cfjax.RKMK`.
 
     Source: Prince & Dormand, High order embedded Runge-Kutta formulae, J. Comput. Appl. Math. 7
     (1981), doi:10.1016/0771-050X(81)90010-3.

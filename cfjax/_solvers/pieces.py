@@ -137,6 +137,11 @@ class ShiftedNoise(AbstractPieces):
     the noise's fields do not depend on the state, along which that is exact.
 
     **Raises** as `cfjax.WeakOrder2`, of both solvers.
+
+    Source: replacing the Brownian path by a piecewise linear one that has its W and H and the mean
+    of its further integrals is the approach of Foster, dos Reis & Strange, High order splitting
+    methods for SDEs satisfying a commutativity condition, arXiv:2210.17543. These shifts, which are
+    linear in H, were derived for this package.
     """
 
     solver: AbstractChartSolver = CF4()

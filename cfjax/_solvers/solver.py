@@ -41,7 +41,7 @@ class AbstractSolver(diffrax.AbstractSolver):
     def for_equal_steps(
         self, terms: PyTree, length: Real[Array, ""], t0: Any, y0: PyTree, args: PyTree
     ) -> Any:
-        """The same method for steps of this length alone, with what all of them share computed."""
+        """The same method for steps of this length only, with what all of them share computed."""
         del terms, length, t0, y0, args
         return self
 

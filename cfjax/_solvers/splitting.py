@@ -66,8 +66,8 @@ class AbstractSplitting(AbstractLieSolver, diffrax.AbstractStratonovichSolver):
             )
         if is_driven(summands[:-1]):
             raise TypeError(
-                f"{name} takes noise, or what else a path drives, in its last term only: move it "
-                "there, together with what acts at the same time, as a diffrax.MultiTerm."
+                f"{name} supports noise and other path-driven terms only as its last term: move "
+                "them there, together with what acts at the same time, as a diffrax.MultiTerm."
             )
         return self
 
@@ -81,9 +81,9 @@ class AbstractSplitting(AbstractLieSolver, diffrax.AbstractStratonovichSolver):
         if dependent:
             cause = f" {unknown_dependence('t')}." if dependent[0][1] is None else ""
             raise TypeError(
-                f"The last term of {type(self).__name__} must not depend on time, which passes "
-                "while it acts: take another one as the last, or add one at rest, with zeros for "
-                f"each part.{cause}"
+                f"The last term of {type(self).__name__} must not depend on time, as the clock "
+                "advances while it acts: put another term last, or append one that returns zeros "
+                f"for each part.{cause}"
             )
 
         def at_start(y0: PyTree) -> tuple[list[PyTree], PyTree]:
@@ -139,7 +139,7 @@ class Splitting(AbstractSplitting):
     """Flows of the terms of a `diffrax.MultiTerm` in turn: symplectic where the terms are.
 
     Each term has a frozen field that does not change along its own flow, such as a force, which
-    moves momenta alone. So its flow is exact, and where the term is Hamiltonian, the step is
+    moves only momenta. So its flow is exact, and where the term is Hamiltonian, the step is
     symplectic. All symmetric methods are reversible. `cfjax.check_terms` checks that the fields do
     not change.
 
@@ -150,10 +150,10 @@ class Splitting(AbstractSplitting):
 
     Each field acts on the whole state, with None for a part at rest. The first term is outermost,
     as in kick, drift, kick: it has one evaluation in each pair of stages, the last term one, and
-    those between two. Time passes while the last term acts, which must not depend on it: if all
-    terms do, add one that rests. The last term alone may be driven by noise, as in Langevin
-    dynamics by BAOAB, which is `cfjax.Strang` of kick, drift, and a `diffrax.MultiTerm` of friction
-    and noise.
+    those between two. The clock advances only during the last term, so the last term must not
+    depend on t: if every term depends on t, append a term that returns zeros. Only the last term
+    may be driven by noise, as in Langevin dynamics by BAOAB, which is `cfjax.Strang` of kick,
+    drift, and a `diffrax.MultiTerm` of friction and noise.
 
     There is no error estimate, as steps of different lengths would not be symplectic. Output within
     a step is on the manifold and meets both ends, with order 1 between them.

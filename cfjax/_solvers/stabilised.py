@@ -59,18 +59,6 @@ class AbstractStabilised(AbstractChartSolver, diffrax.AbstractAdaptiveSolver):
     eigenvalues, whose solution is smooth after a while. The stages move along sums of frozen
     fields, without a commutator, and stay on the manifold however long a step is.
 
-    **Arguments:**
-
-    - `stages`: the number of stages of every step, at least 3; an odd number damps what is stiffest
-      most. None, the default, chooses it in each step from the step size and the spectral radius.
-    - `spectral_radius`: the spectral radius of the field, or a bound on it (see
-      `cfjax.spectral_radius`): a number, or a function `(t, y, args)`. If it is too small, steps
-      are unstable, which error control sees. None, the default, estimates it with one power
-      iteration a step, and 30 at the start.
-    - `max_stages`: a step that needs more fails, before it evaluates a stage. Error control then
-      takes it again, shorter. In float32 use some 50, as rounding errors grow with the square of
-      the stages.
-
     Output within a step has order 2 and stays on the manifold. The last evaluation of a step is the
     first one of the next. Whatever the number of stages, a step keeps five arrays like the state:
     the state, the first field, two elements of the recursion and the point of an evaluation; what
@@ -78,11 +66,6 @@ class AbstractStabilised(AbstractChartSolver, diffrax.AbstractAdaptiveSolver):
     ones, as elements of parts and the middle of the step. An estimated radius takes one more.
     Reverse mode works by checkpoints; forward mode needs `stages`, as it has no rule for a loop
     whose length is chosen.
-
-    **Raises** `TypeError` or `ValueError` for an argument of another kind or value, or `stages`
-    together with `spectral_radius`. When the program is traced, `TypeError` for fields whose sums
-    grow, such as `cfjax.LowRankSkew`, for fields with an exact stiff part, such as `cfjax.Affine`,
-    and for terms that a path drives.
     """
 
     # Twice the index of the Gegenbauer polynomials.
@@ -326,6 +309,23 @@ class RKL2(_OneElement):
     Runge-Kutta-Legendre, for relative errors of some 1e-2 to 1e-3. The estimate comes at no extra
     cost. It is large where stiff parts are not smooth yet.
 
+    **Arguments:**
+
+    - `stages`: the number of stages of every step, at least 3; an odd number damps what is stiffest
+      most. None, the default, chooses it in each step from the step size and the spectral radius.
+    - `spectral_radius`: the spectral radius of the field, or a bound on it (see
+      `cfjax.spectral_radius`): a number, or a function `(t, y, args)`. If it is too small, steps
+      are unstable, which error control sees. None, the default, estimates it with one power
+      iteration a step, and 30 at the start.
+    - `max_stages`: a step that needs more fails, before it evaluates a stage. Error control then
+      takes it again, shorter. In float32 use some 50, as rounding errors grow with the square of
+      the stages.
+
+    **Raises** `TypeError` or `ValueError` for an argument of another kind or value, or `stages`
+    together with `spectral_radius`. When the program is traced, `TypeError` for fields whose sums
+    grow, such as `cfjax.LowRankSkew`, for fields with an exact stiff part, such as `cfjax.Affine`,
+    and for terms that a path drives.
+
     Source: Meyer, Balsara & Aslam, A stabilized Runge-Kutta-Legendre method for explicit
     super-time-stepping of parabolic and mixed equations, J. Comput. Phys. 257 (2014),
     doi:10.1016/j.jcp.2013.08.021; the estimate as in Sommeijer, Shampine & Verwer, RKC: an explicit
@@ -341,6 +341,8 @@ class RKG2(_OneElement):
 
     Runge-Kutta-Gegenbauer. It takes 1.2 times the stages of `RKL2`, and is stable in a wider region
     about the negative axis: for spectra with an imaginary part, as of advection or precession.
+
+    `stages`, `spectral_radius` and `max_stages` are those of `cfjax.RKL2`.
 
     Source: the recursion of `RKL2` with Gegenbauer polynomials of index 3/2; for these methods
     Skaras, Saxton, Meyer & Aslam, Super-time-stepping schemes for parabolic equations with boundary
@@ -366,6 +368,8 @@ class RKL3(AbstractStabilised):
     an action from the left. As `h^3 [F, F'] = -8 [v2, v1]`, the exact logarithm is this sum and
     `2/3 [v2, v1]`, up to `O(h^4)`. With `p + q = a`, `2 e = 1 - a` and `p - q = 4/3` the two flows
     have the sum and, as `u = v1 + v2 + O(h^3)`, the bracket `(p - q)/2 [v2, v1]`.
+
+    `stages`, `spectral_radius` and `max_stages` are those of `cfjax.RKL2`.
 
     Source: derived for this package; it was not found in print.
     """

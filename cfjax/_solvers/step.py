@@ -199,7 +199,7 @@ def begin_step(
     """The time of a step, NaN if the start was wrong, and the value of the field there, or None."""
     first = solver_state.first
     if solver_state.zero is not None:
-        # Of a weak type, if the time is.
+        # It has a weak type if the time has one.
         t0 = jnp.where(solver_state.zero == 0, t0, jnp.nan)
     if first is None or made_jump is False:
         return t0, first

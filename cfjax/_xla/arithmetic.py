@@ -73,7 +73,8 @@ def reduced(call: Call) -> StructOfArrays | None:
     aval: Any = call.eqn.outvars[0].aval
     is_lexicographic = jnp.issubdtype(aval.dtype, jnp.complexfloating)
     if name in _EXTREMES and (is_lexicographic or (positions and rows.shape[1] > 1)):
-        # Of all that are largest each has its share, in whichever column.
+        # Each of several largest entries has its share of the derivative, in whichever column it
+        # is.
         return None
     entries = x.entries
     if positions:
@@ -139,7 +140,7 @@ def transformed(call: Call) -> StructOfArrays | None:
 class _Factor(NamedTuple):
     """One side of a product, with its axes in the order that both agree on."""
 
-    # Of the entries: by batch, by row, by what is summed.
+    # The places of the entries: by batch, by row, by what is summed.
     places: np.ndarray
     entries: list[Any]
     # Whether the axes of the result that come of the row are short.

@@ -33,8 +33,8 @@ CALLS = {
     "custom_vmap_call": "call",
     "jit": "jaxpr",
 }
-# Those that are opened in what may be differentiated again; and where nothing is differentiated any
-# more, and rules for that are not needed either.
+# The calls that are opened in what may be differentiated again; and where nothing is differentiated
+# any more, so that no rule for a derivative is needed.
 OPENED = frozenset(("jit",))
 OPENED_LAST = OPENED | {"custom_jvp_call"}
 

@@ -109,7 +109,7 @@ def not_materialised(value: Any) -> Any:
         return _not_materialised(value)
     if isinstance(value, tuple) and any(isinstance(x, ClosedJaxpr) for x in value):
         new = map(not_materialised, value)
-        # Those of a linear solve have names.
+        # The programs of a linear solve are a named tuple.
         return value._make(new) if hasattr(value, "_make") else tuple(new)  # pyright: ignore[reportAttributeAccessIssue]
     return value
 
@@ -205,7 +205,7 @@ def _materialised_jvp(entries, tangents, **params):
 
 
 def _materialised_transpose(cts, *entries, **params):
-    # Of zeros all that comes before would be computed, too.
+    # The transpose of zeros would compute all that comes before, too.
     coming = [k for k, ct in enumerate(cts) if type(ct) is not ad.Zero]
     outs = _at(coming, cts, **params)
     return [x if k in coming else None for k, x in enumerate(outs)]

@@ -216,7 +216,7 @@ def _length_of(eqn: JaxprEqn) -> float:
 
 
 def num_turns(jaxpr: Jaxpr) -> int:
-    """Of the longest loop over stages, or 1."""
+    """The number of turns of the longest loop over stages, or 1."""
     calls = [eqn for eqn in jaxpr.eqns if eqn.primitive.name in OPENED_LAST]
     inner = [eqn.params[CALLS[eqn.primitive.name]].jaxpr for eqn in calls]
     loops = [eqn.params["length"] for eqn in jaxpr.eqns if eqn.primitive.name == "scan"]

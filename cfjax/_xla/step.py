@@ -57,7 +57,7 @@ step_p = Primitive("cfjax_step")
 step_p.multiple_results = True
 
 
-# Of a function of whole arrays, or of numbers, at primals, in some directions.
+# The tangents of a function of whole arrays, or of numbers, at primals, in some directions.
 
 
 def _tangents(fun, primals, tangents):

@@ -103,7 +103,7 @@ class Call(NamedTuple):
     eqn: JaxprEqn
     values: Sequence[Any]
     fixed: Sequence[bool]
-    # Of the results.
+    # The shapes of the results.
     shapes: Sequence[tuple[int, ...]]
     # Whether there are arrays that are not small.
     is_large: bool

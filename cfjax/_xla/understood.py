@@ -16,7 +16,7 @@ ELEMENTWISE = frozenset(
     "select_n sign sin sinh sqrt square stop_gradient sub tan tanh xor".split()
 )
 REDUCTIONS = frozenset("reduce_and reduce_max reduce_min reduce_or reduce_prod reduce_sum".split())
-# Those that only move entries.
+# Operations that only move entries.
 MOVES = frozenset(
     "broadcast_in_dim cfjax_pack cfjax_unpack concatenate dynamic_slice dynamic_update_slice "
     "gather pad reshape rev scatter slice split squeeze stack transpose".split()
@@ -51,8 +51,8 @@ _TEXTS: dict[str, str] = {
     **dict.fromkeys(REDUCTIONS, "axes out_sharding"),
 }
 _PARAMETERS = {name: frozenset(text.split()) for name, text in _TEXTS.items()}
-# Those that must be None. `x.at[i].apply(f)` has f in its scatter; in `scatter-add` it repeats what
-# the name says.
+# Parameters that must be None. `x.at[i].apply(f)` has f in its scatter; in `scatter-add` it repeats
+# what the name says.
 _NONE = frozenset((("reshape", "dimensions"), ("scatter", "update_jaxpr")))
 
 

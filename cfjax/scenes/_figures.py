@@ -10,7 +10,7 @@ if TYPE_CHECKING:
 # By its name, as few who import the package need matplotlib.
 Figure: TypeAlias = "matplotlib.figure.Figure"
 
-# Those of Okabe & Ito, which colour-blind readers tell apart.
+# The colours of Okabe & Ito, which colour-blind readers tell apart.
 BLUE, GREEN, ORANGE, VERMILION, PURPLE = "#0072B2", "#009E73", "#E69F00", "#D55E00", "#CC79A7"
 
 

@@ -61,9 +61,7 @@ def drop(n: int = 128) -> Float[np.ndarray, "n n"]:
 def field(t: Any, y: Phases, args: float | Float[Array | np.ndarray, ""]) -> cfjax.Affine:
     """The frozen field, with the width w of a front as `args`."""
     transform = cfjax.TensorTransform([cfjax.CosineTransform()] * y.ndim)
-    return cfjax.Affine(
-        1.0, y - y**3, args**2 * jnp.asarray(_laplacian(y.shape), y.dtype), transform
-    )
+    return cfjax.Affine(y - y**3, args**2 * jnp.asarray(_laplacian(y.shape), y.dtype), transform)
 
 
 def velocity(t: Any, y: Phases, args: float | Float[Array | np.ndarray, ""]) -> Phases:

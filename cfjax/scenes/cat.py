@@ -218,7 +218,7 @@ def picture() -> figures.Figure:
 
 
 def _amplitudes(amplitude: complex | float, levels: int) -> Complex[np.ndarray, " n"]:
-    """Those of a coherent field, but for the norm."""
+    """The amplitudes of a coherent field, but for the norm."""
     factors = amplitude / np.sqrt(np.arange(1.0, levels))
     return np.cumprod(np.concatenate([[1.0 + 0.0j], factors]))
 

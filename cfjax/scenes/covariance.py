@@ -52,7 +52,7 @@ class Track(NamedTuple):
 
     # Angle per time, of the ship about the radar.
     rate: Any = np.pi / 30
-    # Of the velocity.
+    # Rates at which the velocity decays.
     drag_across: Any = 1.0
     drag_along: Any = 0.05
     noise: Any = 0.004

@@ -79,12 +79,12 @@ def reference(t: float, k: float = 1.0, start: State | None = None) -> cfjax.Var
 
 
 def density_of_heights(t: Any, height: Any, k: float = 1.0) -> Any:
-    """That of unit vectors at time `t`, if it is uniform at time zero, over the uniform one."""
+    """The density of unit vectors at time `t`, over the uniform one, which it is at time zero."""
     return (np.cosh(k * t) - height * np.sinh(k * t)) ** -2
 
 
 def density_of_angles(t: Any, angle: Any, k: float = 1.0) -> Any:
-    """That of rotations at time `t`, if it is Haar's measure at time zero, over that measure."""
+    """The density of rotations at time `t`, over Haar's measure, which it is at time zero."""
     before = 2 * np.arctan(np.exp(k * t) * np.tan(angle / 2))
     return np.exp(_log_weight(before) - _log_weight(angle))
 
@@ -290,5 +290,5 @@ def _rotation(angle: float, axis: Any = (2 / 3, -1 / 3, 2 / 3)) -> np.ndarray:
 
 
 def _log_weight(angle: Any) -> Any:
-    """Of the sine of the angle and the square of that of its half."""
+    """The logarithm of sin(angle) sin(angle / 2)^2."""
     return np.log(np.sin(angle)) + 2 * np.log(np.sin(angle / 2))

@@ -37,7 +37,7 @@ from ._scene import by_dop853, by_name, in_plain_space, solve
 t0, t1 = 0.0, 100.0
 solver = cfjax.ETD54()
 
-# Of u and v, with the keys "u" and "v".
+# The concentrations u and v, with the keys "u" and "v".
 State = dict[str, Float[Array | np.ndarray, "n n"]]
 
 
@@ -67,7 +67,7 @@ def field(t: Any, y: State, args: Reactor) -> dict[str, cfjax.Affine]:
     turns = jnp.asarray(np.add.outer(k[0] ** 2, k[1] ** 2), y["u"].dtype)
     laplacian = -((2 * np.pi / args.side) ** 2) * turns
     return {
-        name: cfjax.Affine(1.0, rate, diffusivity * laplacian, transform)
+        name: cfjax.Affine(rate, diffusivity * laplacian, transform)
         for (name, rate), diffusivity in zip(
             reaction(y, args).items(), args.diffusivities, strict=True
         )

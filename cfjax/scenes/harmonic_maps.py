@@ -34,7 +34,7 @@ from . import _figures as figures
 from ._scene import by_dop853, by_name, in_plain_space
 
 t0, t1 = 0.0, 100.0
-# Of the methods for large relaxation the one for errors of 1e-2 to 1e-3.
+# The method for large relaxation and errors of 1e-2 to 1e-3.
 solver = cfjax.RKL2()
 
 Spins = Float[Array | np.ndarray, "*sides 3"]

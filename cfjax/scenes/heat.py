@@ -57,7 +57,7 @@ def field(t: Any, y: Float[Array, " n"], args: Diffusivity) -> cfjax.Affine:
     second_difference = -(((n + 1) * np.sin(k * np.pi / (2 * (n + 1)))) ** 2)
     mu, constant = jnp.asarray(args.mu), jnp.asarray(args.constant)
     b = _operator(mu - constant, to_grid(y))
-    return cfjax.Affine(1.0, from_grid(b), constant * jnp.asarray(second_difference, y.dtype))
+    return cfjax.Affine(from_grid(b), constant * jnp.asarray(second_difference, y.dtype))
 
 
 def grid_field(t: Any, u: Float[Array, " n"], args: Diffusivity) -> Float[Array, " n"]:

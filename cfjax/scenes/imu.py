@@ -143,7 +143,7 @@ def picture(num_samples: int = 4000) -> figures.Figure:
     ends.plot(*middle, "ko", markersize=13, fillstyle="none", label="mean of the samples")
     squares, axes = np.linalg.eigh(covariance(t1, args))
     angle = np.degrees(np.arctan2(axes[1, 1], axes[0, 1]))
-    # Of a Gaussian in the plane 95 % is within sqrt(-2 log 0.05) standard deviations.
+    # 95 % of a Gaussian in the plane is within sqrt(-2 log 0.05) standard deviations.
     short, long = 2 * np.sqrt(-2 * np.log(0.05) * squares)
     style = dict(fill=False, color=figures.PURPLE, linewidth=1.5, label="Gaussian in x and y, 95 %")
     ends.add_patch(Ellipse(means[-1], long, short, angle=angle, **style))
@@ -156,7 +156,7 @@ def picture(num_samples: int = 4000) -> figures.Figure:
 
 
 def _matrices(args: Readings) -> list[np.ndarray]:
-    """Those of the motion and of the three noises."""
+    """The matrices of the motion and of the three noises."""
 
     def matrix(omega: float, x: float, y: float) -> np.ndarray:
         return np.array([[0.0, -omega, x], [omega, 0.0, y], [0.0, 0.0, 0.0]])

@@ -56,7 +56,7 @@ def field(t: Any, y: Coefficients, args: float | Float[Array | np.ndarray, ""]) 
     square = jnp.fft.rfft(to_grid(y) ** 2, norm="forward")
     is_kept = 3 * np.arange(len(k)) < 2 * (len(k) - 1)
     half = jnp.where(is_kept, k / 2, 0)
-    return cfjax.Affine(1.0, lax.complex(half * square.imag, -half * square.real), k**2 - k**4)
+    return cfjax.Affine(lax.complex(half * square.imag, -half * square.real), k**2 - k**4)
 
 
 def velocity(

@@ -54,7 +54,7 @@ def barenblatt(t: float, n: int = 64, side: float = SIDE) -> Float[np.ndarray, "
 
 
 def centres(n: int = 64, side: float = SIDE) -> Float[np.ndarray, " n"]:
-    """Of the cells along an axis, from the middle of the square."""
+    """The centres of the cells along an axis, from the middle of the square."""
     return side * ((np.arange(n) + 0.5) / n - 0.5)
 
 

@@ -229,7 +229,7 @@ SCHEMES: dict[str, Callable[[Samples, Pose], Pose]] = {
 def errors(
     scheme: Callable[[Samples, Pose], Pose], rate: int, start: float = 2.0, duration: float = 1.0
 ) -> tuple[float, float, float]:
-    """Of angle, velocity and position after a window, with `rate` samples in a unit of time."""
+    """The errors of angle, velocity and position after a window, with `rate` samples a unit."""
     # A program that runs once.
     with cfjax.rewriting(False):
         y = np.asarray(jax.jit(scheme)(samples(start, duration, rate), y0(start)))
@@ -281,7 +281,7 @@ def picture() -> figures.Figure:
         turn = cfjax.quaternion_to_matrix(jnp.asarray(ys.state[k, :4]), layout="wxyz")
         p = turn @ ys.covariance[k, 6:, 6:] @ turn.T
         squares, axes = np.linalg.eigh(np.asarray(p))
-        # Of a Gaussian in space 95 % is within sqrt(7.815) standard deviations.
+        # 95 % of a Gaussian in space is within sqrt(7.815) standard deviations.
         stretch = axes * np.sqrt(7.815 * np.maximum(squares, 0))
         surface = np.einsum("ij,jkl->ikl", stretch, unit) + ys.state[k, 7:, None, None]
         flight.plot_surface(*surface, color=figures.BLUE, alpha=0.25, linewidth=0)

@@ -176,7 +176,7 @@ def picture(side: int = 64, time: float = 120.0) -> figures.Figure:
     for ax, (solver, step, colour) in zip((left, middle, None, None), runs, strict=True):
         signal, energies = run(start, waves, step, round(time / step), solver)
         name = f"{type(solver).__name__}, steps of {step:g}"
-        # Of the energy that the waves have: aligned spins have two bonds each.
+        # Relative to the energy of the waves: aligned spins have two bonds each.
         change = np.maximum.accumulate(np.abs(energies - before)) / (before + 2)
         times = step * np.arange(1, len(change) + 1)
         right.loglog(times, np.where(change > 0, change, np.nan), color=colour, label=name)

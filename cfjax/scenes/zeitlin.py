@@ -43,7 +43,7 @@ solver = cfjax.CF4()
 def y0(n: int = 32, seed: int = 0, degree: int = 6) -> Complex[np.ndarray, "N N"]:
     """Random vorticity of mean square one, with harmonics up to `degree`: the same for every n."""
     real, imaginary = np.random.default_rng(seed).normal(size=(2, degree + 1, degree + 1))
-    # Those of order 0 are real, and a fluid has no vorticity on the whole.
+    # Coefficients of order 0 are real, and a fluid has no vorticity on the whole.
     some = np.where(np.arange(degree + 1)[:, None] == 0, real / 2**0.5, (real + 1j * imaginary) / 2)
     coefficients = np.zeros((n, n), complex)
     coefficients[: degree + 1, 1 : degree + 1] = np.triu(some)[:, 1:]

@@ -895,7 +895,7 @@ def test_eight_devices(tmp_path, shape):
     process = start(8, tmp_path / "values.npy", shape, tmp_path / "chunks")
     _, error = process.communicate(timeout=300)
     assert process.returncode == 0, error
-    # Of eight members instead of five.
+    # The batch has eight members instead of five.
     assert len(list((tmp_path / "chunks").glob("chunk_*.bin"))) == 3
     check_against_one_device(tmp_path / "values.npy")
 

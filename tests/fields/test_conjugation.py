@@ -186,7 +186,7 @@ class Plain(Conjugation):
 
 
 def drift(cls, a, x):
-    """Of the spectrum over 10^4 steps, relative, for each of a batch."""
+    """The relative drift of the spectrum over 10^4 steps, for each of a batch."""
     term = cfjax.LieTerm(lambda t, y, args: cls((1 + 0.3 * jnp.sin(t)) * args))
     sol = cfjax.integrate(term, cfjax.LieEuler(), 0.0, 1e4, x, a, num_steps=10_000)
     ends = [np.sort(np.real(np.linalg.eigvals(y)), axis=1) for y in (x, np.asarray(sol.ys[-1]))]
@@ -384,7 +384,7 @@ def test_leading_axes_of_one_are_broadcast():
         (
             lambda: Conjugation(np.eye(3)).bracket(Congruence(np.eye(3))),
             TypeError,
-            "Conjugation has a bracket with another Conjugation only, got Congruence",
+            "Cannot compute the bracket of Conjugation and Congruence: both must be of one class",
         ),
         (
             lambda: cfjax.combine((1.0, 1.0), (Conjugation(np.eye(3)), Congruence(np.eye(3)))),

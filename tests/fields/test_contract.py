@@ -43,7 +43,8 @@ class Case(NamedTuple):
     sizes: tuple[float, ...] = SKEW_SIZES
     # Whether the point may be any, so that there is a derivative in it.
     is_free: bool = True
-    # Of the flow itself; where a field is frozen at the point, a second flow starts from another.
+    # Whether the flow itself is one; where a field is frozen at the point, a second flow starts
+    # from another.
     is_group: bool = True
     has_bracket: bool = True
 
@@ -124,7 +125,7 @@ def operators(dtype):
     return [OPERATORS[0].astype(dtype), (lx.FunctionLinearOperator(from_neighbour, vector), 1.0)]
 
 
-# Of norm one, as are the directions of the other cases.
+# It has norm one, as have the directions of the other cases.
 SPECTRUM = -np.array([0.0, 0.4, 0.4, 1.0])
 CASES = {
     "Rotation": Case(
@@ -352,7 +353,7 @@ CASES = {
         has_bracket=False,
     ),
     "Affine": Case(
-        lambda alpha, b: cfjax.Affine(alpha, b, SPECTRUM.astype(b.dtype)),
+        lambda alpha, b: cfjax.Affine(b, SPECTRUM.astype(b.dtype), alpha=alpha),
         lambda: unit(alpha=np.abs(normal()), b=normal(4)),
         normal(4),
         lambda x, alpha, b: (alpha * np.diag(SPECTRUM).astype(LONG), b),
@@ -509,14 +510,14 @@ def test_flow_and_derivatives(name):
         where = f"{name} at {size}"
         np.testing.assert_allclose(got[0][k], want.astype(got[0].dtype), 0, 8 * unit, err_msg=where)
         first_, second_ = derivatives(case, *at, rate)
-        # Of a derivative by differences, and of some units of rounding.
+        # The errors of a derivative by differences, and of some units of rounding.
         atol = 2e-11 * norm + 64 * unit
         np.testing.assert_allclose(got[1][k], first_.astype(got[1].dtype), 0, atol, err_msg=where)
         np.testing.assert_allclose(
             got[2][k], second_.astype(got[2].dtype), 0, 4 * atol, err_msg=where
         )
         paired = np.sum(np.asarray(got[1][k]) * cotangents[k])
-        # Of a field that conjugates its coordinates only the real parts agree.
+        # Only the real parts agree for a field that conjugates its coordinates.
         np.testing.assert_allclose(got[3][k].real, paired.real, 0, 200 * unit, err_msg=where)
 
 

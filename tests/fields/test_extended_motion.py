@@ -302,13 +302,13 @@ def extended(frame: Any = "body", layout: Any = "wxyz_v_p", dtype=np.float64, **
         (
             lambda: cfjax.bracket(extended(), extended("fixed")),
             ValueError,
-            "has a bracket with a motion of the same frame and layout only, got frame='body', "
+            "two ExtendedMotions: both must have the same frame and layout, got frame='body', "
             "layout='wxyz_v_p' and frame='fixed', layout='wxyz_v_p'",
         ),
         (
             lambda: extended().bracket(cfjax.Rotation(np.ones(3))),
             TypeError,
-            "ExtendedMotion has a bracket with another ExtendedMotion only, got Rotation",
+            "Cannot compute the bracket of ExtendedMotion and Rotation: both must be of one class",
         ),
     ],
 )

@@ -25,7 +25,7 @@ def random(shape, seed, dtype: type = np.float64):
 
 
 def matrix(kind, norm, dtype: type = np.float64):
-    """Of the given norm, as the field takes it."""
+    """A matrix of the given norm, as the field takes it."""
     a = random((N, N), 0, dtype)
     if kind == "skew":
         a = a - a.conj().T
@@ -50,7 +50,7 @@ def increment(field, point):
 
 
 def test_which_points_are_thin():
-    """Those that products with the matrix move. The dense exponential is two parts, and only these
+    """Products with the matrix move thin points. The dense exponential is two parts, and only these
     are multiplied with a point that is not thin.
     """
 

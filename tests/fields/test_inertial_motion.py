@@ -136,7 +136,7 @@ def test_promises(kind, axes):
 
 
 def test_brackets_are_commutators():
-    """Of both matrices; the bracket of two plain motions has shifts, and no gravity or time."""
+    """As of both matrices; the bracket of two plain motions has shifts, and no gravity or time."""
     a, b = (0.3 * AXIS, FORCE, GRAVITY, 1.0), (-FORCE, AXIS, FORCE, 0.25)
     found = imu(*a).bracket(imu(*b))
     a, b = ((*x, np.zeros(3), np.zeros(3)) for x in (a, b))
@@ -184,7 +184,7 @@ def test_constant_readings_are_exact_in_one_step(kind):
         ends = [scipy.linalg.expm(7 * part(*coordinates)) for part in (from_left, from_right)]
         want, found = ends[0] @ MATRIX @ ends[1], sol.ys[-1]
         found = to_matrix(np.asarray(found)) if kind == "vector" else found
-        # Of numbers of 40, with an angle of 14.
+        # The numbers are 40, with an angle of 14.
         np.testing.assert_allclose(found, want, rtol=0, atol=40 * 40 * EPS)
 
 
@@ -426,13 +426,13 @@ def ones(layout: Any = "wxyz_v_p", dtype=np.float64, **shapes):
         (
             lambda: ones().bracket(ones(layout="p_v_wxyz")),
             ValueError,
-            "has a bracket with a motion of the same layout only, got layout='wxyz_v_p' and "
+            "two InertialMotions: both must have the same layout, got layout='wxyz_v_p' and "
             "layout='p_v_wxyz'",
         ),
         (
             lambda: ones().bracket(cfjax.Rotation(np.ones(3))),
             TypeError,
-            "InertialMotion has a bracket with another InertialMotion only, got Rotation",
+            "Cannot compute the bracket of InertialMotion and Rotation: both must be of one class",
         ),
     ],
 )

@@ -40,7 +40,7 @@ def lower(n):
 
 
 def hermitian(n, seed=0):
-    """Of 2-norm 1."""
+    """A Hermitian matrix of 2-norm 1."""
     x = random((n, n), seed, complex)
     x = x + x.conj().T
     return x / max(np.linalg.norm(x, 2), 1e-300)
@@ -244,7 +244,7 @@ def test_a_negative_rate_is_computed_as_it_is(way, in_way):
 
 @pytest.mark.parametrize("kind", ["coherent", "damped", "pumped"])
 def test_the_bounds_of_the_numerical_range(kind):
-    """Of the operator on Hermitian and other matrices, in the Hilbert-Schmidt product."""
+    """The operator acts on Hermitian and other matrices, with the Hilbert-Schmidt product."""
     n = 4
     for seed in range(20):
         h = hermitian(n, seed) * (3.0 if kind == "coherent" else 0.1) + 5 * np.eye(n)
@@ -416,7 +416,7 @@ def test_order_2_is_completely_positive_with_every_rate(solver):
         assert_completely_positive(step(t0, t0 + h)[:1])
 
 
-# Of the worst step from 0 to 4, for a rate that touches zero: measured.
+# The worst step from 0 to 4, for a rate that touches zero: measured.
 LOSSES = {
     "CF4": (cfjax.CF4(), {10: -1.4e-7, 20: -1.4e-8, 40: -3.4e-10}),
     "CF43": (cfjax.CF43(), {10: -2.1e-9, 20: -2.5e-10}),
@@ -563,7 +563,7 @@ def test_a_coherent_state_stays_coherent_under_loss():
     steady = -1j * e / rate
     alpha = steady + (start - steady) * np.exp(-rate * t)
     found = flow_for(t, h, [a], [kappa], coherent(start, n))
-    # Of a norm of some 200.
+    # The norm is some 200.
     np.testing.assert_allclose(found, coherent(alpha, n), rtol=0, atol=2e-14)
 
 
@@ -732,7 +732,7 @@ def saved(solver, ts, args):
     ).ys
 
 
-# That of `diffrax`.
+# The warning is that of `diffrax`.
 @pytest.mark.slow
 @pytest.mark.filterwarnings("ignore:Complex dtype support")
 @pytest.mark.representatives(1)
@@ -776,7 +776,7 @@ def solve(field, rho, args=None, solver: Any = None, num_steps=5):
 
 @pytest.mark.parametrize("n", [3, 6])
 def test_leading_axes(n):
-    """Of everything, of jumps or not; axes of 1 are broadcast."""
+    """Everything has leading axes, jumps too or not; axes of 1 are broadcast."""
     h = np.stack([hermitian(n, k) for k in range(3)])
     jumps = np.stack([L2_of(n) * s for s in (1, 0.5, 1j)]), lower(n)
     rates = np.array([[0.3, 0.1], [0.2, 0.4], [0.0, 0.1]])
@@ -842,7 +842,7 @@ def test_a_product_state_with_a_rotation():
     start = {"rho": density(2), "spin": jnp.array([1.0, 0.5, -0.3])}
     want = reference(ode, 0, 1, np.concatenate([np.ravel(start["rho"]), start["spin"]]))
     found = cfjax.integrate(cfjax.LieTerm(field), cfjax.CF4(), 0.0, 1.0, start, num_steps=40).ys
-    # Of order 4, (1/40)^4.
+    # The error is of order 4, (1/40)^4.
     np.testing.assert_allclose(np.ravel(found["rho"][-1]), want[:4], rtol=0, atol=1e-7)
     np.testing.assert_allclose(found["spin"][-1], np.real(want[4:]), rtol=0, atol=1e-7)
 

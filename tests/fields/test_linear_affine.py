@@ -220,7 +220,7 @@ def test_leading_axes_of_one_are_broadcast():
         (
             lambda: LinearAffine(np.eye(3), np.ones(3)).bracket(cfjax.LeftMatrix(np.eye(3))),
             TypeError,
-            "LinearAffine has a bracket with another LinearAffine only, got LeftMatrix",
+            "Cannot compute the bracket of LinearAffine and LeftMatrix: both must be of one class",
         ),
     ],
 )

@@ -151,7 +151,7 @@ def test_rounding_does_not_grow_whatever_the_angle(name):
 
 @pytest.mark.parametrize("angle", [4.0, 7.0])
 def test_lengths_in_other_methods(angle):
-    """Of a fast spin, for which one flow turns a quaternion by more than half a turn."""
+    """One flow of a fast spin turns a quaternion by more than half a turn."""
     field = lambda t, q, args: quaternion("body", "wxyz")(angle, q)  # noqa: E731
     y0 = jnp.asarray(Q)
     for solver in (cfjax.CF4(), cfjax.Magnus2(), cfjax.ImplicitMidpoint()):

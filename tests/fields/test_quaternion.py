@@ -426,7 +426,9 @@ def test_kinds_are_not_mixed():
     with pytest.raises(TypeError, match="must agree in all but arrays"):
         cfjax.integrate(terms, cfjax.CF4(), 0.0, 1.0, Q, num_steps=1)
     for other in (fields[1], fields[2], cfjax.Rotation(np.ones(3))):
-        with pytest.raises(TypeError, match="of the same frame and layout only, got"):
+        with pytest.raises(
+            TypeError, match="must be a QuaternionRotation of the same frame and layout"
+        ):
             cfjax.bracket(fields[0], other)
 
 

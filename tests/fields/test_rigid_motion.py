@@ -283,7 +283,7 @@ def test_layouts():
         # The same operations, which the compiler may join otherwise, on numbers of size 3.
         for got, want in zip(ends, found[first, frame][0], strict=True):
             np.testing.assert_allclose(got, want, rtol=0, atol=10 * EPS)
-        # Of (q_0 + 0.1)^2 - q_0^2, to rounding.
+        # The defect is (q_0 + 0.1)^2 - q_0^2, to rounding.
         want = abs(0.2 * POSES[3 if len(LAYOUTS[layout]) == 7 else 2][0] + 0.01)
         np.testing.assert_allclose(off, want, rtol=0, atol=10 * EPS)
 
@@ -472,7 +472,7 @@ NO_LAYOUT = (
         (
             lambda: cfjax.bracket(rigid("body"), rigid("fixed")),
             ValueError,
-            "with a motion of the same frame and layout only, got frame='body', "
+            "both must have the same frame and layout, got frame='body', "
             "layout='wxyz_xyz' and frame='fixed', layout='wxyz_xyz'",
         ),
         (
@@ -518,7 +518,7 @@ NO_LAYOUT = (
         (
             lambda: planar().bracket(cfjax.Rotation(np.ones(3))),
             TypeError,
-            "PlanarMotion has a bracket with another PlanarMotion only, got Rotation",
+            "Cannot compute the bracket of PlanarMotion and Rotation: both must be of one class",
         ),
     ],
 )

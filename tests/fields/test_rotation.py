@@ -226,7 +226,7 @@ def test_wrong_point(shape):
 
 
 def test_bracket_with_another_class():
-    text = "Rotation has a bracket with another Rotation only, got LeftMatrix"
+    text = "Cannot compute the bracket of Rotation and LeftMatrix: both must be of one class"
     with pytest.raises(TypeError, match=text):
         Rotation(np.ones(3)).bracket(cfjax.LeftMatrix(np.eye(3)))
 

@@ -37,7 +37,7 @@ def test_every_entry_is_relatively_accurate(dtype, point_dtype):
     rate = (LARGEST[str(info.dtype)] * RATES).astype(dtype)
     if np.iscomplexobj(rate):
         rate += (1j * np.linspace(-30, 30, len(rate))).astype(dtype)
-    # Of all sizes from 1e-3 to 1e3, and of both signs.
+    # The entries have all sizes from 1e-3 to 1e3, and both signs.
     point = (10.0 ** np.linspace(-3, 3, len(rate)) * (-1) ** np.arange(len(rate))).astype(dtype)
     if point_dtype.startswith("complex"):
         point = (point * np.exp(1j * np.arange(len(rate)))).astype(point_dtype)
@@ -195,7 +195,7 @@ def test_a_munthe_kaas_method_acts_on_logarithms(solver):
         (
             lambda: Scaling(np.ones(3)).bracket(cfjax.LeftMatrix(np.eye(3))),
             TypeError,
-            "Scaling has a bracket with another Scaling only, got LeftMatrix",
+            "Cannot compute the bracket of Scaling and LeftMatrix: both must be of one class",
         ),
     ],
 )
@@ -233,7 +233,7 @@ def soliton(t):
 TERMS = diffrax.MultiTerm(
     cfjax.LieTerm(lambda t, psi, args: Scaling(1j * (jnp.abs(psi) ** 2).astype(psi.dtype))),
     cfjax.LieTerm(
-        lambda t, psi, args: cfjax.Affine(1.0, jnp.zeros_like(psi), KINETIC, FOURIER),
+        lambda t, psi, args: cfjax.Affine(jnp.zeros_like(psi), KINETIC, FOURIER),
     ),
 )
 

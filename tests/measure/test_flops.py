@@ -279,7 +279,7 @@ class Reversed(cfjax.AbstractTransform):
 def test_transforms_of_a_step_of_affine_fields(solver, transforms):
     def flops(transform):
         def field(t, y, args):
-            return cfjax.Affine(1.0, jnp.sin(y) + t, -jnp.arange(8.0), transform)
+            return cfjax.Affine(jnp.sin(y) + t, -jnp.arange(8.0), transform)
 
         term, y0 = cfjax.LieTerm(field), jnp.ones(8)
         state = eqx.filter_jit(solver.init)(term, 0.0, 0.1, y0, None)

@@ -313,7 +313,7 @@ def test_stored_orders_are_those_that_the_conditions_prove(solver):
 
 def test_orders_are_stored_where_a_proof_takes_long():
     assert {cfjax.CG5, cfjax.YRK135, cfjax.CF54, cfjax.ETD54} <= set(STORED)
-    # Of others they are proved.
+    # The orders of others are proved.
     assert cfjax.CommutatorFree(changed(CG5, (4, 0, 2), 1e-10)).order(None) < 5
 
 
@@ -480,7 +480,7 @@ def test_the_order_conditions_of_the_continuous_extension(name):
 
 @pytest.mark.parametrize("name", MUNTHE_KAAS)
 def test_the_order_conditions_in_the_algebra(name):
-    """Those of continuous Runge-Kutta methods, tree by tree, at every stage by recursion."""
+    """The conditions of continuous Runge-Kutta methods, for each tree and stage by recursion."""
     solver, order = MUNTHE_KAAS[name].make(), MUNTHE_KAAS[name].output
     a = solver.a[: len(solver.b)]
     (powers,), more, times = runge_kutta_extension(a, solver.b, solver.order(None))

@@ -120,8 +120,8 @@ def test_output_is_of_order_one_less(solver):
         (lambda T: T([0, 1], {2: {2: {1: 1}}}, {}), r"a\[2\] must have columns 2 to 1, got column"),
         (lambda T: T([0, 1], {3: {}}, {}), "a must have rows of stages 2 to 2, got row 3"),
         (lambda T: T([0, 1], {}, {2: {6: 1}}), r"b\[2\] must be made of phi_1 to phi_5, got phi_6"),
-        (lambda T: T([0, 1], {}, {2: {(2, HALF): 1}}), "b must be made of phi_2"),
-        (lambda T: T([0, 1], {}, {2: {1: 1}}), "b must be made of phi_2"),
+        (lambda T: T([0, 1], {}, {2: {(2, HALF): 1}}), "b must be made only of phi_2"),
+        (lambda T: T([0, 1], {}, {2: {1: 1}}), "b must be made only of phi_2"),
         (lambda T: T([0, 1], {}, {3: {2: 1}}), "b must have columns 2 to 2, got column 3"),
     ],
 )

@@ -96,12 +96,12 @@ def test_the_sum_of_two_affine_fields_keeps_their_operator(solver):
     directions = np.array([[1.0, -0.5, 0.3], [0.2, 0.8, -1.0]])
 
     def kick(k):
-        return lambda t, y, args, dw: cfjax.Affine(dw[k], directions[k] * dw[k], spectrum)
+        return lambda t, y, args, dw: cfjax.Affine(directions[k] * dw[k], spectrum, alpha=dw[k])
 
     both = [cfjax.LieControlTerm(kick(k), GIVEN) for k in (0, 1)]
 
     def joined(t, y, args, dw):
-        return cfjax.Affine(dw[0] + dw[1], dw @ jnp.asarray(directions), spectrum)
+        return cfjax.Affine(dw @ jnp.asarray(directions), spectrum, alpha=dw[0] + dw[1])
 
     expected = step(solver, cfjax.LieControlTerm(joined, GIVEN))
     close(step(solver, diffrax.MultiTerm(*both)), expected)
@@ -255,7 +255,7 @@ def test_noise_there_and_back(way):
 
     there = solve(0.0, 1.0, Y0)
     assert np.linalg.norm(there - Y0) > 0.3
-    # Of steps of 1/16 all times are exact, so what is left is the rounding of 64 flows.
+    # All times are exact with steps of 1/16, so what is left is the rounding of 64 flows.
     close(solve(1.0, 0.0, there), Y0, atol=1e-14)
 
 
@@ -410,7 +410,8 @@ def test_the_gradient_of_a_path(solver, options):
     gradient = jax.jit(jax.grad(loss), compiler_options=problems.QUICK)(x)
     direction = problems.random_like(x, 1)
     difference = problems.central_difference(jax.jit(loss), x, direction, 1e-3)
-    # Of order 4: a fifth derivative of some 1e4 times 1e-12 / 30, and rounding of 1e-16 / 1e-3.
+    # The difference has order 4: a fifth derivative of some 1e4 times 1e-12 / 30, and rounding of
+    # 1e-16 / 1e-3.
     close(problems.inner(gradient, direction), difference, atol=1e-9)
 
 
@@ -542,7 +543,7 @@ def test_ito_and_stratonovich_marks_and_strong_orders():
     assert isinstance(cfjax.LieEuler(), diffrax.AbstractItoSolver)
     assert not isinstance(cfjax.LieEuler(), diffrax.AbstractStratonovichSolver)
     assert not isinstance(cfjax.Magnus4(), diffrax.AbstractStratonovichSolver)
-    # Of ordinary equations as ever.
+    # Ordinary equations have the same orders as ever.
     assert cfjax.CF43().error_order(ode) == 4
     assert cfjax.CF4().order(ode) == 4
     assert cfjax.WeakOrder2(cfjax.RKMK8()).order(term) == 8

@@ -45,7 +45,7 @@ def copies(y: Any, number: int) -> jax.Array:
 def assert_mean(samples: Any, expected: Any, weak_error: float) -> None:
     samples = np.asarray(samples)
     mean, n = samples.mean(0), len(samples)
-    # Of complex numbers the deviation is that of both parts.
+    # The deviation of complex numbers is that of both parts.
     error = np.abs(mean - expected)
     allowed = 5 * samples.std(0) / np.sqrt(n) + weak_error
     assert np.all(error < allowed), (error, allowed)
@@ -304,7 +304,7 @@ def torques(t, y, amplitudes, dw):
 
 
 def amplitudes_of(inertia, h):
-    """Those with which the frozen flow of friction and noise has the exact law, for steps h."""
+    """The amplitudes with which the flow of friction and noise has the exact law, for steps h."""
     x = FRICTION * h / 2
     return np.sqrt(2 * FRICTION * HEAT * inertia * x / np.tanh(x))[None]
 

@@ -73,7 +73,7 @@ def test_one_channel_has_order_1_or_3_over_2(references, solver):
 
 
 def stratonovich_drift(t, y, args):
-    """That of the equation that is `drift` and `noise` in the sense of Itô in the frame."""
+    """The drift of the equation that is `drift` and `noise` in the sense of Itô in the frame."""
 
     def correction(channel):
         return jax.jvp(

@@ -103,7 +103,7 @@ def weak_errors(
     number: int = NODES,
     is_ito: bool = False,
 ) -> np.ndarray:
-    """Of the expectations of P_1 and P_3 of the height at the end, for each number of steps."""
+    """The errors of the mean P_1 and P_3 of the height at the end, for each number of steps."""
     at_start = legendre.legvander([START], degree)[0]
     exact = at_start @ expm(TIME * generator(slope, degree, is_ito))
     found = [
@@ -150,7 +150,7 @@ def test_a_step_along_the_chord_has_weak_order_1(solver):
 def test_weak_order_2(solver):
     for found in slopes(solver, 0.5):
         assert 1.85 < found < 2.15
-    # Those of `CF4` are 5e-4.
+    # The errors of `CF4` are 5e-4.
     assert np.all(np.abs(weak_errors(solver, STEPS, 0.5)[:, -1]) < 5e-5)
 
 

@@ -89,7 +89,7 @@ def test_half_turns():
     np.testing.assert_allclose(found, sign * HALF_TURNS, rtol=0, atol=4 * EPS)
     weights = jnp.array([0.3, -0.2, 0.5, 0.1])
     slope = jax.jit(jax.vmap(jax.grad(lambda m: from_matrix(m) @ weights)))(matrices)
-    # Of one side: the row of q q^T that is taken, divided by at least 2.
+    # A one-sided derivative: the row of q q^T that is taken, divided by at least 2.
     assert np.all(np.abs(slope) < 1)
 
 
@@ -269,7 +269,7 @@ def test_matrices_that_are_no_rotations():
     ):
         with pytest.raises(RuntimeError, match=message):
             quaternion_from_matrix(jnp.asarray(bad), layout="wxyz")
-        # Of the first matrix of `far` nothing is wrong.
+        # Nothing is wrong with the first matrix of `far`.
         assert np.isnan(from_matrix(bad)).all(axis=1).tolist() == [bad is not far, True]
     # The way out that the message names.
     u, _, vh = jnp.linalg.svd(jnp.asarray(far))

@@ -92,7 +92,7 @@ def test_derivatives(n, dtype):
     cases += [("phase", 1.0), ("double", 1.0), ("nilpotent", 2.0), ("general", 1.5)]
     a = np.stack([small(kind, n, norm, k, dtype) for k, (kind, norm) in enumerate(cases)])
     if not np.issubdtype(dtype, np.complexfloating):
-        # Of symmetric ones with a large norm exp grows.
+        # The exponential of symmetric ones with a large norm grows.
         keep = [k for k, (kind, norm) in enumerate(cases) if not (kind == "meet" and norm > 2)]
         cases, a = [cases[k] for k in keep], a[keep]
     d, w = (random((len(a), n, n), seed, dtype) / n for seed in (8, 9))
@@ -118,7 +118,7 @@ def test_derivatives(n, dtype):
 
 @pytest.mark.slow
 def test_derivatives_are_finite_beside_large_members():
-    """Of a batch that squares for one."""
+    """One member of the batch needs squaring."""
     a = np.stack([small("skew", 3, norm) for norm in (1e3, 0.0, 1e-200, 1.0, 1e6)])
     d = random(a.shape, 3, complex)
     assert all(np.isfinite(x).all() for x in derivatives(a, d, d))

@@ -95,7 +95,7 @@ def test_heat_with_a_variable_coefficient_is_exact_in_one_step(which):
     n, b = len(a), np.linspace(1, 2, len(a))
     spectrum, transform = cfjax.diagonalised(a)
     assert spectrum.dtype == np.float64 and spectrum.max() < 0
-    term = cfjax.LieTerm(lambda t, u, args: cfjax.Affine(1.0, jnp.asarray(b), args, transform))
+    term = cfjax.LieTerm(lambda t, u, args: cfjax.Affine(jnp.asarray(b), args, transform))
     u0 = 1 - np.abs(np.linspace(-1, 1, n + 2)[1:-1])
     found = cfjax.integrate(term, cfjax.CF4(), 0.0, 0.5, jnp.asarray(u0), spectrum, num_steps=1).ys[
         -1
@@ -114,7 +114,7 @@ def test_a_flow_of_a_matrix_that_is_not_normal(name):
     n = len(a)
     spectrum, transform = cfjax.diagonalised(a)
     b, u = (points((n,), kind == "complex", seed) for seed in (1, 2))
-    field = cfjax.Affine(0.3, b, spectrum, transform)
+    field = cfjax.Affine(b, spectrum, transform, alpha=0.3)
     whole = np.zeros((n + 1, n + 1), b.dtype)
     whole[:n, :n], whole[:n, n] = 0.3 * a, b
     wanted = (scipy.linalg.expm(whole) @ np.append(u, 1))[:n]
@@ -149,7 +149,7 @@ def test_one_axis_of_a_grid(name):
     operator = np.kron(m1, np.eye(len(m2))) + np.kron(np.eye(len(m1)), m2)
     b, u = (points((len(m1), len(m2)), False, seed) for seed in (1, 2))
     grid = cfjax.TensorTransform((t1, t2))
-    field = cfjax.Affine(0.1, b, np.add.outer(s1, s2), grid)
+    field = cfjax.Affine(b, np.add.outer(s1, s2), grid, alpha=0.1)
     size = b.size
     whole = np.zeros((size + 1, size + 1))
     whole[:size, :size], whole[:size, size] = 0.1 * operator, b.ravel()
@@ -167,7 +167,7 @@ def test_derivative_of_a_solve_with_respect_to_a_factor_of_the_spectrum():
 
     def loss(factor):
         def field(t, u, args):
-            return cfjax.Affine(1.0, u - u**3, args * spectrum, transform)
+            return cfjax.Affine(u - u**3, args * spectrum, transform)
 
         factor = factor.astype(complex)
         end = cfjax.integrate(
@@ -199,7 +199,7 @@ def test_float32(name):
         # Sums of n products, in vectors of a condition up to 400.
         np.testing.assert_allclose(back, x, rtol=0, atol=len(a) * 2.0**-23 * 100)
     b = jnp.ones(len(a), single)
-    term = cfjax.LieTerm(lambda t, u, args: cfjax.Affine(1.0, b, args, transform))
+    term = cfjax.LieTerm(lambda t, u, args: cfjax.Affine(b, args, transform))
     times = (np.float32(0), np.float32(0.1))
     end = cfjax.integrate(
         term, cfjax.CF4(), *times, x.astype(single), jnp.asarray(spectrum), num_steps=2
@@ -215,7 +215,7 @@ def test_batches_without_another_trace():
     def flows(transform, spectrum, points):
         nonlocal traces
         traces += 1
-        field = cfjax.Affine(0.1, jnp.ones(6), spectrum, transform)
+        field = cfjax.Affine(jnp.ones(6), spectrum, transform, alpha=0.1)
         return jax.vmap(field.flow)(points)
 
     u = jnp.asarray(points((3, 6), False))
@@ -225,13 +225,13 @@ def test_batches_without_another_trace():
     again, same = cfjax.diagonalised(a)
     np.testing.assert_array_equal(flows(same, again, u), found)
     assert traces == 1
-    field = cfjax.Affine(0.1, jnp.ones(6), spectrum, transform)
+    field = cfjax.Affine(jnp.ones(6), spectrum, transform, alpha=0.1)
     for x, y in zip(u, found, strict=True):
         np.testing.assert_allclose(field.flow(x), y, rtol=0, atol=20 * EPS)
     other = cfjax.diagonalised(a.T)[1]
     assert other != transform and hash(other) != hash(transform)
     with pytest.raises(ValueError, match="must have one operator"):
-        cfjax.combine((1.0, 1.0), (field, cfjax.Affine(0.1, jnp.ones(6), spectrum, other)))
+        cfjax.combine((1.0, 1.0), (field, cfjax.Affine(jnp.ones(6), spectrum, other, alpha=0.1)))
 
 
 def test_a_program_has_each_matrix_once():
@@ -268,7 +268,7 @@ def sheared(n, spread):
 
 def flow_of(spectrum, transform, dtype):
     """The matrix of the flow, with points of this dtype."""
-    field = cfjax.Affine(1.0, jnp.zeros(10, dtype), spectrum.astype(dtype), transform)
+    field = cfjax.Affine(jnp.zeros(10, dtype), spectrum.astype(dtype), transform)
     return jax.vmap(field.flow)(jnp.eye(10, dtype=dtype)).T
 
 

@@ -440,8 +440,8 @@ def test_the_rounding_of_the_rest_is_as_small_as_it_is(n, dtype):
         with mpmath.workdps(60):
             m = mpmath.matrix(x.tolist())
             exact = to_numpy(exact_expm(x) - mpmath.eye(n) - m)
-        # Those of c, and of one product, relative to the square of a, which for real skew matrices
-        # of size 2 is no smaller than the norm squared.
+        # The errors of c, and of one product, relative to the square of a, which for real skew
+        # matrices of size 2 is no smaller than the norm squared.
         atol = 8 * np.finfo(dtype).eps * np.linalg.norm(x) ** 2
         np.testing.assert_allclose(rest, exact, rtol=0, atol=atol)
 

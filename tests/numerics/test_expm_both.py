@@ -61,9 +61,9 @@ def test_coefficients_are_positive_so_nothing_cancels():
 def test_theta_of_both_is_where_the_backward_error_reaches_the_unit_roundoff(precision, unit):
     even, odd = of_rows(expm_both._EVEN), of_rows(expm_both._ODD)
     polynomial = [x for pair in zip(even, odd, strict=True) for x in pair]
-    # Those that are rounded count as exact: they are tested above.
+    # Rounded coefficients count as exact: they are tested above.
     c = backward_error(polynomial, 15)
-    # Of 1/16! as well.
+    # The coefficient 1/16! is right as well.
     assert c[16] < 1e-28
 
     def size(x):
@@ -141,14 +141,14 @@ def test_the_rest_of_both_is_as_small_as_the_square():
 
 @cache
 def derivatives_of_both():
-    """Of both along a direction: forward, and by reverse mode of a product."""
+    """The derivatives of both along a direction: forward, and by reverse mode of a product."""
 
     @jax.jit
     @jax.vmap
     def of(a, d, weight):
         pushed = jax.jvp(both, (a,), (d,))[1]
         pulled = jax.vjp(both, a)[1]((weight, weight))[0]
-        # Of sum(weight * both(t a)) twice by t, reverse over reverse.
+        # The second derivative of sum(weight * both(t a)) by t, reverse over reverse.
         value = lambda t: jnp.sum(weight * (sum(both(t * a))))  # noqa: E731
         return pushed, pulled, jax.grad(jax.grad(value))(1.0)
 
@@ -175,7 +175,7 @@ def test_derivatives_of_both():
         ]
         np.testing.assert_allclose(pulled[k], sum(exact), rtol=0, atol=2 * bound)
         twice = a[k] @ a[k] @ (scipy.linalg.expm(a[k]) + scipy.linalg.expm(-a[k]))
-        # Of size norm^2, nine entries.
+        # Nine entries of size norm^2.
         atol = 9 * bound * max(1, norm) ** 2
         np.testing.assert_allclose(second[k], np.sum(w[k] * twice), rtol=0, atol=atol)
 

@@ -94,8 +94,8 @@ LINEAR: dict[str, Any] = {
     # Linear, but not as far as the program shows.
     "unit vector": lambda y, a, dw: dw / jnp.linalg.norm(dw) * jnp.linalg.norm(dw),
     "matrix": lambda y, a, dw: cfjax.LeftMatrix(dw[0] * a * A),
-    "Affine": lambda y, a, dw: cfjax.Affine(dw[0], dw, DECAY),
-    "Affine, zero": lambda y, a, dw: cfjax.Affine(0.0, dw, DECAY, cfjax.SineTransform()),
+    "Affine": lambda y, a, dw: cfjax.Affine(dw, DECAY, alpha=dw[0]),
+    "Affine, zero": lambda y, a, dw: cfjax.Affine(dw, DECAY, cfjax.SineTransform(), alpha=0.0),
     "LinearAffine, zero": lambda y, a, dw: cfjax.LinearAffine(np.zeros((3, 3)), dw),
     "kept zeros": lambda y, a, dw: Kept(jnp.zeros((3, 3)))(0, y, a, dw),
     "operators": lambda y, a, dw: cfjax.OperatorSum(dw * a, [A, A - 1, A.T]),
@@ -107,7 +107,7 @@ DRIFTS: dict[str, Any] = {
     "Rotation": lambda y, a, dw: cfjax.Rotation(y * dw - y),
     "Rotation, of a parameter": lambda y, a, dw: cfjax.Rotation(dw - a * y),
     "alone": lambda y, a, dw: cfjax.Rotation(-y),
-    "Affine": lambda y, a, dw: cfjax.Affine(1.0, dw, DECAY),
+    "Affine": lambda y, a, dw: cfjax.Affine(dw, DECAY),
     "LinearAffine": lambda y, a, dw: cfjax.LinearAffine(-a * A, dw),
 }
 NOT_LINEAR: dict[str, Any] = {

@@ -49,5 +49,5 @@ def test_reverse_mode_keeps_as_much_however_long_the_loop_is():
 
     kept = jax.eval_shape(pulled, jnp.ones(size), jnp.asarray(3, jnp.int32))
     numbers = sum(leaf.size for leaf in jax.tree.leaves(kept))
-    # Of n^2 = 25 steps n carries, and a few numbers.
+    # It keeps n carries of n^2 = 25 steps, and a few numbers.
     assert numbers <= (n + 1) * size

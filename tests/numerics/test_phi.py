@@ -30,7 +30,7 @@ REAL = {"negative": -1, "positive": 1}
 
 def phi_1(z):
     """Where the flow of `x' = z x + 1` leads zero, entry by entry."""
-    return cfjax.Affine(1.0, jnp.ones_like(z), z).flow(jnp.zeros_like(z))
+    return cfjax.Affine(jnp.ones_like(z), z).flow(jnp.zeros_like(z))
 
 
 def exact(z, order):

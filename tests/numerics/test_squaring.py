@@ -56,7 +56,7 @@ def powers(a, s):
     return squared(a, lambda x: x, s)
 
 
-# Of products that fuse, and of a loop.
+# Sizes whose products fuse, and one with a loop.
 @pytest.mark.parametrize("n", [3, 6])
 def test_each_member_of_a_batch_is_squared_as_often_as_it_needs(n):
     a, s = random((5, n, n)), np.array([0, 1, 2, 5, 7])
@@ -79,7 +79,7 @@ def test_none_are_started_where_there_is_no_squaring():
 @pytest.mark.parametrize("n", [3, 6])
 @pytest.mark.parametrize("s", [0, 3, 6])
 def test_derivatives_of_powers(n, s):
-    """Of the trace of (t a)^m at t = 1, m = 2^s: m times itself, in both modes."""
+    """The trace of (t a)^m has the derivative m times itself at t = 1, m = 2^s, in both modes."""
     a = random((n, n))
     a = jnp.asarray(a / np.linalg.norm(a, 2))
 

@@ -24,7 +24,7 @@ from cfjax._paper import complexity, heat, rigid_body, stiefel
 
 
 def check_text(figure, num_panels):
-    """That no text is cut or covered."""
+    """Checks that no text is cut or covered."""
     FigureCanvasAgg(figure).draw()
     (caption,) = (text.get_window_extent() for text in figure.texts)
     panels = [box for axes in figure.axes if (box := axes.get_tightbbox()) is not None]

@@ -113,7 +113,7 @@ def test_order(args, t1, num_steps):
     start = covariance.y0()
     exact = covariance.reference(t1, start, args)
     errors = [np.abs(CF4(t1, n, start, args)[-1] - exact).max() for n in (num_steps, 2 * num_steps)]
-    # Of order 4: 16, and more where terms of the next order have not gone yet.
+    # Order 4 gives 16, and more where terms of the next order have not gone yet.
     assert 14 < errors[0] / errors[1] < 24
     assert errors[1] < 1e-6
 

@@ -97,7 +97,7 @@ def test_reference():
 
 
 def test_reference_solves_the_large_system():
-    # Of order 4 in time with steps of 1e-3 at t = 0.3, where rates up to 20 are left.
+    # Differences of order 4 in time with steps of 1e-3 at t = 0.3, where rates up to 20 are left.
     mu = np.asarray(heat.diffusivity(100).mu)
     u = heat.reference(0.3 + 1e-3 * np.arange(-2, 3), mu)
     slope = (u[0] - u[4] - 8 * (u[1] - u[3])) / 0.012
@@ -148,7 +148,7 @@ def test_grid_values_with_a_transform_give_the_same_steps(solver):
     def field(t, u, args):
         spectrum = heat.field(t, u, args).spectrum
         b = heat.grid_field(t, u, args._replace(mu=args.mu - args.constant))
-        return cfjax.Affine(1.0, b, spectrum, cfjax.SineTransform())
+        return cfjax.Affine(b, spectrum, cfjax.SineTransform())
 
     y0, args = jnp.asarray(heat.y0(20)), arguments(20)
     kwargs = dict(num_steps=20)

@@ -74,7 +74,7 @@ def test_rk4_at_its_limit():
 @pytest.mark.parametrize("ratio", [0.0, 0.5, 1.0, 1.5, 2.0, 2.5])
 @pytest.mark.parametrize("solver", [cfjax.LieEuler(), cfjax.CF2(), cfjax.CF3(), cfjax.CF4()])
 def test_linear_theory_is_a_real_step(solver, ratio):
-    """Of constant diffusivity `ratio * mu_c`, where every mode has `w = (ratio - 1) z`."""
+    """The diffusivity is constant, `ratio * mu_c`, where every mode has `w = (ratio - 1) z`."""
     n, constant = 20, 0.7
     args = heat.Diffusivity(jnp.full(n, ratio * constant), jnp.asarray(constant))
     y0 = jnp.ones(n - 1)

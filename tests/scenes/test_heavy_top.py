@@ -107,8 +107,8 @@ def turned(ys):
 
 
 def test_kovalevskayas_integral_does_not_change():
-    # Of her top, with inertia 2 : 2 : 1 and its centre of mass across the third axis, and of no
-    # other: it sees the signs of all that turns the body.
+    # Her top, with inertia 2 : 2 : 1 and its centre of mass across the third axis, has it, and no
+    # other does: it sees the signs of all that turns the body.
     args = heavy_top.Top(1.5, (1.4, 1.4, 0.7), (0.3, 0.0, 0.0), 9.81)
     mu = 1.5 * 9.81 * 0.3 / 0.7
 
@@ -132,7 +132,7 @@ def test_the_velocity_is_that_of_the_field():
     y = jax.tree.map(jnp.asarray, heavy_top.reference(0.1))
     want = cfjax.tangent(heavy_top.field(0.0, y, TOP), y)
     found = heavy_top.velocity(0.0, y, TOP)
-    # Of a rate of 75.
+    # The rate is 75.
     jax.tree.map(lambda a, b: np.testing.assert_allclose(a, b, 0, 1e-12), found, want)
 
 

@@ -75,7 +75,7 @@ def test_the_spot_against_dop853_and_barenblatt():
     assert want.sum() == pytest.approx(start.sum(), rel=1e-12)
     found = [end(start, 10.0, 10.0**-k) for k in (5, 7)]
     errors = [porous_medium.error(y, want) for y in found]
-    # Of values of 2e-2, in some twenty steps.
+    # The values are 2e-2, in some twenty steps.
     assert errors[0] < 3e-3 and errors[1] < 2e-4 and errors[1] < errors[0] / 4
     for y in found:
         assert y.sum() == pytest.approx(start.sum(), rel=1e-13)

@@ -19,7 +19,7 @@ def rotations(t):
 
 
 def test_readings_are_differences_of_the_path():
-    """Of angles between attitudes and of positions, by differences."""
+    """Angles between attitudes, and positions, give the readings by differences."""
     t, h = 3.3, 1e-3
     before, now, after = preintegration.reference(np.array([t - h, t, t + h]))
     omega, force = preintegration.readings(t)
@@ -120,7 +120,7 @@ def test_the_covariance_against_quadrature():
     for k in (80, 320):
         want = covariance_by_quadrature(times[k], args)
         scale = np.sqrt(np.outer(np.diag(want), np.diag(want)))
-        # Of a method of order 4 with steps of 1/20, in units of the standard deviations.
+        # The error of a method of order 4 with steps of 1/20, in units of the standard deviations.
         np.testing.assert_allclose(ys.covariance[k] / scale, want / scale, rtol=0, atol=1e-4)
 
 

@@ -41,7 +41,7 @@ def test_the_order_of_two_colours(solver, order):
 
 
 def test_the_energy_stays_at_every_step_size():
-    """Of spins in all directions, with steps up to a quarter of a turn."""
+    """Spins in all directions, with steps up to a quarter of a turn."""
     start = spins.y0(SIDE, SIDE)
     for step in (0.5, 1.0):
         end = end_of(start, 0.0, 40 * step)

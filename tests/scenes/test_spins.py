@@ -31,7 +31,7 @@ def test_the_macrospin_against_its_closed_form(z):
             save_every=n // 5,
         ).ys
         errors.append(np.abs(found - spins.macrospin(times, start, FIELD_ALONE)[1:]).max())
-    # Of order 4: 16, and more where the next order has not gone yet.
+    # Order 4 gives 16, and more where the next order has not gone yet.
     assert 14 < errors[0] / errors[1] < 20
     assert errors[1] < 1e-6
 

@@ -36,7 +36,7 @@ def test_the_velocity_is_that_of_the_fluid():
             if i != j:
                 across = np.cross(z, x) / np.linalg.norm(np.cross(z, x))
                 want[i] += g / (4 * np.pi * np.tan(np.arccos(z @ x) / 2)) * across
-    # Of size one, with the rounding of an arc cosine.
+    # The velocities are of size one, with the rounding of an arc cosine.
     options = dict(rtol=0, atol=1e-14)
     np.testing.assert_allclose(vortices.velocity(0.0, OTHERS, UNEQUAL), want, **options)
     parts = [cfjax.tangent(term.field(0.0, OTHERS, UNEQUAL), OTHERS) for term in ROUNDS.terms]

@@ -45,7 +45,7 @@ def test_the_stream_function_has_the_vorticity_as_its_laplacian():
 
 @pytest.mark.parametrize("n", [12, 64])
 def test_the_harmonics(n):
-    # Of a matrix of 64 the first elements, which are positive, go down to 1e-18.
+    # The first elements of a matrix of 64, which are positive, go down to 1e-18.
     rng = np.random.default_rng(2)
     coefficients = np.triu(rng.normal(size=(n, n)) + 1j * rng.normal(size=(n, n)))
     coefficients[0] = coefficients[0].real

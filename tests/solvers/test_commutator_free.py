@@ -345,7 +345,8 @@ def test_a_step_costs_what_its_tableau_says(solver, shape, estimate):
         jax.eval_shape(step, jnp.ones(shape))
     # The field at the end of the step comes on top, where the next step does not start with it.
     # Where it does, a rewritten step evaluates it once more, from the end alone.
-    # Of order 5 with stages that reach order 3 only, as methods/test_order_conditions.py has it.
+    # These have order 5 with stages that reach order 3 only, as methods/test_order_conditions.py
+    # has it.
     uses_last = type(solver) in (cfjax.CF54, cfjax.CG5)
     last = is_rewritten if solver.first_same_as_last else uses_last
     assert counts["evaluations"] == tableau.num_evaluations + last

@@ -55,7 +55,7 @@ def dense(solver, n, field, y0, args, t1=1.0, **kwargs):
     )
 
 
-# Those of Dopri8 are at rounding after two of these steps, so its own are longer.
+# The errors of Dopri8 are at rounding after two of these steps, so its own are longer.
 @pytest.mark.parametrize(
     "name",
     [

@@ -464,7 +464,7 @@ def test_the_backsolve_adjoint_along_a_manifold():
 
 
 def in_the_times(adjoint, t0, t1):
-    """Of a step and a half; diffrax holds the size of the first and ends the last at t1."""
+    """The end of a step and a half; diffrax holds the size of the first and ends the last at t1."""
     sol = diffrax.diffeqsolve(
         TERM, cfjax.CF2(), t0, t1, 0.5, Y0, ARGS, adjoint=adjoint, max_steps=4
     )

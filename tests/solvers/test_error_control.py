@@ -150,7 +150,7 @@ FROM_NOTHING = {
         lambda t, y: cfjax.LinearAffine(BLOCH, jnp.asarray([0.0, jnp.sin(1.0), 1.0])),
         jnp.zeros(3),
     ),
-    "Affine": (lambda t, y: cfjax.Affine(1.0, jnp.cos(y), -jnp.ones(3)), jnp.zeros(3)),
+    "Affine": (lambda t, y: cfjax.Affine(jnp.cos(y), -jnp.ones(3)), jnp.zeros(3)),
     "Congruence": (
         lambda t, y: cfjax.Congruence(BLOCH, jnp.eye(3)),
         jnp.zeros((3, 3)),

@@ -66,7 +66,7 @@ def low_rank_ode(t, y):
 
 
 def affine(t, y, args):
-    return cfjax.Affine(1.0, jnp.sin(y) + 1.0, -SCALES)
+    return cfjax.Affine(jnp.sin(y) + 1.0, -SCALES)
 
 
 def affine_ode(t, y):

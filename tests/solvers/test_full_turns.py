@@ -41,7 +41,7 @@ def test_a_controlled_step_of_a_full_turn_is_taken_again(estimate):
 
     sol = solve(0.3)
     assert sol.stats["num_rejected_steps"] > 0
-    # Of 60 steps, each of which may be off by the tolerance.
+    # Each of 60 steps may be off by the tolerance.
     np.testing.assert_allclose(sol.ys[-1], reference(4.0, 0.3), rtol=0, atol=60e-8)
     # What a rejected step is made of has no derivative that counts.
     slope = jax.grad(lambda args: solve(args).ys[-1, 1])(0.3)

@@ -336,7 +336,7 @@ def test_the_ends_of_a_step_are_those_of_its_output(problem):
 
 
 def loss(args):
-    """Of h, a jump, the rates and the start, after a step."""
+    """A function of h, a jump, the rates and the start, after a step."""
 
     def field(t, y, args):
         h, jump, rates, _ = args
@@ -485,7 +485,7 @@ def test_a_sum_of_terms():
 
 
 def test_back_in_time():
-    """Of order 4 and with the trace; it is not positive, as the equation itself is not."""
+    """A step back has order 4 and keeps the trace. Like the equation, it is not positive."""
     there = jnp.asarray(exact(general, 0.0, 1.0))
     back = functools.partial(problems.many_steps, term(general).field, SOLVER)
     ends = [back(*map(jnp.asarray, (1.0, 0.0, there)), None, jnp.asarray(n)) for n in (64, 128)]

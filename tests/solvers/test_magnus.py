@@ -176,7 +176,10 @@ FIELDS = {
     ),
     "Affine": (
         lambda t, y, _: cfjax.Affine(
-            1.0 + 0.5 * jnp.sin(t), wave(t, (3,)), -jnp.arange(1.0, 4.0), cfjax.SineTransform()
+            wave(t, (3,)),
+            -jnp.arange(1.0, 4.0),
+            cfjax.SineTransform(),
+            alpha=1.0 + 0.5 * jnp.sin(t),
         ),
         START,
     ),
@@ -340,7 +343,8 @@ def test_controlled_steps(name):
     solutions = [solve(jnp.asarray(atol)) for atol in tolerances]
     exact = exact_matrix(6.0) @ FRAME
     for atol, sol in zip(tolerances, solutions, strict=True):
-        # Of every step; the steps are fewer than 600, and most are far better.
+        # The tolerance is that of every step; the steps are fewer than 600, and most are far
+        # better.
         assert np.abs(sol.ys[-1] - exact).max() < 3 * atol
     steps = [int(sol.stats["num_accepted_steps"]) for sol in solutions]
     # As many as an estimate of order q + 1 asks for.

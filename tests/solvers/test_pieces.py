@@ -93,7 +93,7 @@ def test_the_noise_solver_of_shifted_noise(no_shape_hook):
     def constant(t, y, args, dw):
         return {"y": cfjax.Rotation(jnp.concatenate([dw, dw[:1]]))}
 
-    # Of fields that do not depend on the state one flow is exact.
+    # One flow is exact for fields that do not depend on the state.
     term = diffrax.MultiTerm(cfjax.LieTerm(paths.drift), cfjax.LieControlTerm(constant, GIVEN))
     found, expected = step(low, term), step(cfjax.ShiftedNoise(noise_solver=cfjax.CF4()), term)
     np.testing.assert_allclose(found["y"], expected["y"], rtol=0, atol=1e-14)

@@ -45,7 +45,7 @@ def test_power_iteration_finds_a_mode_that_the_first_field_has_no_part_in():
     y = (jnp.arange(float(n)) - (n - 1) / 2) ** 2
     first = field(0.0, y, None)
     np.testing.assert_allclose(first, first[::-1], rtol=0, atol=1e-12)
-    # Of the symmetric modes the stiffest has (n - 2)(n - 1), which is 0.875 of it.
+    # The stiffest of the symmetric modes has (n - 2)(n - 1), which is 0.875 of it.
     assert LOW < found(field, y) / (n * (n - 1)) < HIGH
 
 
@@ -78,7 +78,7 @@ def spins(t, y, args):
 
 
 def test_spectral_radius_on_a_manifold():
-    """Of aligned spins: a Laplacian, whose radius is 8; the frame has more coordinates."""
+    """Aligned spins have a Laplacian, whose radius is 8; the frame has more coordinates."""
     up = jnp.zeros((6, 6, 3)).at[..., 2].set(1.0)
     assert LOW < found(spins, up, jnp.asarray(1.0)) / 8 < HIGH
 

@@ -206,8 +206,12 @@ def test_terms_that_a_splitting_refuses(no_shape_hook):
         all_terms(kick), TypeError, "Strang takes a diffrax.MultiTerm of two or more terms, got 1"
     )
     fails(BODY[0], TypeError, "Strang takes a term of the form")
-    fails(diffrax.MultiTerm(noise, *BODY), TypeError, "takes noise, or what else a path drives, in")
-    fails(diffrax.MultiTerm(BODY[0], noise, BODY[1]), TypeError, "in its last term only: move it")
+    fails(
+        diffrax.MultiTerm(noise, *BODY),
+        TypeError,
+        "supports noise and other path-driven terms only as its last term",
+    )
+    fails(diffrax.MultiTerm(BODY[0], noise, BODY[1]), TypeError, "only as its last term: move them")
     fails(all_terms(axial, spherical, kick), TypeError, "last term of Strang must not depend on t")
 
     def on_host(t, y, args):

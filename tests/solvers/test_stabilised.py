@@ -1019,7 +1019,7 @@ INSTEAD = "LeftMatrix.*BorderedSkew"
 REFUSED = {
     "LowRankSkew": (lambda t, y, args: cfjax.LowRankSkew(A @ y), COLUMNS, INSTEAD),
     "SphereRotation": (lambda t, y, args: cfjax.SphereRotation(A @ y), UNIT, INSTEAD),
-    "Affine": (lambda t, y, args: cfjax.Affine(-1.0, 0 * y, np.ones(6)), UNIT, "ETD54"),
+    "Affine": (lambda t, y, args: cfjax.Affine(0 * y, np.ones(6), alpha=-1.0), UNIT, "ETD54"),
     "LinearAffine": (
         lambda t, y, args: cfjax.LinearAffine(-jnp.eye(6), 0 * y), UNIT, "ETD54",
     ),

@@ -24,7 +24,7 @@ def test_fields_of_different_kinds_are_an_error_in_words():
 
 @pytest.mark.parametrize("dtype", [jnp.float64, jnp.complex128])
 def test_large_fields_are_combined_by_a_product(dtype):
-    """Of 2500 numbers; smaller ones are added up."""
+    """These fields have 2500 numbers; smaller ones are added up."""
     n = 50
     a = jnp.asarray(np.random.default_rng(0).normal(size=(n, n)) / n, dtype)
     a = a + 1j * a.T if dtype == jnp.complex128 else a

@@ -245,7 +245,7 @@ def test_a_step_is_what_its_tableau_says(name, estimate, problem):
         assert np.linalg.norm(right) > 1e-8
         np.testing.assert_allclose(error, right, rtol=0, atol=2 * atol)
     if first is not None:
-        # Of the last field, without the step size. It would be stale if it were another stage's.
+        # The value of the last field, without the step size. Another stage's value would be stale.
         last = problem[0](jnp.asarray(T0 + H), *problems.arrays((expected.y1, problem[2])))
         problems.assert_close(first, last, 1e-13)
     assert (first is not None) == solver.first_same_as_last

@@ -16,7 +16,7 @@ FOUR = cfjax.Composition(cfjax.ImplicitMidpoint(), 4)
 
 
 def test_times_of_substeps_that_go_back():
-    """Of a translation by a function of time the midpoint rule is the rule for its integral."""
+    """For a translation by a function of time the midpoint rule is the rule for its integral."""
     t0, t1 = 0.3, 0.8
 
     def end(t0, t1):
@@ -25,7 +25,7 @@ def test_times_of_substeps_that_go_back():
 
     middles = t0 + (t1 - t0) * (ENDS[:-1] + ENDS[1:]) / 2
     expected = (t1 - t0) * np.sum(PARTS * np.exp(middles))
-    # Of fourth order, so it is not the integral; five sums.
+    # The rule has order 4, so it is not the integral; five sums.
     assert 1e-7 < abs(expected - (np.exp(t1) - np.exp(t0))) < 1e-4
     np.testing.assert_allclose(end(t0, t1), [expected] * 2, rtol=0, atol=1e-15)
 

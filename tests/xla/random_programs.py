@@ -85,7 +85,7 @@ def both(a, b):
 # Templates, apart by " | " and by lines. Fields: x is a value, f a real or complex one, r a real
 # one, i an integer one, v a vector, m a square matrix, s a number; like broadcasts with x, same has
 # its shape and dtype; axis is one of x, and at an index along it, far one that may be outside.
-# Those in `ONCE` are drawn once a line.
+# Names in `ONCE` are drawn once a line.
 
 ARITHMETIC = """
 {x} + {like} | {x} - {like} | {x} * {like} | {f} / {like} | {like} / {f} | -{x} | {x} ** {small}
@@ -935,7 +935,7 @@ def _weights(x: Any, seed: int) -> np.ndarray:
 
 
 def gradient(fun: Callable[..., Any]) -> Callable[..., Any]:
-    """Of a weighted sum, by all arguments."""
+    """The gradient of a weighted sum, by all arguments."""
 
     def of(y, p):
         along, some = _along(fun, y, p)

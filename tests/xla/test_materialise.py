@@ -78,7 +78,7 @@ def test_a_long_step_is_cut(rewritten):
 
 
 def _functions(scene, solver):
-    """Of XLA's program for controlled steps, how long each function is and how many sums it has."""
+    """How long each function of XLA's program for adaptive steps is, and its number of sums."""
     given = scene.problem()
 
     def solve(y0, args):

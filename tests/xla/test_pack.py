@@ -89,7 +89,7 @@ def test_transformations(transform, stack):
 def over_a_batch(ys):
     def one(y):
         entries = unpack(y)
-        # Of an entry of the batch, and one that all have.
+        # It has an entry of the batch, and one that all have.
         whole = pack([*entries, jnp.asarray(2.0)])
         along = materialised([whole, *entries], in_batches=True)
         return jnp.sum(along[0]) * pack(along[1:], sums=True)

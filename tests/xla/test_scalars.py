@@ -316,7 +316,7 @@ def test_padding_is_moved_as_jax_moves_it(config):
 
 @pytest.mark.parametrize("start", [-9, -1, 0, 1, 2, 9])
 def test_slices_are_moved_as_jax_moves_them(start):
-    """Those that begin outside of the array too."""
+    """Slices that begin outside of the array too."""
 
     def fun(y):
         m = jnp.outer(y, Y)
@@ -328,7 +328,7 @@ def test_slices_are_moved_as_jax_moves_them(start):
 
 
 def test_what_is_known_is_of_this_operation():
-    """Of two that are alike but for a parameter."""
+    """Two operations are alike but for a parameter."""
 
     def fun(y):
         k = lax.iota(np.int32, 3)

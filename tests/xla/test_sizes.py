@@ -78,7 +78,7 @@ def test_a_step_that_is_kept_is_as_one_in_the_loop(name):
 @pytest.mark.slow
 @pytest.mark.parametrize("name", ["CF4", "CF54", "RKMK8"])
 def test_derivatives_are_at_most_twice_as_large_as_not_rewritten(name):
-    """Of controlled steps with output, and second ones of a few equal steps."""
+    """Derivatives of adaptive steps with output, and second ones of a few equal steps."""
     fun = equal(craft, SOLVERS[name], 4)
     for program in (
         jax.grad(controlled(craft, SOLVERS[name])),
@@ -161,7 +161,7 @@ def test_a_splitting_of_six_vectors_has_each_flow_once():
     assert split < 4 * rolled
 
 
-# Of all that people write, as `python benchmarks/compile.py` has stored it.
+# The sizes of all that people write, as `python benchmarks/compile.py` has stored them.
 RESULTS = results.load("compile")
 STORED = [row for row in RESULTS["rows"] if "scene" in row]
 # What bloats a program mostly doubles it, so a tenth is room for small changes. Another version of

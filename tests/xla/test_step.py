@@ -38,7 +38,7 @@ def size(fun):
 @pytest.fixture(params=["flat", "as traced"], autouse=True)
 def lengths(request, monkeypatch):
     """Compiled on single numbers, and as too long for that."""
-    # Those of the other way, of the same functions.
+    # Forgets the programs of the other way, of the same functions.
     jax.clear_caches()
     if request.param == "as traced":
         for name, limit in (
@@ -91,7 +91,7 @@ ALONG = {few: jnp.linspace(0.2, 1.4, few) for few in (0, 2, 40)}
 @pytest.mark.parametrize("axes", [(0, None), (None, 0), (0, 0)])
 @pytest.mark.parametrize("count", ALONG)
 def test_batches(axes, count):
-    """Of none, of few, as directions are, and of many."""
+    """Batches of none, of few, as directions are, and of many."""
     along = ALONG[count]
     x = jnp.outer(along, X) if axes[0] == 0 else X
     scale = along * SCALE if axes[1] == 0 else SCALE

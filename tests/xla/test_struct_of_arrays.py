@@ -197,7 +197,7 @@ def test_windows_of_leading_axes_stay_whole(place):
 
 
 def test_a_matrix_is_no_lattice():
-    # Of 100 rows: products with itself are what XLA knows best, so they stay whole.
+    # A matrix of 100 rows: products with itself are what XLA knows best, so they stay whole.
     y = jnp.asarray(RNG.normal(size=(100, 4)))
     fun = lambda y: y @ (y.T @ y)  # noqa: E731
     # A sum of 100 terms, with another order.
@@ -262,7 +262,7 @@ def test_flows_of_a_step_are_computed_once():
 
 
 def neighbours(t, y, args):
-    """Of spins on a grid, and of one number for all."""
+    """The neighbours of spins on a grid, and one number for all."""
     field = jnp.roll(y["s"], 1, 0) + args * jnp.roll(y["s"], -1, 1) + y["w"] + jnp.cos(t)
     return {"s": cfjax.Rotation(field * jnp.asarray(W)), "w": jnp.sum(y["s"] * W, (0, 1)) / 72}
 
