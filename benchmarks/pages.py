@@ -1317,11 +1317,6 @@ def energy_longest() -> list[list[str]]:
     ]
 
 
-def _medians(rows: Iterable[Row], key: str) -> str:
-    """The smallest and the largest median of the rows."""
-    return between(row[key][2] for row in rows)
-
-
 @number
 def batch_output() -> str:
     """How much longer a batch takes with output at times."""
@@ -1454,13 +1449,13 @@ def lindblad_smooth() -> str:
     """How much longer Kraus4 takes than the best in plain space on small smooth problems."""
     rows = pick(load("lindblad")["rows"], method="cfjax, Kraus4")
     smooth = [row for row in rows if row["problem"] in ("thermal oscillator", "Dicke ladder")]
-    return _medians(smooth, "over best of others")
+    return _medians(row["over best of others"] for row in smooth)
 
 
 def _fast_drive(goal: float) -> str:
     """How many times as fast Magnus6 is as the fastest of others."""
     rows = pick(load("quantum")["rows"], problem="transmon", goal=goal, method="cfjax, Magnus6")
-    return between(1 / row[_OVER][2] for row in rows)
+    return between(1 / row[_OVER_OTHERS][2] for row in rows)
 
 
 @number
@@ -1505,7 +1500,7 @@ def scenes_others() -> str:
     rows = [row for row in load("scenes")["rows"] if row["tolerance"] in (1e-6, 1e-8)]
     others = ("spins", "Wilson flow", "Stiefel, first", "Stiefel, second", "Toda", "Zeitlin")
     rows = [row for row in rows if row["scene"] in (*others, "covariance")]
-    return _medians((row for row in rows if "over Tsit5" in row), "over Tsit5")
+    return _medians(row["over Tsit5"] for row in rows if "over Tsit5" in row)
 
 
 def _seconds_of(derivative: str) -> str:
