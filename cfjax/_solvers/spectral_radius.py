@@ -53,7 +53,8 @@ def _noise(shape: tuple[int, ...], dtype: Any, seed: int) -> Array:
     x = lax.iota(jnp.uint32, n).reshape(shape) + np.uint32((seed + 1) * 0x9E3779B9 % 2**32)
     for shift, factor in ((16, 0x85EBCA6B), (13, 0xC2B2AE35), (16, 1)):
         x = (x ^ (x >> np.uint32(shift))) * np.uint32(factor)
-    return x.astype(dtype) / 2**31 - 1
+    # A float: without x64 the integer would not fit.
+    return x.astype(dtype) / 2.0**31 - 1
 
 
 def iterated(

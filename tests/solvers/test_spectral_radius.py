@@ -103,6 +103,18 @@ def test_spectral_radius_in_single_precision_and_of_nothing():
     assert value == found(lambda t, y, args: -jnp.arange(8, dtype=np.float32) * y, y)
 
 
+def test_spectral_radius_without_x64():
+    """In JAX's default settings, in which integers have 32 bits."""
+    term = cfjax.LieTerm(lambda t, y, args: -jnp.arange(1, 5, dtype=y.dtype) * y)
+    jax.config.update("jax_enable_x64", False)
+    try:
+        radius = cfjax.spectral_radius(term, 0.0, jnp.ones(4))
+    finally:
+        jax.config.update("jax_enable_x64", True)
+    # The rates are 1 to 4, and 30 rounds leave (3/4)^60 of the others.
+    np.testing.assert_allclose(radius, 4, rtol=1e-5)
+
+
 def test_the_derivative_of_a_spectral_radius_is_zero():
     def radius(a):
         return cfjax.spectral_radius(cfjax.LieTerm(lambda t, y, args: -a * y), 0.0, jnp.ones(3))
