@@ -1504,6 +1504,53 @@ def scenes_others() -> str:
     return _medians(row["over Tsit5"] for row in rows if "over Tsit5" in row)
 
 
+# Programs of the benchmark of variations.
+VARIATIONS = {
+    "solve": "the state alone",
+    "P and S": "`VariationTerm`: P and S",
+    "unrolled, P and S": "`VariationTerm`: P and S, `CF4(unroll=True)`",
+    "S": "`VariationTerm`: S",
+    "jacfwd, S": "`jax.jacfwd` of the solve: S",
+    "jacfwd of steps, P and S": "`jax.jacfwd` of each step: P and S",
+    "inertial": "`InertialMotion`, the state alone",
+    "inertial, P and S": "`InertialMotion` in a `VariationTerm`: P and S",
+    "NumPy": "NumPy by hand, order 2: P and S",
+    "C": "C by hand, order 2: P and S",
+    "P": "`VariationTerm`: P",
+    "jacfwd, transition": "`jax.jacfwd` of the solve: $`\\Phi`$",
+}
+
+
+def _variations(problem: str) -> list[list[str]]:
+    rows = pick(load("variations")["rows"], problem=problem)
+    counts = values(rows, "windows")
+
+    def text(row: Row) -> str:
+        time = in_units(row["seconds a window"][2])
+        return f"1 ({time})" if row["program"] == "solve" else cell(row["over the solve"])
+
+    table = [["", *("one" if n == 1 else f"each of {two_digits(n)}" for n in counts), "to compile"]]
+    for program in values(rows, "program"):
+        of_program = [one(rows, program=program, windows=n) for n in counts]
+        compiling = of_program[0].get("compile over the solve")
+        if program == "solve":
+            to_compile = f"1 ({in_units(of_program[0]['compile CPU seconds'][2])})"
+        else:
+            to_compile = cell(compiling) if compiling else ""
+        table.append([VARIATIONS[program], *map(text, of_program), to_compile])
+    return table
+
+
+@table
+def variations_imu() -> list[list[str]]:
+    return _variations("IMU")
+
+
+@table
+def variations_attitude() -> list[list[str]]:
+    return _variations("attitude")
+
+
 def _seconds_of(derivative: str) -> str:
     row = one(load("compile")["rows"], derivative=derivative)
     return two_digits(row["CPU seconds"][2])

@@ -1,0 +1,155 @@
+"""Gradients of a covariance and of a log-density by the weights of a network, to many digits.
+
+The reference is of another kind: it knows quaternions as four numbers, their velocity and its
+Jacobian matrix, and no frame, bracket or trace. It takes differences of solves with 50 digits.
+"""
+
+import jax
+import jax.numpy as jnp
+import mpmath
+import numpy as np
+import pytest
+
+import cfjax
+
+Q0 = np.array([0.5, 0.1, -0.7, 0.5])
+P0 = np.diag([0.1, 0.2, 0.3])
+# Unequal and not diagonal.
+GAIN = np.array([[0.3, 0.1], [-0.2, 0.2], [0.05, 0.4]])
+# Of the network omega = second tanh(first q + bias) + (sin t, 0.5, 0).
+SHAPES = {"first": (3, 4), "bias": (3,), "second": (3, 3)}
+SIZE = sum(map(np.prod, SHAPES.values()))
+WEIGHTS, *DIRECTIONS = np.random.default_rng(7).normal(size=(3, SIZE))
+
+# The velocity of a quaternion (w, x, y, z) is E(q) omega in the frame of the body, with
+# E(q) = (FRAME[0] q, FRAME[1] q, FRAME[2] q): half of q times i, j and k.
+FRAME = np.array(
+    [
+        [[0, -1, 0, 0], [1, 0, 0, 0], [0, 0, 0, 1], [0, 0, -1, 0]],
+        [[0, 0, -1, 0], [0, 0, 0, -1], [1, 0, 0, 0], [0, 1, 0, 0]],
+        [[0, 0, 0, -1], [0, 0, 1, 0], [0, -1, 0, 0], [1, 0, 0, 0]],
+    ]
+)
+
+
+def parts(weights):
+    ends = np.cumsum([np.prod(shape) for shape in SHAPES.values()])
+    pieces = np.split(weights, ends[:-1]) if isinstance(weights, np.ndarray) else []
+    pieces = pieces or jnp.split(weights, ends[:-1])
+    return [x.reshape(shape) for x, shape in zip(pieces, SHAPES.values(), strict=True)]
+
+
+# With 50 digits
+
+
+def exact(x):
+    """Entries of 50 digits, in arrays of NumPy."""
+    return np.vectorize(mpmath.mpf, otypes=[object])(x)
+
+
+def frame(q):
+    return np.stack([matrix @ q for matrix in FRAME], axis=1) / mpmath.mpf(2)
+
+
+def rates(t, y, weights):
+    """Of a quaternion q, its covariance (4, 4), and the changes (4, 3) that angles cause."""
+    first, bias, second = parts(weights)
+    q, covariance, changes = y[:4], y[4:20].reshape(4, 4), y[20:].reshape(4, 3)
+    layer = np.vectorize(mpmath.tanh, otypes=[object])(first @ q + bias)
+    omega = second @ layer + np.array([mpmath.sin(t), mpmath.mpf("0.5"), 0])
+    e = frame(q)
+    jacobian = sum(w * matrix for w, matrix in zip(omega, FRAME, strict=True)) / mpmath.mpf(2)
+    jacobian = jacobian + e @ (second * (1 - layer**2)) @ first
+    noise = e @ exact(GAIN)
+    moved = jacobian @ covariance
+    rate = moved + moved.T + noise @ noise.T
+    return np.concatenate([e @ omega, rate.ravel(), (jacobian @ changes).ravel()])
+
+
+def step(t, h, y, weights, columns):
+    """Gragg's midpoint rule with 2, 4, 6 ... substeps, extrapolated: the last two values."""
+    rows = []
+    for k in range(1, columns + 1):
+        n = 2 * k
+        before, now = y, y + h / n * rates(t, y, weights)
+        for m in range(1, n):
+            before, now = now, before + 2 * h / n * rates(t + m * h / n, now, weights)
+        smooth = (now + before + h / n * rates(t + h, now, weights)) / 2
+        row = [smooth]
+        for m in range(1, k):
+            ratio = mpmath.mpf(k) ** 2 / (k - m) ** 2
+            row.append(row[-1] + (row[-1] - rows[-1][m - 1]) / (ratio - 1))
+        rows.append(row)
+    return rows[-1][-1], rows[-1][-2]
+
+
+def end(weights, steps=4, columns=8):
+    """The trace of P and the log-density after unit time."""
+    q = exact(Q0) / mpmath.sqrt(sum(exact(Q0) ** 2))
+    e = frame(q)
+    y = np.concatenate([q, (e @ exact(P0) @ e.T).ravel(), e.ravel()])
+    for k in range(steps):
+        h = mpmath.mpf(1) / steps
+        y, other = step(k * h, h, y, weights, columns)
+        # The differences below have the digits of the solve.
+        assert max(abs(y - other)) < 1e-13
+    # The columns of E are orthogonal, of length 1/2.
+    inverse = 4 * frame(y[:4]).T
+    p = inverse @ y[4:20].reshape(4, 4) @ inverse.T
+    volume = mpmath.det(mpmath.matrix((inverse @ y[20:].reshape(4, 3)).tolist()))
+    return np.array([np.trace(p), -mpmath.log(volume)])
+
+
+# Of a method of order 4 with steps of 1/200, and rates of up to 4: the fourth power of 1/50.
+TOLERANCE = 1.6e-7
+
+
+@pytest.fixture(scope="module")
+def slopes():
+    """The derivatives of both along each direction."""
+    with mpmath.workdps(50):
+        weights, h = exact(WEIGHTS), mpmath.mpf(10) ** -15
+        ends = [
+            [end(weights + sign * h * exact(direction)) for sign in (1, -1)]
+            for direction in DIRECTIONS
+        ]
+        return np.array([(plus - minus) / (2 * h) for plus, minus in ends]).astype(float)
+
+
+# By cfjax
+
+
+def field(t, q, weights):
+    first, bias, second = parts(weights)
+    omega = second @ jnp.tanh(first @ q + bias) + jnp.stack([jnp.sin(t), 0.5, 0.0])
+    return cfjax.QuaternionRotation(omega, frame="body", layout="wxyz")
+
+
+def noise(t, q, weights, dw):
+    return cfjax.QuaternionRotation(jnp.asarray(GAIN) @ dw, frame="body", layout="wxyz")
+
+
+def both(weights):
+    term = cfjax.VariationTerm(cfjax.LieTerm(field), noise=noise, channels=2)
+    q0 = jnp.asarray(Q0 / np.linalg.norm(Q0))
+    y0 = cfjax.Variation(q0, covariance=jnp.asarray(P0), log_density=jnp.asarray(0.0))
+    ys = cfjax.integrate(term, cfjax.CF4(), 0.0, 1.0, y0, weights, num_steps=200).ys
+    return jnp.stack([jnp.trace(ys.covariance[-1]), ys.log_density[-1]])
+
+
+def test_forward_mode_by_the_weights_of_a_network(slopes):
+    weights, directions = jnp.asarray(WEIGHTS), jnp.asarray(np.stack(DIRECTIONS))
+    with cfjax.rewriting(False):
+        along = lambda v: jax.jvp(both, (weights,), (v,))[1]  # noqa: E731
+        found = jax.jit(jax.vmap(along))(directions)
+    np.testing.assert_allclose(found, slopes, rtol=0, atol=TOLERANCE)
+    assert np.abs(slopes).min() > 0.1
+
+
+@pytest.mark.slow
+def test_reverse_mode_by_the_weights_of_a_network(slopes):
+    # A sum of both, with different weights, is one program.
+    share = np.array([1.0, 0.3])
+    with cfjax.rewriting(False):
+        found = jax.jit(jax.grad(lambda weights: share @ both(weights)))(jnp.asarray(WEIGHTS))
+    np.testing.assert_allclose(np.stack(DIRECTIONS) @ found, slopes @ share, rtol=0, atol=TOLERANCE)
