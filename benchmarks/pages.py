@@ -1456,7 +1456,7 @@ def lindblad_smooth() -> str:
 def _fast_drive(goal: float) -> str:
     """How many times as fast Magnus6 is as the fastest of others."""
     rows = pick(load("quantum")["rows"], problem="transmon", goal=goal, method="cfjax, Magnus6")
-    return between(1 / row[_OVER_OTHERS][2] for row in rows)
+    return between(1 / row[_OVER][2] for row in rows)
 
 
 @number
