@@ -149,7 +149,7 @@ def code(program: str) -> str:
 # Numbers that guides keep of a table.
 
 
-def _middle(spreads: Iterable[list[float]]) -> str:
+def _medians(spreads: Iterable[list[float]]) -> str:
     """The smallest and the largest median."""
     return between(spread[2] for spread in spreads)
 
@@ -157,13 +157,13 @@ def _middle(spreads: Iterable[list[float]]) -> str:
 @number
 def scenes_magnus() -> str:
     rows = pick(load("scenes")["rows"], method="Magnus6", tolerance=1e-6)
-    return _middle(row["over Tsit5"] for row in rows if "over Tsit5" in row)
+    return _medians(row["over Tsit5"] for row in rows if "over Tsit5" in row)
 
 
 @number
 def attitude_rkmk8() -> str:
     rows = pick(load("attitude")["rows"], scene="spacecraft", to=1e-8)
-    return _middle(
+    return _medians(
         row["over the better in plain space"]
         for row in rows
         if SHORT.get(row["method"], row["method"]) == "RKMK8"
@@ -173,13 +173,13 @@ def attitude_rkmk8() -> str:
 @number
 def stiff_gain() -> str:
     rows = pick(_stiff("to"), program="ETD54", to=1e-6)
-    return _middle(row["over CF4"] for row in rows if row.get("over CF4"))
+    return _medians(row["over CF4"] for row in rows if row.get("over CF4"))
 
 
 @number
 def stiff_adaptive() -> str:
     rows = pick(_stiff("step over an equal one"), program="ETD54 controlled", to=1e-6)
-    return _middle(row["step over an equal one"] for row in rows)
+    return _medians(row["step over an equal one"] for row in rows)
 
 
 @number
@@ -191,19 +191,19 @@ def stiff_largest() -> str:
 @number
 def quantum_gain() -> str:
     rows = [row for rows in _quantum().values() for row in rows]
-    return between(1 / row[_OVER][2] for row in pick(rows, method="cfjax, Magnus6"))
+    return between(1 / row[_OVER_OTHERS][2] for row in pick(rows, method="cfjax, Magnus6"))
 
 
 @number
 def lindblad_gain() -> str:
     rows = pick(load("lindblad")["rows"], method="cfjax, Kraus4", problem="transmon and cavity")
-    return _middle(row["over best of others"] for row in rows)
+    return _medians(row["over best of others"] for row in rows)
 
 
 @number
 def batch_rkmk8() -> str:
     rows = pick(load("batch")["rows"], method="RKMK8", what="end alone")
-    return _middle(row["over Tsit5"] for row in rows)
+    return _medians(row["over Tsit5"] for row in rows)
 
 
 @number
@@ -217,7 +217,7 @@ def gpu_gain() -> str:
 @number
 def gradient_over_solve() -> str:
     rows = pick(load("gradients")["rows"], program="cfjax.integrate, CF4")
-    return _middle(row["gradient over solve"] for row in rows)
+    return _medians(row["gradient over solve"] for row in rows)
 
 
 @number
@@ -716,7 +716,7 @@ _SECOND = {
     "its gradient": "their gradient",
     "diffeqsolve": "50 steps in `diffrax.diffeqsolve`",
 }
-_OVER = "over the fastest of others"
+_OVER_OTHERS = "over the fastest of others"
 
 
 def _quantum() -> dict[tuple[str, int, float], list[Row]]:
@@ -738,11 +738,11 @@ def quantum() -> list[list[str]]:
         peers = [row for row in rows if row not in ours]
         in_lab_frame = [row for row in peers if not row["method"].endswith("frame")]
         groups = ours, peers, in_lab_frame
-        best, *fastest = (min(group, key=lambda r: r[_OVER][2]) for group in groups)
+        best, *fastest = (min(group, key=lambda r: r[_OVER_OTHERS][2]) for group in groups)
         cells = [f"{problem}, {systems(count)}", power(goal)]
         cells += [code(best["method"].removeprefix("cfjax, ")), in_units(best["seconds each"][2])]
         for row in fastest:
-            cells += [row["method"], two_digits(row[_OVER][2] / best[_OVER][2])]
+            cells += [row["method"], two_digits(row[_OVER_OTHERS][2] / best[_OVER_OTHERS][2])]
         table.append([*cells, power(best["off norm"]), power(fastest[0]["off norm"])])
     return table
 
@@ -788,7 +788,7 @@ def quantum_steps() -> list[list[str]]:
 
 @table
 def quantum_times() -> list[list[str]]:
-    return _by_method(lambda row: cell(row[_OVER]))
+    return _by_method(lambda row: cell(row[_OVER_OTHERS]))
 
 
 @number
@@ -1317,11 +1317,6 @@ def energy_longest() -> list[list[str]]:
     ]
 
 
-def _medians(rows: Iterable[Row], key: str) -> str:
-    """The smallest and the largest median of the rows."""
-    return between(row[key][2] for row in rows)
-
-
 @number
 def batch_output() -> str:
     """How much longer a batch takes with output at times."""
@@ -1454,13 +1449,13 @@ def lindblad_smooth() -> str:
     """How much longer Kraus4 takes than the best in plain space on small smooth problems."""
     rows = pick(load("lindblad")["rows"], method="cfjax, Kraus4")
     smooth = [row for row in rows if row["problem"] in ("thermal oscillator", "Dicke ladder")]
-    return _medians(smooth, "over best of others")
+    return _medians(row["over best of others"] for row in smooth)
 
 
 def _fast_drive(goal: float) -> str:
     """How many times as fast Magnus6 is as the fastest of others."""
     rows = pick(load("quantum")["rows"], problem="transmon", goal=goal, method="cfjax, Magnus6")
-    return between(1 / row[_OVER][2] for row in rows)
+    return between(1 / row[_OVER_OTHERS][2] for row in rows)
 
 
 @number
@@ -1505,7 +1500,7 @@ def scenes_others() -> str:
     rows = [row for row in load("scenes")["rows"] if row["tolerance"] in (1e-6, 1e-8)]
     others = ("spins", "Wilson flow", "Stiefel, first", "Stiefel, second", "Toda", "Zeitlin")
     rows = [row for row in rows if row["scene"] in (*others, "covariance")]
-    return _medians((row for row in rows if "over Tsit5" in row), "over Tsit5")
+    return _medians(row["over Tsit5"] for row in rows if "over Tsit5" in row)
 
 
 def _seconds_of(derivative: str) -> str:
