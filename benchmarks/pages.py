@@ -201,15 +201,6 @@ def lindblad_gain() -> str:
 
 
 @number
-def noise_step() -> str:
-    rows = [row for row in load("noise")["rows"] if row.get("spins", 1) > 1]
-    medians = {
-        row["program"]: next(v for k, v in row.items() if k.startswith("over "))[2] for row in rows
-    }
-    return two_digits(medians["WeakOrder2"] / medians["CF2"])
-
-
-@number
 def batch_rkmk8() -> str:
     rows = pick(load("batch")["rows"], method="RKMK8", what="end alone")
     return _medians(row["over Tsit5"] for row in rows)
