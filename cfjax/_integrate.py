@@ -193,6 +193,10 @@ def equal_steps(
         n, intervals = jnp.zeros_like(num_steps), num_steps.astype(t0.dtype)
     is_short = _is_short(t0, t1, intervals)
 
+    # Not as a number that is known: next to zero the compiler rounds the times within a step once
+    # less than those at its ends, and the lengths of steps would not add up to the interval.
+    t0 = lax.optimization_barrier(t0)
+
     def time(n):
         # From the step's number, so that rounding does not add up, and t1 is met exactly.
         return jnp.where(n == num_steps, t1, t0 + n.astype(t0.dtype) * ((t1 - t0) / intervals))

@@ -951,3 +951,21 @@ def test_what_diffrax_says_of_a_blow_up():
         **options,
     )
     assert adaptive.result == diffrax.RESULTS.max_steps_reached
+
+
+def test_lengths_of_steps_add_up_where_the_times_are_known():
+    """Compiled as users' programs are: other tests leave out what would round times otherwise."""
+    term = cfjax.LieTerm(lambda t, y, args: cfjax.Rotation(jnp.array([0.0, 0.0, 1.0], y.dtype)))
+    end, y0 = 1e3, np.array([1, 0, 0], np.float32)
+
+    def solve():
+        return cfjax.integrate(term, cfjax.CF4(), 0.0, end, y0, num_steps=100_000).ys[-1]
+
+    jax.config.update("jax_disable_most_optimizations", False)
+    try:
+        y = np.asarray(jax.jit(solve)(), float)
+    finally:
+        jax.config.update("jax_disable_most_optimizations", True)
+    error = np.angle((y[0] + 1j * y[1]) * np.exp(-1j * end))
+    # The angle rounds as a number of its size does. Lengths that do not add up are off by 8e-4.
+    assert abs(error) < 2 * np.spacing(np.float32(end))
