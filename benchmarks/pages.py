@@ -1551,6 +1551,27 @@ def variations_attitude() -> list[list[str]]:
     return _variations("attitude")
 
 
+def _over_the_state(problem: str, program: str, windows: int) -> str:
+    rows = load("variations")["rows"]
+    row = one(rows, problem=problem, program=program, windows=windows)
+    return two_digits(row["over the solve"][2])
+
+
+@number
+def variations_attitude_one() -> str:
+    return _over_the_state("attitude", "P", 1)
+
+
+@number
+def variations_imu_one() -> str:
+    return _over_the_state("IMU", "P and S", 1)
+
+
+@number
+def variations_imu_many() -> str:
+    return _over_the_state("IMU", "P and S", 1000)
+
+
 def _seconds_of(derivative: str) -> str:
     row = one(load("compile")["rows"], derivative=derivative)
     return two_digits(row["CPU seconds"][2])
