@@ -7,6 +7,7 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 import jax.tree_util as jtu
+from jax import lax
 from jaxtyping import Array, Bool, PyTree, Real
 
 from .._arrays import Weight
@@ -280,4 +281,7 @@ class ElementwiseCoordinates(Elementwise, AbstractCoordinates):
 
     def landing(self, start: Any) -> tuple[Any, Bool[Array, ""]]:
         increment, is_there = self._each(lambda u, start: u.landing(start))(self.field, start)
-        return increment, jnp.all(is_there)
+        # A branch keeps the step from being compiled as a program of single numbers. With 3 x 3
+        # matrices and RKMK8 that has 29 000 instructions in place of 800, and takes three times as
+        # long.
+        return increment, lax.cond(jnp.all(is_there), lambda: True, lambda: False)
