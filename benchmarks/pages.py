@@ -356,26 +356,6 @@ def million_steps() -> list[list[str]]:
 
 
 @table
-def projected() -> list[list[str]]:
-    rows = load("projected")["rows"]
-    names = {
-        "CF4": "`CF4`",
-        "CF54": "`CF54`",
-        "RKMK5, projected": "`RKMK5`, projected",
-        "RKMK8, projected": "`RKMK8`, projected",
-        "Dopri8": "Dopri8, in plain space",
-    }
-
-    def text(problem: str, method: str) -> str:
-        of_method = pick(rows, problem=problem, method=method)
-        return " / ".join(two_digits(row["over Tsit5"][2]) for row in of_method)
-
-    return [["", *names.values()]] + [
-        [problem, *(text(problem, name) for name in names)] for problem in values(rows, "problem")
-    ]
-
-
-@table
 def gradients() -> list[list[str]]:
     rows = load("gradients")["rows"]
     cases = list(itertools.product(values(rows, "state"), values(rows, "systems")))
@@ -1272,6 +1252,52 @@ def diffusion_frames() -> str:
         for frame in values(rows, "frame")
     )
     return between(along[a] / across[a] for a in along if 0.5 <= a <= 2)
+
+
+COORDINATES = {
+    "CF4": "`CF4`",
+    "CF54": "`CF54`",
+    "RKMK5, projected": "`RKMK5`, projected",
+    "RKMK8, projected": "`RKMK8`, projected",
+    "RKMK5, Cayley": "`RKMK5`, Cayley",
+    "RKMK8, Cayley": "`RKMK8`, Cayley",
+    "Dopri8": "Dopri8, in plain space",
+}
+
+
+def _coordinates(steps: str, without: tuple[str, ...] = ()) -> list[list[str]]:
+    rows = pick(load("coordinates")["rows"], steps=steps)
+    targets = sorted(values(rows, "to"), reverse=True)
+    methods = {name: title for name, title in COORDINATES.items() if name not in without}
+    table = [["", *methods.values()]]
+    for problem in values(rows, "problem"):
+        table.append([problem])
+        for name in methods:
+            at = [pick(rows, problem=problem, method=name, to=x) for x in targets]
+            texts = [two_digits(found[0]["over Tsit5"][2]) if found else "-" for found in at]
+            table[-1].append(" / ".join(texts) if any(at) else "")
+    return table
+
+
+@table
+def coordinates_equal() -> list[list[str]]:
+    return _coordinates("equal")
+
+
+@table
+def coordinates_adaptive() -> list[list[str]]:
+    return _coordinates("adaptive", without=("CF4",))
+
+
+@number
+def coordinates_gradient() -> str:
+    """The time of a gradient over that of its solve, in Cayley's coordinates."""
+    rows = [row for row in load("coordinates")["rows"] if "gradient over solve" in row]
+    medians = {name: [] for name in ("CF4", "RKMK8, Cayley")}
+    for name, found in medians.items():
+        found += [row["gradient over solve"][2] for row in pick(rows, method=name)]
+    own, other = (between(medians[name]) for name in ("RKMK8, Cayley", "CF4"))
+    return f"{own} times as long as its solve, that of `CF4` {other} times"
 
 
 def _exact(error: float) -> str:

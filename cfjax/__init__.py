@@ -107,9 +107,9 @@ if TYPE_CHECKING:
     from ._solvers.munthe_kaas import RKMK4 as RKMK4
     from ._solvers.munthe_kaas import RKMK5 as RKMK5
     from ._solvers.munthe_kaas import RKMK8 as RKMK8
+    from ._solvers.munthe_kaas import CayleyRK4 as CayleyRK4
     from ._solvers.pieces import ShiftedNoise as ShiftedNoise
     from ._solvers.pieces import WeakOrder2 as WeakOrder2
-    from ._solvers.retraction import CayleyRK4 as CayleyRK4
     from ._solvers.richardson import Richardson as Richardson
     from ._solvers.spectral_radius import spectral_radius as spectral_radius
     from ._solvers.splitting import BlanesMoan4 as BlanesMoan4
@@ -173,9 +173,8 @@ _NAMES_LATER = {
         "YRK135",
     ),
     "_solvers.magnus": ("Magnus10", "Magnus2", "Magnus4", "Magnus4Lobatto", "Magnus6", "Magnus8"),
-    "_solvers.munthe_kaas": ("RKMK", "RKMK3", "RKMK4", "RKMK5", "RKMK8"),
+    "_solvers.munthe_kaas": ("RKMK", "RKMK3", "RKMK4", "RKMK5", "RKMK8", "CayleyRK4"),
     "_solvers.pieces": ("ShiftedNoise", "WeakOrder2"),
-    "_solvers.retraction": ("CayleyRK4",),
     "_solvers.richardson": ("Richardson",),
     "_solvers.spectral_radius": ("spectral_radius",),
     "_solvers.stabilised": ("RKG2", "RKL2", "RKL3"),

@@ -165,14 +165,21 @@ class AbstractFrozenField(eqx.Module):
         del earlier
         return self, point
 
-    def projected(self, point: Any) -> Any:
-        """This field at a point in the coordinates of a step in plain space, for
-        `cfjax.RKMK(..., coordinates="projected")`.
+    def projected(self, point: Any) -> "AbstractCoordinates | None":
+        """This field at a point, for `cfjax.RKMK(..., coordinates="projected")`.
 
-        An `AbstractAlgebraElement` that is a translation by `tangent(point)`, with a further method
-        `projection(start)`. This returns by how much the step leads from a start on the manifold to
-        an end on it, and whether it could be brought there. None, the default, if there are no
-        such coordinates. The point need not be on the manifold.
+        A translation in plain space by `tangent(point)`, which knows how to bring the end of a step
+        back to the manifold; or None, the default, if there is none. The point need not be on the
+        manifold.
+        """
+        del point
+        return None
+
+    def cayley(self, point: Any) -> "AbstractCoordinates | None":
+        """This field at a point, for `cfjax.RKMK(..., coordinates="cayley")`; or None, the default.
+
+        A class that stands for a matrix can return that of its matrix, for example
+        `cfjax.LeftMatrix(a).cayley(point)`, and likewise with `projected`.
         """
         del point
         return None
@@ -236,6 +243,35 @@ class AbstractAlgebraElement(AbstractFrozenField):
         return None
 
 
+class AbstractCoordinates(AbstractFrozenField):
+    """A field in coordinates of a step in which sums of fields are sums of coordinates.
+
+    A sum u of such fields leads to the point `flow(start)`, with `increment` as in other fields.
+    `tangent` is the velocity of the field. The methods below are for parts without leading axes.
+    """
+
+    # Whether `rate` needs the start.
+    is_rate_of_start: ClassVar[bool] = False
+
+    def rate(self, field: Any, start: Any) -> Any:
+        """How u, `self`, changes where the point to which it leads from `start` moves with `field`.
+
+        By default as the field, for coordinates in which a point is the start plus a sum.
+        """
+        del start
+        return field
+
+    def has_rate(self) -> Bool[Array, ""] | None:
+        """Whether `rate` at u has a value; None, the default, if it always has."""
+        return None
+
+    @abc.abstractmethod
+    def landing(self, start: Any) -> tuple[Any, Bool[Array, ""]]:
+        """By how much the step leads from a start on the manifold to an end on it; and whether
+        there is such an end.
+        """
+
+
 class Rest(AbstractAlgebraElement):
     """The field of a part of the state that a term does not move: there a user writes None.
 
@@ -259,12 +295,6 @@ class Rest(AbstractAlgebraElement):
 
     def bracket(self, other: "Rest") -> "Rest":
         return self
-
-    def projected(self, point: PyTree) -> "Rest":
-        return self
-
-    def projection(self, point: PyTree) -> tuple[PyTree, Bool[Array, ""]]:
-        return self.tangent(point), jnp.asarray(True)
 
 
 def is_field(x: Any) -> bool:
@@ -411,9 +441,13 @@ def dexpinv(a: PyTree, b: PyTree, degree: int) -> PyTree:
 
 def has_dexpinv(a: PyTree) -> Bool[Array, ""] | None:
     """Whether `dexpinv` at a has a value in all parts; None if nothing is known of any part."""
-    flags = [x.has_dexpinv() for x in jtu.tree_leaves(a, is_leaf=is_field) if is_field(x)]
-    defined = [x for x in flags if x is not None]
-    return functools.reduce(jnp.logical_and, defined) if defined else None
+    return _all_of([x.has_dexpinv() for x in jtu.tree_leaves(a, is_leaf=is_field) if is_field(x)])
+
+
+def _all_of(flags: Sequence[Bool[Array, ""] | None]) -> Bool[Array, ""] | None:
+    """Whether all that are known are true; None if none is known."""
+    known = [x for x in flags if x is not None]
+    return functools.reduce(jnp.logical_and, known) if known else None
 
 
 @functools.cache
@@ -444,48 +478,66 @@ def from_chart(field: PyTree, point: PyTree) -> PyTree:
     )
 
 
-def projected(field: PyTree, point: PyTree) -> PyTree:
-    """The field at a point in the coordinates of a step in plain space, part by part.
+def in_coordinates(name: str, field: PyTree, point: PyTree) -> PyTree:
+    """The field at a point in the coordinates of this name, `"projected"` or `"cayley"`, part by
+    part.
 
     **Raises** `TypeError` for a part that has no such coordinates.
     """
 
     def part(f: Any, p: PyTree) -> Any:
-        coordinates = f.projected(p) if is_field(f) else f
+        if not is_field(f) or isinstance(f, Rest):
+            return f
+        coordinates = getattr(f, name)(p)
         if coordinates is None:
-            raise TypeError(_not_projected_message(f))
+            raise TypeError(_no_coordinates_message(name, f))
         return coordinates
 
     return jtu.tree_map(part, field, point, is_leaf=is_field)
 
 
-def projection(field: PyTree, point: PyTree) -> tuple[PyTree, Bool[Array, ""]]:
-    """By how much a field in these coordinates moves a point on the manifold, to another on it; and
-    whether all parts could be brought there.
+def rate(u: PyTree, field: PyTree, start: PyTree) -> PyTree:
+    """How coordinates u change where the point to which they lead moves with `field`."""
+    return jtu.tree_map(
+        lambda x, f, p: x.rate(f, p) if isinstance(x, AbstractCoordinates) else f,
+        u,
+        field,
+        start,
+        is_leaf=is_field,
+    )
+
+
+def has_rate(u: PyTree) -> Bool[Array, ""] | None:
+    """Whether `rate` at u has a value in all parts; None if it always has."""
+    parts = jtu.tree_leaves(u, is_leaf=is_field)
+    return _all_of([x.has_rate() for x in parts if isinstance(x, AbstractCoordinates)])
+
+
+def landing(field: PyTree, start: PyTree) -> tuple[PyTree, Bool[Array, ""]]:
+    """By how much a field in such coordinates moves a point on the manifold, to another on it; and
+    whether there is one in all parts.
     """
+
+    def part(f: Any, p: PyTree) -> tuple[PyTree, Bool[Array, ""]]:
+        if isinstance(f, AbstractCoordinates):
+            return f.landing(p)
+        return f.increment(p) if is_field(f) else f, jnp.asarray(True)
+
     fields, treedef = jtu.tree_flatten(field, is_leaf=is_field)
-    pairs = [
-        f.projection(p) if is_field(f) else (f, jnp.asarray(True))
-        for f, p in zip(fields, treedef.flatten_up_to(point), strict=True)
-    ]
+    pairs = list(map(part, fields, treedef.flatten_up_to(start)))
     is_there = functools.reduce(jnp.logical_and, [x for _, x in pairs], jnp.asarray(True))
     return treedef.unflatten([increment for increment, _ in pairs]), is_there
 
 
-def _not_projected_message(field: AbstractFrozenField) -> str:
+def _no_coordinates_message(name: str, field: AbstractFrozenField) -> str:
     has_closed_form = (
         isinstance(field, AbstractAlgebraElement)
         and type(field).dexpinv is not AbstractAlgebraElement.dexpinv
     )
-    return (
-        f'{type(field).__name__} has no coordinates for coordinates="projected", which are for '
-        "cfjax.LeftMatrix, RightMatrix, LowRankSkew, BorderedSkew, Conjugation, Congruence without "
-        "q, and arrays beside them. Use "
-        + (
-            'coordinates="exponential", the default, where this field has a closed form.'
-            if has_closed_form
-            else "a commutator-free method, for example cfjax.CF4()."
-        )
+    return f'{type(field).__name__} has no coordinates for coordinates="{name}". Use ' + (
+        'coordinates="exponential", the default, where this field has a closed form.'
+        if has_closed_form
+        else "a commutator-free method, for example cfjax.CF4()."
     )
 
 

@@ -35,8 +35,8 @@ _NOT_FINITE = (
 _BLOW_UP = (
     f"{diffrax.RESULTS[diffrax.RESULTS.nonfinite].rstrip('.')}: the solution grows without bound, "
     "or the steps are too long, which more num_steps cure. (A step of a Munthe-Kaas method, such "
-    "as cfjax.RKMK8, must turn by less than 2 pi; with coordinates='projected' by less than pi, "
-    "and matrices that act from one side must be skew-Hermitian.)"
+    "as cfjax.RKMK8, must turn by less than 2 pi; with coordinates='projected' and 'cayley' by "
+    "less than pi, and with 'projected' matrices that act from one side must be skew-Hermitian.)"
 )
 
 

@@ -21,7 +21,6 @@ Kind = Literal[
     "Kraus",
     "exponential",
     "stabilised",
-    "retraction",
     "splitting",
     "implicit",
     "composition",
@@ -96,6 +95,7 @@ SOLVERS = {
     "RKMK4": Row(cfjax.RKMK4, "Munthe-Kaas", 4, None, 4, 0, 3, "brackets"),
     "RKMK5": Row(cfjax.RKMK5, "Munthe-Kaas", 5, 4, 6, 1, 4, "brackets"),
     "RKMK8": Row(cfjax.RKMK8, "Munthe-Kaas", 8, 7, 13, 0, 7, "brackets"),
+    "CayleyRK4": Row(cfjax.CayleyRK4, "Munthe-Kaas", 4, None, 4, 0, 3, "columns"),
     "RKMK": Row(
         lambda: cfjax.RKMK(diffrax.Bosh3.tableau), "Munthe-Kaas", 3, 2, 3, 1, 2, "brackets"
     ),
@@ -117,7 +117,6 @@ SOLVERS = {
     "RKL2": Row(lambda: cfjax.RKL2(5), "stabilised", 2, 2, 5, 1, 2),
     "RKG2": Row(lambda: cfjax.RKG2(5), "stabilised", 2, 2, 5, 1, 2),
     "RKL3": Row(lambda: cfjax.RKL3(5), "stabilised", 3, 2, 14, 1, 2),
-    "CayleyRK4": Row(cfjax.CayleyRK4, "retraction", 4, None, 4, 0, 3, "columns"),
     "Strang": Row(cfjax.Strang, "splitting", 2, None, 1, 1, None, "terms", True),
     "BlanesMoan4": Row(cfjax.BlanesMoan4, "splitting", 4, None, 6, 1, None, "terms", True),
     "BlanesMoan6": Row(cfjax.BlanesMoan6, "splitting", 6, None, 10, 1, None, "terms", True),

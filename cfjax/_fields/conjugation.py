@@ -10,13 +10,14 @@ from jax import lax
 from jaxtyping import Array, Bool, Inexact
 
 from .._arrays import Weight
+from .._numerics.cayley import dcayinv, solve, solve_from_right
 from .._numerics.expm import expm, expm_parts
 from .._numerics.expm_both import expm_both_parts
 from .._numerics.expm_source import expm_parts_with_source
 from .._numerics.matmul import plus_identity, promoted, small_product
+from .coordinates import BesideCayley, Cayley
 from .elementwise import check_other, check_point, each, elementwise
 from .matrix import AbstractMatrix, check_companion
-from .projected import BesideCayley
 
 
 class AbstractTwoSided(AbstractMatrix):
@@ -49,16 +50,19 @@ class AbstractTwoSided(AbstractMatrix):
     def projected(self, point: Inexact[Array, "*batch n n"]) -> Any:
         if self._num_axes:
             return elementwise(self, self._num_axes).projected(point)
-        return BesideCayley(self.tangent(point), type(self)(self.effective()))
+        return BesideCayley(self.tangent(point), Cayley(type(self)(self.effective())))
+
+    def cayley(self, point: Inexact[Array, "*batch n n"]) -> Any:
+        effective = each(lambda field: type(self)(field.effective()), self._num_axes)(self)
+        field = Cayley(effective)
+        return elementwise(field, self._num_axes) if self._num_axes else field
 
     def dcayinv(self, other: Any) -> Any:
         """How u, this field, changes where `cay(u)` does with the matrix of the other field.
 
-        Here `cay(u) = (I - u/2)^-1 (I + u/2)`, and u' is `(I - u/2) a (I + u/2)`. For fields
-        without leading axes.
+        For fields without leading axes.
         """
-        a = other.a - _times(self.a, other.a) / 2
-        return type(self)(a + _times(a, self.a) / 2)
+        return type(self)(dcayinv(self.a, other.a))
 
     @abc.abstractmethod
     def cayley_increment(self, x: Inexact[Array, "n n"]) -> Inexact[Array, "n n"]:
@@ -131,8 +135,8 @@ class Conjugation(AbstractTwoSided):
 
     def cayley_increment(self, x: Inexact[Array, "n n"]) -> Inexact[Array, "n n"]:
         u, x = promoted(self.a, x)
-        left = jnp.linalg.solve(plus_identity(-u / 2), _commutator(u, x))
-        return jnp.linalg.solve(plus_identity(u / 2).T, left.T).T
+        left = solve(plus_identity(-u / 2), _commutator(u, x))
+        return solve_from_right(left, plus_identity(u / 2))
 
     def commutator(self, other: Any) -> "Conjugation":
         return Conjugation(_commutator(self.a, other.a))
@@ -203,6 +207,9 @@ class Congruence(AbstractTwoSided):
     def projected(self, point: Inexact[Array, "*batch n n"]) -> Any:
         return super().projected(point) if self.q is None else None
 
+    def cayley(self, point: Inexact[Array, "*batch n n"]) -> Any:
+        return super().cayley(point) if self.q is None else None
+
     def effective(self) -> Inexact[Array, "n n"]:
         if not jnp.iscomplexobj(self.a):
             return self.a
@@ -213,8 +220,8 @@ class Congruence(AbstractTwoSided):
         is_hermitian = jnp.all(x == _adjoint(x))
         u, x = promoted(self.a, x)
         matrix = plus_identity(-u / 2)
-        left = jnp.linalg.solve(matrix, _linear_part(u, x))
-        return _without_skew_part(_adjoint(jnp.linalg.solve(matrix, _adjoint(left))), is_hermitian)
+        left = solve(matrix, _linear_part(u, x))
+        return _without_skew_part(_adjoint(solve(matrix, _adjoint(left))), is_hermitian)
 
     def velocity(self, x: Inexact[Array, "n n"]) -> Inexact[Array, "n n"]:
         v = _linear_part(self.a, x)

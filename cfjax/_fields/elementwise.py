@@ -7,10 +7,17 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 import jax.tree_util as jtu
+from jax import lax
 from jaxtyping import Array, Bool, PyTree, Real
 
 from .._arrays import Weight
-from .._field import AbstractAlgebraElement, AbstractFrozenField, combine, is_field
+from .._field import (
+    AbstractAlgebraElement,
+    AbstractCoordinates,
+    AbstractFrozenField,
+    combine,
+    is_field,
+)
 
 
 def each(fun: Callable[..., PyTree], num_axes: int) -> Callable[..., PyTree]:
@@ -163,6 +170,8 @@ def elementwise(field: AbstractFrozenField, num_axes: int = 1) -> AbstractFrozen
             )
     if isinstance(field, Elementwise):
         field, num_axes = field.field, num_axes + field.num_axes
+    if isinstance(field, AbstractCoordinates):
+        return ElementwiseCoordinates(field, num_axes)
     is_element = isinstance(field, AbstractAlgebraElement)
     return (ElementwiseElement if is_element else Elementwise)(field, num_axes)
 
@@ -228,6 +237,10 @@ class Elementwise(AbstractFrozenField):
         field = self._each(lambda field, point: field.projected(point))(self.field, point)
         return None if field is None else elementwise(field, self.num_axes)
 
+    def cayley(self, point: Any) -> Any:
+        field = self._each(lambda field, point: field.cayley(point))(self.field, point)
+        return None if field is None else elementwise(field, self.num_axes)
+
     def _each(self, fun: Callable[..., PyTree]) -> Callable[..., PyTree]:
         return each(fun, self.num_axes)
 
@@ -247,7 +260,28 @@ class ElementwiseElement(Elementwise, AbstractAlgebraElement):
         has_value = self._each(lambda a: a.has_dexpinv())(self.field)
         return None if has_value is None else jnp.all(has_value)
 
-    def projection(self, point: Any) -> tuple[Any, Bool[Array, ""]]:
-        each = self._each(lambda field, point: field.projection(point))
-        increment, is_there = each(self.field, point)
-        return increment, jnp.all(is_there)
+
+class ElementwiseCoordinates(Elementwise, AbstractCoordinates):
+    """What `elementwise` of a field in coordinates of a step returns."""
+
+    field: AbstractCoordinates
+
+    def rate(self, field: Any, start: Any) -> Any:
+        if self.field.is_rate_of_start:
+            each = self._each(lambda u, field, start: u.rate(field, start))
+            rates = each(self.field, field.field, start)
+        else:
+            # One for all points where the field is one.
+            rates = self._each(lambda u, field: u.rate(field, None))(self.field, field.field)
+        return elementwise(rates, self.num_axes)
+
+    def has_rate(self) -> Bool[Array, ""] | None:
+        has_value = self._each(lambda u: u.has_rate())(self.field)
+        return None if has_value is None else jnp.all(has_value)
+
+    def landing(self, start: Any) -> tuple[Any, Bool[Array, ""]]:
+        increment, is_there = self._each(lambda u, start: u.landing(start))(self.field, start)
+        # A branch keeps the step from being compiled as a program of single numbers. With 3 x 3
+        # matrices and RKMK8 that has 29 000 instructions in place of 800, and takes three times as
+        # long.
+        return increment, lax.cond(jnp.all(is_there), lambda: True, lambda: False)

@@ -24,8 +24,8 @@ from .._numerics.span import (
     plus_product,
     square,
 )
+from .coordinates import Polar, Tangent
 from .elementwise import check_point, check_real, each, elementwise
-from .projected import Polar
 
 
 class AbstractSkew(AbstractFrozenField):
@@ -41,6 +41,10 @@ class AbstractSkew(AbstractFrozenField):
         # Skew by construction.
         defect = jnp.zeros((), point.dtype)
         return Polar(self.tangent(point), defect, are_orthonormal=True)
+
+    def cayley(self, point: Float[Array, "*batch n p"]) -> Any:
+        velocity = Tangent(self.tangent(point))
+        return elementwise(velocity, point.ndim - 2) if point.ndim > 2 else velocity
 
 
 class LowRankSkew(AbstractSkew):

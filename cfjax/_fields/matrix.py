@@ -11,12 +11,13 @@ from jax import lax
 from jaxtyping import Array, Bool, Inexact, Real
 
 from .._field import AbstractAlgebraElement
+from .._numerics.cayley import dcayinv, solve, solve_from_right
 from .._numerics.expm import expm_parts
 from .._numerics.expm_multiply import Dense, expm_minus_one_multiply, row_norm
-from .._numerics.matmul import by_columns, promoted, small_product
+from .._numerics.matmul import by_columns, plus_identity, promoted, small_product
 from .._numerics.squaring import max_over_batch
+from .coordinates import Cayley, Polar, skew_defect
 from .elementwise import check_other, check_point, each, elementwise
-from .projected import Polar, skew_defect
 
 
 class AbstractMatrix(AbstractAlgebraElement):
@@ -96,6 +97,26 @@ class AbstractOneSided(AbstractMatrix):
             )
         return Polar(self.tangent(point), skew_defect(self.a), are_rows=self.axis == -1)
 
+    def cayley(self, point: Inexact[Array, "..."]) -> Any:
+        trace = None
+        # The transform keeps every quadratic form, but determinants only where they follow from
+        # one up to their sign.
+        if self.a.shape[-1] == 3 and jnp.iscomplexobj(self.a):
+            trace = jnp.trace(self.a, axis1=-2, axis2=-1)
+        field = Cayley(self, trace)
+        return elementwise(field, self._num_axes) if self._num_axes else field
+
+    @abc.abstractmethod
+    def dcayinv(self, other: Any) -> Any:
+        """How u, this field, changes where `cay(u)` does with the matrix of the other field.
+
+        For fields without leading axes.
+        """
+
+    @abc.abstractmethod
+    def cayley_increment(self, x: Inexact[Array, "..."]) -> Inexact[Array, "..."]:
+        """By how much `cay(u)` of this field, u, moves x; for a field without leading axes."""
+
     def _each(self, fun: Callable[[Array, Array], Array], point: Array) -> Array:
         n = self.a.shape[-1]
         matrix = (n, "k") if self.axis == 0 else ("k", n)
@@ -133,6 +154,12 @@ class LeftMatrix(AbstractOneSided):
     def act(a: Inexact[Array, "n n"], x: Inexact[Array, "n *k"]) -> Inexact[Array, "n *k"]:
         return small_product(*promoted(a, x))
 
+    def dcayinv(self, other: "LeftMatrix") -> "LeftMatrix":
+        return LeftMatrix(dcayinv(self.a, other.a))
+
+    def cayley_increment(self, x: Inexact[Array, "n *k"]) -> Inexact[Array, "n *k"]:
+        return solve(plus_identity(-self.a / 2), self.act(self.a, x))
+
 
 class RightMatrix(AbstractOneSided):
     """The linear field `x' = x a`, whose flow is `x -> x exp(a)`.
@@ -146,6 +173,13 @@ class RightMatrix(AbstractOneSided):
     @staticmethod
     def act(a: Inexact[Array, "n n"], x: Inexact[Array, "*k n"]) -> Inexact[Array, "*k n"]:
         return small_product(*promoted(x, a))
+
+    def dcayinv(self, other: "RightMatrix") -> "RightMatrix":
+        # The body's frame has the other sign.
+        return RightMatrix(dcayinv(-self.a, other.a))
+
+    def cayley_increment(self, x: Inexact[Array, "*k n"]) -> Inexact[Array, "*k n"]:
+        return solve_from_right(self.act(self.a, x), plus_identity(-self.a / 2))
 
 
 def exp_times(

@@ -10,19 +10,20 @@ import diffrax
 import equinox as eqx
 import jax.numpy as jnp
 import jax.tree_util as jtu
+import numpy as np
 from jax import lax
 from jaxtyping import Array, Bool, PyTree, Real
 
 from .._control_term import is_driven
 from .._field import (
     AbstractAlgebraElement,
+    AbstractCoordinates,
     bracket,
     combine,
-    dexpinv,
-    has_dexpinv,
+    has_rate,
+    in_coordinates,
     is_field,
     no_bracket_message,
-    projected,
     tangent,
 )
 from .._methods.continuous_extension import RungeKuttaExtension, runge_kutta_extension
@@ -32,8 +33,8 @@ from .._numerics.vectors import smooth
 from .._term import product
 from .base import check_choice, combine_nonzero, without_trailing_zeros
 from .compiled import materialised_together, scalarised
+from .coordinates import CHARTS
 from .dense import Path
-from .projected import ProjectedChart
 from .stages import rolled_elements
 from .step import AbstractChartSolver, Chart, Step
 from .sums import Sums
@@ -118,7 +119,7 @@ class AbstractMuntheKaas(AbstractChartSolver, diffrax.AbstractStratonovichSolver
 
 
 class _Elements(NamedTuple):
-    """Elements of the algebra, and a zero, which is NaN if some `dexpinv` had no value.
+    """Elements of the algebra, and a zero, which is NaN if some `rate` had no value.
 
     The elements then mean nothing, but they are finite: the derivative of a rejected step must be
     zero, and that of NaN is NaN. The zero is None if nothing is known. `last` is the value of the
@@ -141,9 +142,9 @@ class _Elements(NamedTuple):
 
 # A number and not a predicate: a comparison would keep the divisions of the whole step.
 @smooth
-def _zero_or_nan(u: PyTree) -> Real[Array, ""] | None:
-    """Zero, or NaN if `dexpinv` at u has no value; None if nothing is known."""
-    return _zero_where(has_dexpinv(u), u)
+def _zero_or_nan(chart: Chart, u: PyTree) -> Real[Array, ""] | None:
+    """Zero, or NaN if the `rate` at u has no value; None if nothing is known."""
+    return _zero_where(chart.has_rate(u), u)
 
 
 def _zero_where(is_defined: Bool[Array, ""] | None, u: PyTree) -> Real[Array, ""] | None:
@@ -160,7 +161,7 @@ def _first_element(chart: Chart) -> PyTree:
     **Raises** `TypeError` for a field without a bracket.
     """
     for part in jtu.tree_leaves(chart.first_field, is_leaf=is_field):
-        if is_field(part) and not isinstance(part, AbstractAlgebraElement):
+        if is_field(part) and not isinstance(part, AbstractAlgebraElement | AbstractCoordinates):
             raise TypeError(no_bracket_message(part))
     return chart.first_field
 
@@ -235,66 +236,10 @@ class RKMK4(AbstractMuntheKaas):
         return _Elements([k1, k2, k3, k4, bracket(k1, k4)])
 
 
-class RKMK(AbstractMuntheKaas, diffrax.AbstractAdaptiveSolver):
-    """The Munthe-Kaas method of any explicit Runge-Kutta method, with its order and its estimate.
+class AbstractTableau(AbstractMuntheKaas):
+    """The Munthe-Kaas method of a tableau, in some coordinates of a step."""
 
-    Each stage but the first takes the inverse derivative of the exponential, `dexpinv` of the
-    field: a closed form for `Rotation`, `QuaternionRotation`, `RigidMotion`, `PlanarMotion`,
-    `ExtendedMotion` and `Scaling`, otherwise a series. The series of a method of order q has up to
-    q - 2 commutators, or q - 3 if q is odd and above 3. From a full turn on the exponential cannot
-    be inverted. For these fields and `InertialMotion`, a step where one of them, times the step
-    size, is an angular velocity of 2 pi or more at some stage is an error, or taken again, shorter,
-    with adaptive steps. The series of other fields converges below this bound only, and the step is
-    as wrong as any that is too long.
-
-    The estimate comes at no extra cost, unless the tableau is first same as last: then it needs the
-    field at the end of the step, which is the first field of the next step. Dense output has order
-    q - 1 and uses the stages alone; for `diffrax.Dopri8` it takes 4 evaluations more.
-
-    With `coordinates="projected"` a step takes no exponentials and no commutators. Within a step it
-    moves along straight lines: the stages are those of the tableau in plain space, off the manifold
-    by their own error, and only the end of the step, or the output within it, is brought back to
-    the manifold. The order, the order of output and the cost of the estimate are as above; the
-    estimate is that of plain space. It takes these fields, with leading axes or without, and arrays
-    and None beside them:
-
-    - `LeftMatrix` and `RightMatrix` with a skew-Hermitian `a`, on columns or rows of full rank. The
-      end keeps their products, so matrices stay orthogonal or unitary. The determinant of a complex
-      matrix is only as accurate as the solution. A step takes four or five products with the point
-      more than in plain space, and an inverse where the columns are not orthonormal.
-    - `LowRankSkew` and `BorderedSkew`. The end has orthonormal columns.
-    - `Conjugation` and `Congruence` without `q`, with any `a`. Beside the point a step computes an
-      element of the algebra in Cayley's coordinates, which moves the start to the end. This takes
-      two products of matrices a stage, and two solves a step.
-
-    The function of the term is called off the manifold, and must return elements of the same
-    algebra there.
-
-    **Arguments:**
-
-    - `tableau`: a `diffrax.ButcherTableau`, for example `diffrax.Dopri5.tableau`.
-    - `coordinates`: `"exponential"` or `"projected"`.
-    - `estimate`: the estimate of the error, if the tableau has an embedded method, which gives
-      another element of the algebra. `"algebra"`, the default, is the velocity of the difference of
-      both elements at the end of the step, and takes no flow. `"group"` is the difference between
-      the end points of both methods, for 1 flow more. None leaves out the estimate, which constant
-      steps do not need. `cfjax.integrate` leaves it out.
-    - `unroll`: whether the stages are unrolled in the program, as in `cfjax.CommutatorFree`.
-
-    **Raises** `TypeError` if the tableau is something else, `ValueError` if the method is implicit,
-    or for other `coordinates`, `estimate` or `unroll`. With `coordinates="projected"`: `TypeError`
-    for a field without these coordinates, `ValueError` for more columns than a column has entries;
-    and a runtime error for an `a` that is not skew-Hermitian at the start, by more than 1000 units
-    of rounding of its largest entry. Such an `a` later on makes a step fail, and so do an end so
-    far off that five corrections do not lead to rounding, and an element of the algebra that turns
-    by nearly pi. Then `cfjax.integrate` raises an error, and an adaptive step is taken again,
-    shorter.
-
-    Source: Munthe-Kaas, High order Runge-Kutta methods on manifolds, Appl. Numer. Math. 29 (1999),
-    doi:10.1016/S0168-9274(98)00030-0.
-    """
-
-    coordinates: Literal["exponential", "projected"] = eqx.field(
+    coordinates: Literal["exponential", "projected", "cayley"] = eqx.field(
         static=True, default="exponential", kw_only=True
     )
     # Tuples: unlike diffrax's tableau they compare by value, as a static field must. Last are
@@ -310,7 +255,7 @@ class RKMK(AbstractMuntheKaas, diffrax.AbstractAdaptiveSolver):
         self,
         tableau: diffrax.ButcherTableau,
         *,
-        coordinates: Literal["exponential", "projected"] = "exponential",
+        coordinates: Literal["exponential", "projected", "cayley"] = "exponential",
         estimate: Literal["algebra", "group"] | None = "algebra",
         unroll: bool | None = None,
     ):
@@ -332,17 +277,17 @@ class RKMK(AbstractMuntheKaas, diffrax.AbstractAdaptiveSolver):
         self.unroll = unroll
 
     def __check_init__(self):
-        check_choice("coordinates", self.coordinates, "exponential", "projected")
+        check_choice("coordinates", self.coordinates, *CHARTS)
 
     @property
     def chart_type(self) -> type[Chart]:
-        return ProjectedChart if self.coordinates == "projected" else Chart
+        return CHARTS[self.coordinates]
 
     def start(self, terms, t0, t1, y0, args):
         state, fault = super().start(terms, t0, t1, y0, args)
         if self.coordinates == "projected":
             value = product(terms, terms.vf(t0, y0, args), terms.contr(t0, t1))
-            is_defined = has_dexpinv(projected(lax.stop_gradient(value), y0))
+            is_defined = has_rate(in_coordinates("projected", lax.stop_gradient(value), y0))
             if is_defined is not None:
                 fault = fault.with_case(~is_defined, _NOT_SKEW)
         return state, fault
@@ -387,8 +332,8 @@ class RKMK(AbstractMuntheKaas, diffrax.AbstractAdaptiveSolver):
                 point = chart.flow(u, chart.start)
             value = chart.value_at(c, point)
             field = chart.frozen(value, point, elements.fields)
-            elements = elements.add_zero(_zero_or_nan(u))._replace(
-                fields=[*elements.fields, dexpinv(u, field, self._degree)], last=value
+            elements = elements.add_zero(_zero_or_nan(chart, u))._replace(
+                fields=[*elements.fields, chart.rate(u, field, self._degree)], last=value
             )
         return elements
 
@@ -420,8 +365,9 @@ class RKMK(AbstractMuntheKaas, diffrax.AbstractAdaptiveSolver):
         self, fields: list[PyTree], rows: Sequence[Row], times: Sequence[float], chart: Chart
     ) -> _Elements:
         """These fields, and a stage for each row and time."""
-        inverse = functools.partial(dexpinv, degree=self._degree)
-        rolled = rolled_elements(self.unroll, chart, fields, rows, times, inverse, _zero_or_nan)
+        rate = functools.partial(chart.rate, degree=self._degree)
+        zero_of = functools.partial(_zero_or_nan, chart)
+        rolled = rolled_elements(self.unroll, chart, fields, rows, times, rate, zero_of)
         if rolled is not None:
             return _Elements(*rolled)
         elements = _Elements(fields)
@@ -431,10 +377,101 @@ class RKMK(AbstractMuntheKaas, diffrax.AbstractAdaptiveSolver):
             else:
                 # Rows may be shorter than the list of fields.
                 u = combine_nonzero(row, elements.fields)
-                stage = inverse(u, _field_at(chart, c, u, elements.fields))
-                elements = elements.add_zero(_zero_or_nan(u))
+                stage = rate(u, _field_at(chart, c, u, elements.fields))
+                elements = elements.add_zero(_zero_or_nan(chart, u))
             elements = elements._replace(fields=[*elements.fields, stage])
         return elements
+
+
+class RKMK(AbstractTableau, diffrax.AbstractAdaptiveSolver):
+    """The Munthe-Kaas method of any explicit Runge-Kutta method, with its order and its estimate.
+
+    Each stage but the first takes the inverse derivative of the exponential, `dexpinv` of the
+    field: a closed form for `Rotation`, `QuaternionRotation`, `RigidMotion`, `PlanarMotion`,
+    `ExtendedMotion` and `Scaling`, otherwise a series. The series of a method of order q has up to q - 2
+    commutators, or q - 3 if q is odd and above 3. From a full turn on the exponential cannot be
+    inverted. For these fields and `InertialMotion`, a step where one of them, times the step size,
+    is an angular velocity of 2 pi or more at some stage is an error, or taken again, shorter, with
+    adaptive steps. The series of other fields converges below this bound only, and the step is as
+    wrong as any that is too long.
+
+    The estimate comes at no extra cost, unless the tableau is first same as last: then it needs the
+    field at the end of the step, which is the first field of the next step. Dense output has order
+    q - 1 and uses the stages alone; for `diffrax.Dopri8` it takes 4 evaluations more.
+
+    With `coordinates="projected"` a step takes no exponentials and no commutators. Within a step it
+    moves along straight lines: the stages are those of the tableau in plain space, off the manifold
+    by their own error, and only the end of the step, or the output within it, is brought back to
+    the manifold. The order, the order of output and the cost of the estimate are as above; the
+    estimate is that of plain space. It takes these fields, with leading axes or without, and arrays
+    and None beside them:
+
+    - `LeftMatrix` and `RightMatrix` with a skew-Hermitian `a`, on columns or rows of full rank. The
+      end keeps their products, so matrices stay orthogonal or unitary. The determinant of a complex
+      matrix is only as accurate as the solution. A step takes four or five products with the point
+      more than in plain space, and an inverse where the columns are not orthonormal.
+    - `LowRankSkew` and `BorderedSkew`. The end has orthonormal columns.
+    - `Conjugation` and `Congruence` without `q`, with any `a`. Beside the point a step computes an
+      element of the algebra in Cayley's coordinates, which moves the start to the end. This takes
+      two products of matrices a stage, and two solves a step.
+
+    The function of the term is called off the manifold, and must return elements of the same
+    algebra there.
+
+    With `coordinates="cayley"` a step takes no exponentials and no commutators either, but all its
+    stages are on the manifold: Cayley's transform `cay(u) = (I - u/2)^-1 (I + u/2)` stands in place
+    of the exponential, and the inverse of its derivative is `(I - u/2) a (I + u/2)`. The order, the
+    order of output and the cost of the estimate are as above. It takes these fields, with leading
+    axes or without, and arrays and None beside them:
+
+    - `LeftMatrix`, `RightMatrix`, `Conjugation` and `Congruence` without `q`, with any `a`. Every
+      form `y^H J y` that the group of the field keeps is kept to rounding, for example of
+      orthogonal, unitary, symplectic and Lorentz matrices. J occurs nowhere. The determinant of
+      complex 3 x 3 matrices follows the trace of `a` to rounding; any other determinant that does
+      not follow from a form, for example of SU(4), is as accurate as the solution. A stage takes
+      a linear system of the size of `a` for each side that it acts from, written out up to n = 4,
+      and four to six products of matrices.
+    - `LowRankSkew`, `BorderedSkew` and `SphereRotation`, in tangent vectors at the start, as in
+      `CayleyRK4`.
+
+    These coordinates end at half a turn. A step by nearly as much fails: where the angles of
+    cay(u) are all below 1 it is none, and where a pair of them is above 2.5 for n = 3, or 2.75 for
+    n = 100, it is one.
+
+    **Arguments:**
+
+    - `tableau`: a `diffrax.ButcherTableau`, for example `diffrax.Dopri5.tableau`.
+    - `coordinates`: `"exponential"`, `"projected"` or `"cayley"`.
+    - `estimate`: the estimate of the error, if the tableau has an embedded method, which gives
+      another element of the algebra. `"algebra"`, the default, is the velocity of the difference of
+      both elements at the end of the step, and takes no flow. `"group"` is the difference between
+      the end points of both methods, for 1 flow more. None leaves out the estimate, which constant
+      steps do not need. `cfjax.integrate` leaves it out.
+    - `unroll`: whether the stages are unrolled in the program, as in `cfjax.CommutatorFree`.
+
+    **Raises** `TypeError` if the tableau is something else, `ValueError` if the method is implicit,
+    or for other `coordinates`, `estimate` or `unroll`; `TypeError` for a field without such
+    coordinates. With `coordinates="projected"`: `ValueError` for more columns than a column has
+    entries, and a runtime error for an `a` that is not skew-Hermitian at the start, by more than
+    1000 units of rounding of its largest entry. Such an `a` later on makes a step fail, and so do
+    an end so far off that five corrections do not lead to rounding, and with both coordinates an
+    element of the algebra that turns by nearly pi. Then `cfjax.integrate` raises an error, and an
+    adaptive step is taken again, shorter.
+
+    Source: Munthe-Kaas, High order Runge-Kutta methods on manifolds, Appl. Numer. Math. 29 (1999),
+    doi:10.1016/S0168-9274(98)00030-0; for Cayley's transform, Iserles, Munthe-Kaas, Nørsett &
+    Zanna, Lie-group methods, Acta Numerica 9 (2000), Section 6, doi:10.1017/S0962492900002154.
+    """
+
+    def __init__(
+        self,
+        tableau: diffrax.ButcherTableau,
+        *,
+        coordinates: Literal["exponential", "projected", "cayley"] = "exponential",
+        estimate: Literal["algebra", "group"] | None = "algebra",
+        unroll: bool | None = None,
+    ):
+        super().__init__(tableau, coordinates=coordinates, estimate=estimate, unroll=unroll)
 
 
 class RKMK5(RKMK):
@@ -443,7 +480,7 @@ class RKMK5(RKMK):
     This is `RKMK(diffrax.Tsit5.tableau)`, without commutators for a field whose `dexpinv` is a
     closed form, otherwise with 10. The estimate takes no flow, but needs the field at the end of
     the step, which is the first field of the next step, and 2 commutators for this field. Dense
-    output of order 4. With `coordinates="projected"` it takes no commutators.
+    output of order 4. With other `coordinates`, as in `RKMK`, it takes no commutators.
 
     `coordinates`, `estimate` and `unroll` are those of `cfjax.RKMK`.
 
@@ -454,7 +491,7 @@ class RKMK5(RKMK):
     def __init__(
         self,
         *,
-        coordinates: Literal["exponential", "projected"] = "exponential",
+        coordinates: Literal["exponential", "projected", "cayley"] = "exponential",
         estimate: Literal["algebra", "group"] | None = "algebra",
         unroll: bool | None = None,
     ):
@@ -468,8 +505,8 @@ class RKMK8(RKMK):
 
     This is `RKMK(diffrax.Dopri8.tableau)`, for fields whose `dexpinv` is a closed form: with other
     fields it takes 72 commutators a step. The estimate comes at no extra cost. Dense output of
-    order 7, for 4 evaluations and flows more. With `coordinates="projected"` it takes
-    no commutators.
+    order 7, for 4 evaluations and flows more. With other `coordinates`, as in `RKMK`, it takes no
+    commutators.
 
     `coordinates`, `estimate` and `unroll` are those of `cfjax.RKMK`.
 
@@ -480,13 +517,39 @@ class RKMK8(RKMK):
     def __init__(
         self,
         *,
-        coordinates: Literal["exponential", "projected"] = "exponential",
+        coordinates: Literal["exponential", "projected", "cayley"] = "exponential",
         estimate: Literal["algebra", "group"] | None = "algebra",
         unroll: bool | None = None,
     ):
         super().__init__(
             diffrax.Dopri8.tableau, coordinates=coordinates, estimate=estimate, unroll=unroll
         )
+
+
+class CayleyRK4(AbstractTableau):
+    """The classical Runge-Kutta method in the coordinates of Cayley's transform.
+
+    Order 4, 4 evaluations. Dense output of order 3. This is `RKMK` of the classical tableau with
+    `coordinates="cayley"`, which says what fields it takes. In a linear space it is the classical
+    Runge-Kutta method.
+
+    **Cost** on orthonormal columns, shape `(n, p)`: solves of sizes 2p and p, and products of size
+    `n p^2`. No n x n matrix is formed.
+
+    Source: Celledoni & Owren, On the implementation of Lie group methods on the Stiefel manifold,
+    Numer. Algorithms 32 (2003); RKR-C in Celledoni, Marthinsen & Owren, FGCS 19 (2003).
+    """
+
+    def __init__(self, *, unroll: bool | None = None):
+        super().__init__(_CLASSICAL, coordinates="cayley", estimate=None, unroll=unroll)
+
+
+_CLASSICAL = diffrax.ButcherTableau(
+    a_lower=(np.array([0.5]), np.array([0.0, 0.5]), np.array([0.0, 0.0, 1.0])),
+    b_sol=np.array([1 / 6, 1 / 3, 1 / 3, 1 / 6]),
+    b_error=np.zeros(4),
+    c=np.array([0.5, 0.5, 1.0]),
+)
 
 
 @functools.lru_cache

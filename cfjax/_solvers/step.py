@@ -12,7 +12,7 @@ from jax import lax
 from jax.core import Tracer
 from jaxtyping import Array, Bool, PyTree, Real
 
-from .._field import from_chart, is_field
+from .._field import dexpinv, from_chart, has_dexpinv, is_field
 from .._term import product
 from .base import AbstractLieSolver, State, result_of, time_at
 from .compiled import (
@@ -92,6 +92,17 @@ class Chart(NamedTuple):
     def flow_of_step(self, field: PyTree) -> tuple[PyTree, Bool[Array, ""] | None]:
         """Where a step leads along one field: its end, and whether there is one, None if so."""
         return self.flow(field, self.start), None
+
+    def rate(self, u: PyTree, field: PyTree, degree: int) -> PyTree:
+        """How u changes where the point to which it leads from the start moves with a field.
+
+        The degree is for a series of commutators.
+        """
+        return dexpinv(u, field, degree)
+
+    def has_rate(self, u: PyTree) -> Bool[Array, ""] | None:
+        """Whether `rate` at u has a value; None if nothing is known."""
+        return has_dexpinv(u)
 
     # Within a step, from the state at its start, for `Path`.
     apply_flow = staticmethod(flow_once)

@@ -15,8 +15,6 @@ from cfjax._methods.continuous_extension import (
 )
 from cfjax._methods.tableau import Tableau
 
-CLASSICAL = ((), (0.5,), (0.0, 0.5), (0.0, 0.0, 1.0)), (1 / 6, 1 / 3, 1 / 3, 1 / 6), 4
-
 
 def named() -> dict[str, tuple[Any, ...]]:
     """By name, the coefficients of the methods whose sources have no continuous extension."""
@@ -26,10 +24,10 @@ def named() -> dict[str, tuple[Any, ...]]:
         tableau = getattr(solver, "tableau", None)
         if isinstance(tableau, Tableau) and tableau.continuous_extension is None:
             found[name] = (tableau,)
-    for solver in (cfjax.RKMK5(), cfjax.RKMK8()):
+    for solver in (cfjax.RKMK5(), cfjax.RKMK8(), cfjax.CayleyRK4()):
         coefficients = solver.a[: len(solver.b)], solver.b, solver.order(None)
         found[type(solver).__name__] = coefficients
-    return found | {"CayleyRK4": CLASSICAL}
+    return found
 
 
 def derived() -> dict[str, dict[str, Any]]:

@@ -531,7 +531,7 @@ def test_step_doubling_controls_the_error():
 
 def test_ito_and_stratonovich_marks_and_strong_orders():
     term, ode = term_of(GIVEN), cfjax.LieTerm(drift)
-    kinds = "commutator-free", "low-storage", "Munthe-Kaas", "retraction", "splitting", "noise"
+    kinds = "commutator-free", "low-storage", "Munthe-Kaas", "splitting", "noise"
     of_stratonovich = [row.make() for row in solvers(*kinds).values()]
     of_stratonovich.remove(cfjax.LieEuler())
     for solver in of_stratonovich:

@@ -1,0 +1,81 @@
+"""Steps in coordinates other than those of the exponential, which the fields offer."""
+
+from collections.abc import Callable
+from typing import Any, ClassVar
+
+import jax.numpy as jnp
+import jax.tree_util as jtu
+from jaxtyping import PyTree
+
+from .._field import has_rate, in_coordinates, landing, rate
+from .compiled import materialised_in_rows
+from .step import Chart
+from .sums import Sums
+
+
+def landed(field: PyTree, start: PyTree) -> PyTree:
+    """Where a field in these coordinates leads from the start of a step, on the manifold."""
+    return jtu.tree_map(jnp.add, start, landing(field, start)[0])
+
+
+class AbstractCoordinateChart(Chart):
+    """A step whose fields are `AbstractCoordinates`, by the method of the fields of this name.
+
+    Sums of them are coordinates u of a point. A Munthe-Kaas method is the Runge-Kutta method of its
+    tableau for u, whose velocity is the `rate`.
+    """
+
+    __slots__ = ()
+
+    name: ClassVar[str]
+
+    apply_flow = staticmethod(landed)
+
+    @classmethod
+    def at_start(
+        cls,
+        value: Callable[[Any, PyTree], PyTree],
+        product: Callable[[PyTree], PyTree],
+        sums: Sums,
+        first_value: PyTree,
+    ) -> "AbstractCoordinateChart":
+        first_field = in_coordinates(cls.name, product(first_value), sums.y0)
+        return cls(value, product, sums, first_value, first_field, sums.start)
+
+    def frozen(self, value, point, earlier):
+        return in_coordinates(self.name, self.product(value), self.sums.state(point))
+
+    def rate(self, u, field, degree):
+        return rate(u, field, self.origin)
+
+    def has_rate(self, u):
+        return has_rate(u)
+
+    def flow_of_step(self, field):
+        increment, is_there = landing(field, self.origin)
+        # A part that is no sum has its state there.
+        end = jtu.tree_map(jnp.add, self.start, increment)
+        return materialised_in_rows(end), is_there
+
+
+class ProjectedChart(AbstractCoordinateChart):
+    """A step in plain space, whose end is brought back to the manifold."""
+
+    __slots__ = ()
+
+    name = "projected"
+
+
+class CayleyChart(AbstractCoordinateChart):
+    """A step in the coordinates of Cayley's transform."""
+
+    __slots__ = ()
+
+    name = "cayley"
+
+
+CHARTS: dict[str, type[Chart]] = {
+    "exponential": Chart,
+    "projected": ProjectedChart,
+    "cayley": CayleyChart,
+}
