@@ -388,12 +388,12 @@ class RKMK(AbstractTableau, diffrax.AbstractAdaptiveSolver):
 
     Each stage but the first takes the inverse derivative of the exponential, `dexpinv` of the
     field: a closed form for `Rotation`, `QuaternionRotation`, `RigidMotion`, `PlanarMotion`,
-    `ExtendedMotion` and `Scaling`, otherwise a series. The series of a method of order q has up to q - 2
-    commutators, or q - 3 if q is odd and above 3. From a full turn on the exponential cannot be
-    inverted. For these fields and `InertialMotion`, a step where one of them, times the step size,
-    is an angular velocity of 2 pi or more at some stage is an error, or taken again, shorter, with
-    adaptive steps. The series of other fields converges below this bound only, and the step is as
-    wrong as any that is too long.
+    `ExtendedMotion` and `Scaling`, otherwise a series. The series of a method of order q has up to
+    q - 2 commutators, or q - 3 if q is odd and above 3. From a full turn on the exponential cannot
+    be inverted. For these fields and `InertialMotion`, a step where one of them, times the step
+    size, is an angular velocity of 2 pi or more at some stage is an error, or taken again, shorter,
+    with adaptive steps. The series of other fields converges below this bound only, and the step is
+    as wrong as any that is too long.
 
     The estimate comes at no extra cost, unless the tableau is first same as last: then it needs the
     field at the end of the step, which is the first field of the next step. Dense output has order
