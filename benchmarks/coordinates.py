@@ -274,7 +274,8 @@ def _equal(problem: str, given: Problem, names: list[str], rounds: int) -> Itera
         for row in _rows(names, runs, factors, rounds, where):
             yield row | {"number": results.digits(needed[row["method"]])}
     for name, program in programs.items():
-        instructions = sum(" = " in line for line in program.run.as_text().splitlines())
+        text = program.run.as_text() or ""
+        instructions = sum(" = " in line for line in text.splitlines())
         yield {
             "problem": problem,
             "method": name,
@@ -284,7 +285,7 @@ def _equal(problem: str, given: Problem, names: list[str], rounds: int) -> Itera
 
 
 def _adaptive(problem: str, given: Problem, names: list[str], rounds: int) -> Iterator[results.Row]:
-    solves: dict[str, Callable[[float], Any]] = {}
+    solves: dict[str, Callable[[Any], Any]] = {}
     # CF54 is the better one of both there.
     for name in (name for name in names if name != "CF4"):
         term, solver = method(given, name)

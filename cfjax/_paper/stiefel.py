@@ -86,7 +86,7 @@ def rank_of_step(method: str, problem: str) -> int:
     def field(c, y):
         return combine((0.5,), (scene["term"].field(0.0, y, scene["args"]),))
 
-    if isinstance(solver, AbstractMuntheKaas):
+    if isinstance(solver, AbstractMuntheKaas) and not isinstance(solver, CayleyRK4):
         return len(jax.eval_shape(lambda y: solver.logarithm(field, y), scene["y0"]).k)
     if isinstance(solver, CF4):
         # The span of all columns, or the form of the field.

@@ -413,7 +413,7 @@ class RKMK(AbstractTableau, diffrax.AbstractAdaptiveSolver):
     - `LowRankSkew` and `BorderedSkew`. The end has orthonormal columns.
     - `Conjugation` and `Congruence` without `q`, with any `a`. Beside the point a step computes an
       element of the algebra in Cayley's coordinates, which moves the start to the end. This takes
-      two products of matrices a stage, and two solves a step.
+      three products of matrices a stage, and two solves a step.
 
     The function of the term is called off the manifold, and must return elements of the same
     algebra there.
@@ -430,7 +430,7 @@ class RKMK(AbstractTableau, diffrax.AbstractAdaptiveSolver):
       complex 3 x 3 matrices follows the trace of `a` to rounding; any other determinant that does
       not follow from a form, for example of SU(4), is as accurate as the solution. A stage takes
       a linear system of the size of `a` for each side that it acts from, written out up to n = 4,
-      and four to six products of matrices.
+      and three products of matrices besides those with the point.
     - `LowRankSkew`, `BorderedSkew` and `SphereRotation`, in tangent vectors at the start, as in
       `CayleyRK4`.
 
@@ -534,7 +534,7 @@ class CayleyRK4(AbstractTableau):
     Runge-Kutta method.
 
     **Cost** on orthonormal columns, shape `(n, p)`: solves of sizes 2p and p, and products of size
-    `n p^2`. No n x n matrix is formed.
+    `n p^2`. No n x n matrix is formed. `unroll` is that of `cfjax.RKMK`.
 
     Source: Celledoni & Owren, On the implementation of Lie group methods on the Stiefel manifold,
     Numer. Algorithms 32 (2003); RKR-C in Celledoni, Marthinsen & Owren, FGCS 19 (2003).

@@ -52,7 +52,7 @@ OTHERS = r"commutator-free method.*cfjax\.CF4\(\)"
         ),
         (lambda y: cfjax.Congruence(-y, y), np.eye(2), "Congruence", OTHERS),
         (
-            lambda y: cfjax.Affine(1.0, y, -jnp.ones(3)),
+            lambda y: cfjax.Affine(y, -jnp.ones(3)),
             np.ones(3),
             "Affine",
             OTHERS,
