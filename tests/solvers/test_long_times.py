@@ -23,7 +23,7 @@ from scipy.special import ellipj, ellipk
 import cfjax
 
 EPS = 2.0**-52
-PAGE = Path(__file__).parents[2] / "docs" / "long_times.md"
+PAGE = Path(__file__).parents[2] / "docs" / "recipes" / "hmc.md"
 
 
 def all_terms(*fields: Any) -> Any:
