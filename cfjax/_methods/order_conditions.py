@@ -70,7 +70,6 @@ Weights: TypeAlias = dict[Word, Number]
 Defects: TypeAlias = list[tuple[Fraction, float]]
 
 
-@lru_cache
 def order(tableau: Any) -> int:
     """The order of a commutator-free method, at least 1 as every tableau is consistent.
 
@@ -90,18 +89,32 @@ def order(tableau: Any) -> int:
         if isinstance(tableau, ExponentialTableau):
             return classical_order(tableau)
         raise TypeError(f"order: tableau must be a cfjax.Tableau, got {tableau!r}.")
+    return _order(tableau)
+
+
+# The type is checked before: other objects, such as a `diffrax.ButcherTableau`, may have no hash.
+@lru_cache
+def _order(tableau: Tableau) -> int:
     return _largest_order(_defects(_end_weights(tableau), exact_weight), tableau)
 
 
-@lru_cache
 def error_constant(tableau: Tableau) -> float:
     """The size of the leading error term of a `tableau`.
 
     For a method of order q it is the 2-norm of the residuals of all order conditions of order
     q + 1.
+
+    **Raises:** `TypeError` if `tableau` is not a `Tableau`.
     """
+    if not isinstance(tableau, Tableau):
+        raise TypeError(f"error_constant: tableau must be a cfjax.Tableau, got {tableau!r}.")
+    return _error_constant(tableau)
+
+
+@lru_cache
+def _error_constant(tableau: Tableau) -> float:
     defects = _defects(_end_weights(tableau), exact_weight)
-    for _ in range(order(tableau)):
+    for _ in range(_order(tableau)):
         next(defects)
     return math.hypot(*(float(defect) for defect, _ in next(defects)))
 

@@ -37,7 +37,6 @@ Expansion: TypeAlias = Callable[[Combination], Function]
 _MAX_ORDER = 6
 
 
-@lru_cache
 def stiff_order(tableau: ExponentialTableau) -> int:
     """The stiff order of an exponential Runge-Kutta method: that for any stiff linear part.
 
@@ -54,7 +53,12 @@ def stiff_order(tableau: ExponentialTableau) -> int:
         raise TypeError(
             f"stiff_order: tableau must be a cfjax.ExponentialTableau, got {tableau!r}."
         )
+    return _stiff_order(tableau)
 
+
+# The type is checked before: other objects, such as a `diffrax.ButcherTableau`, may have no hash.
+@lru_cache
+def _stiff_order(tableau: ExponentialTableau) -> int:
     def holds(p: int) -> bool:
         below = (_conditions(tableau, q, _exact, _exact) for q in range(2, p))
         return all(map(_is_zero, below)) and _is_zero(_conditions(tableau, p, _exact, _at_zero))

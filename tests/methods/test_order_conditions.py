@@ -392,6 +392,12 @@ def test_order_is_of_a_tableau(no_shape_hook):
     # The method instead of its tableau is an easy mistake.
     with pytest.raises(TypeError, match=r"tableau must be a cfjax.Tableau, got CF4\(\)"):
         order(cfjax.CF4())  # pyright: ignore[reportArgumentType]
+    # It has arrays, so no hash.
+    with pytest.raises(TypeError, match=r"order: tableau must be a cfjax.Tableau, got Butcher"):
+        order(diffrax.Dopri5.tableau)
+    for other in cfjax.CF4(), cfjax.ETD54().tableau, diffrax.Dopri5.tableau:
+        with pytest.raises(TypeError, match=r"error_constant: tableau must be a cfjax.Tableau"):
+            error_constant(other)  # pyright: ignore[reportArgumentType]
 
 
 # Continuous extensions. Their conditions are evaluated on their own: words, weights by recursion.

@@ -2,6 +2,7 @@
 
 from fractions import Fraction as F
 
+import diffrax
 import pytest
 
 import cfjax
@@ -135,6 +136,8 @@ def test_coefficients_are_exact(no_shape_hook):
         cfjax.ExponentialTableau([0, 1], {}, {2: {2: 0.5}})
     with pytest.raises(TypeError, match=r"tableau must be a cfjax\.ExponentialTableau"):
         cfjax.stiff_order(cfjax.CF4.tableau)  # pyright: ignore[reportArgumentType]
+    with pytest.raises(TypeError, match=r"tableau must be a cfjax\.ExponentialTableau"):
+        cfjax.stiff_order(diffrax.Dopri5.tableau)  # pyright: ignore[reportArgumentType]
     with pytest.raises(TypeError, match=r"tableau must be a cfjax\.Tableau"):
         cfjax.order("CF4")  # pyright: ignore[reportArgumentType]
     with pytest.raises(TypeError, match=r"tableau must be a cfjax\.ExponentialTableau"):
