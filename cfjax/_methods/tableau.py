@@ -49,8 +49,8 @@ class Tableau:
 
     **Raises:** `TypeError` where the nesting or a coefficient's type is wrong; `ValueError` where
     a row is too long, the method is implicit, a coefficient is not finite, the rows of `beta` or
-    `embedded` do not sum to 1, or the sums of the rows of `continuous_extension` are not those of
-    `beta`.
+    `embedded` do not sum to 1, `embedded` is `beta`, or the sums of the rows of
+    `continuous_extension` are not those of `beta`.
     """
 
     alpha: tuple[Product, ...]
@@ -75,6 +75,11 @@ class Tableau:
         store("beta", checked_end("beta", beta, s))
         if embedded is not None:
             embedded = checked_end("embedded", embedded, s + 1)
+            if embedded == checked_end("beta", self.beta, s + 1):
+                raise ValueError(
+                    "embedded must lead to another end point than beta, got the same coefficients, "
+                    "with which the estimate of the error is always zero."
+                )
         store("embedded", embedded)
         if continuous_extension is not None:
             continuous_extension = checked_extension(continuous_extension, s + 1, self.beta)

@@ -318,6 +318,12 @@ def test_bad_values_raise(alpha, beta, message):
         Tableau(alpha, beta)
 
 
+def test_an_embedded_method_is_another_method():
+    with pytest.raises(ValueError, match="another end point than beta"):
+        Tableau([[], [[HALF]]], [[0, 1]], embedded=[[0, 1]])
+    Tableau([[], [[HALF]]], [[0, 1]], embedded=[[1]])
+
+
 @pytest.mark.parametrize(
     ("alpha", "beta", "message"),
     [
