@@ -54,7 +54,6 @@ PRIVATE = {
     ("scenes.wilson_flow", "_xla"): "its field in the form that XLA vectorises",
     ("_paper", "_measure"): "reports, charts and flops are what it shows",
     ("_paper", "scenes"): "its problems",
-    ("_paper.stiefel", "_solvers.munthe_kaas"): "measures its element and its flow apart",
 }
 
 # Tests beyond the public names, so that few change when code moves. One of the name of a module may

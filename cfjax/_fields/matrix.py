@@ -106,12 +106,12 @@ class AbstractOneSided(AbstractMatrix):
         field = Cayley(self, trace)
         return elementwise(field, self._num_axes) if self._num_axes else field
 
-    @abc.abstractmethod
     def dcayinv(self, other: Any) -> Any:
         """How u, this field, changes where `cay(u)` does with the matrix of the other field.
 
         For fields without leading axes.
         """
+        return type(self)(dcayinv(self.a, other.a))
 
     @abc.abstractmethod
     def cayley_increment(self, x: Inexact[Array, "..."]) -> Inexact[Array, "..."]:
@@ -153,9 +153,6 @@ class LeftMatrix(AbstractOneSided):
     @staticmethod
     def act(a: Inexact[Array, "n n"], x: Inexact[Array, "n *k"]) -> Inexact[Array, "n *k"]:
         return small_product(*promoted(a, x))
-
-    def dcayinv(self, other: "LeftMatrix") -> "LeftMatrix":
-        return LeftMatrix(dcayinv(self.a, other.a))
 
     def cayley_increment(self, x: Inexact[Array, "n *k"]) -> Inexact[Array, "n *k"]:
         return solve(plus_identity(-self.a / 2), self.act(self.a, x))

@@ -17,11 +17,10 @@ from matplotlib.ticker import LogLocator, NullLocator
 from rich.progress import Progress
 from rich.table import Table
 
-from .. import CF4, RKMK4, CayleyRK4, WorkPrecision, combine, work_precision
+from .. import CF4, RKMK, RKMK4, CayleyRK4, WorkPrecision, combine, work_precision
 from .._measure.flops import count_flops
 from .._measure.report import Report
 from .._measure.style import STYLES, about_times, finish, new_figure, times
-from .._solvers.munthe_kaas import AbstractMuntheKaas
 from ..scenes import stiefel
 from .rigid_body import cost_at_equal_error, series_in_full
 
@@ -86,7 +85,7 @@ def rank_of_step(method: str, problem: str) -> int:
     def field(c, y):
         return combine((0.5,), (scene["term"].field(0.0, y, scene["args"]),))
 
-    if isinstance(solver, AbstractMuntheKaas) and not isinstance(solver, CayleyRK4):
+    if isinstance(solver, RKMK | RKMK4):
         return len(jax.eval_shape(lambda y: solver.logarithm(field, y), scene["y0"]).k)
     if isinstance(solver, CF4):
         # The span of all columns, or the form of the field.

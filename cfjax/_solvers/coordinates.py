@@ -1,7 +1,6 @@
 """Steps in coordinates other than those of the exponential, which the fields offer."""
 
-from collections.abc import Callable
-from typing import Any, ClassVar
+from typing import ClassVar
 
 import jax.numpy as jnp
 import jax.tree_util as jtu
@@ -10,7 +9,6 @@ from jaxtyping import PyTree
 from .._field import has_rate, in_coordinates, landing, rate
 from .compiled import materialised_in_rows
 from .step import Chart
-from .sums import Sums
 
 
 def landed(field: PyTree, start: PyTree) -> PyTree:
@@ -32,18 +30,8 @@ class AbstractCoordinateChart(Chart):
     apply_flow = staticmethod(landed)
 
     @classmethod
-    def at_start(
-        cls,
-        value: Callable[[Any, PyTree], PyTree],
-        product: Callable[[PyTree], PyTree],
-        sums: Sums,
-        first_value: PyTree,
-    ) -> "AbstractCoordinateChart":
-        first_field = in_coordinates(cls.name, product(first_value), sums.y0)
-        return cls(value, product, sums, first_value, first_field, sums.start)
-
-    def frozen(self, value, point, earlier):
-        return in_coordinates(self.name, self.product(value), self.sums.state(point))
+    def charted(cls, sums, field, point, earlier=()):
+        return in_coordinates(cls.name, field, sums.state(point)), point
 
     def rate(self, u, field, degree):
         return rate(u, field, self.origin)

@@ -236,7 +236,7 @@ class RKMK4(AbstractMuntheKaas):
         return _Elements([k1, k2, k3, k4, bracket(k1, k4)])
 
 
-class AbstractTableau(AbstractMuntheKaas):
+class AbstractRKMK(AbstractMuntheKaas):
     """The Munthe-Kaas method of a tableau, in some coordinates of a step."""
 
     coordinates: Literal["exponential", "projected", "cayley"] = eqx.field(
@@ -383,7 +383,7 @@ class AbstractTableau(AbstractMuntheKaas):
         return elements
 
 
-class RKMK(AbstractTableau, diffrax.AbstractAdaptiveSolver):
+class RKMK(AbstractRKMK, diffrax.AbstractAdaptiveSolver):
     """The Munthe-Kaas method of any explicit Runge-Kutta method, with its order and its estimate.
 
     Each stage but the first takes the inverse derivative of the exponential, `dexpinv` of the
@@ -526,7 +526,7 @@ class RKMK8(RKMK):
         )
 
 
-class CayleyRK4(AbstractTableau):
+class CayleyRK4(AbstractRKMK):
     """The classical Runge-Kutta method in the coordinates of Cayley's transform.
 
     Order 4, 4 evaluations. Dense output of order 3. This is `RKMK` of the classical tableau with

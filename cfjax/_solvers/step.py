@@ -70,8 +70,15 @@ class Chart(NamedTuple):
         first_value: PyTree,
     ) -> "Chart":
         """With the first field, from whose point all flows start. It may correct a drift."""
-        first_field, start = sums.to_chart(product(first_value), sums.start)
+        first_field, start = cls.charted(sums, product(first_value), sums.start)
         return cls(value, product, sums, first_value, first_field, start)
+
+    @classmethod
+    def charted(
+        cls, sums: Sums, field: PyTree, point: PyTree, earlier: Sequence[PyTree] = ()
+    ) -> tuple[PyTree, PyTree]:
+        """A field that is frozen at a point, after `earlier` ones, and the point, in the chart."""
+        return sums.to_chart(field, point, earlier)
 
     def value_at(self, c: Time, point: PyTree) -> PyTree:
         """The value of the field at a point."""
@@ -79,7 +86,7 @@ class Chart(NamedTuple):
 
     def frozen(self, value: PyTree, point: PyTree, earlier: Sequence[PyTree]) -> PyTree:
         """The field with this value at a point, after `earlier` ones, in the same coordinates."""
-        return self.sums.to_chart(self.product(value), point, earlier)[0]
+        return self.charted(self.sums, self.product(value), point, earlier)[0]
 
     def field(self, c: Time, point: PyTree, earlier: Sequence[PyTree]) -> PyTree:
         """The field at a point, `h f(t + c h, point)`, after `earlier` ones."""

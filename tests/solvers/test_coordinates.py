@@ -1,5 +1,7 @@
 """What all coordinates of a Munthe-Kaas step share: how they are chosen, and what is refused."""
 
+from typing import Any
+
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -125,3 +127,32 @@ def test_the_field_at_the_end_of_a_step_is_the_first_of_the_next(coordinates, pr
     count.clear()
     jax.eval_shape(lambda: solver.step(term, t0, t1, y0, args, state, made_jump=False))
     assert len(count) == 6
+
+
+@pytest.mark.parametrize("coordinates", NAMES)
+def test_products_with_arrays_and_parts_at_rest(coordinates):
+    """A frame with orthonormal columns, a lattice, and how far the frame's first column leads."""
+    frame, lattice = PROBLEMS["SO(5)"], PROBLEMS["Toda"]
+
+    def field(t, y, args):
+        return {
+            "frame": frame.field(t, y["frame"], args),
+            "lattice": (lattice.field(t, y["lattice"][0], None), None),
+            "path": y["frame"][:, 0],
+        }
+
+    y0 = {
+        "frame": frame.y0,
+        "lattice": (lattice.y0, np.ones(2)),
+        "path": np.zeros(5),
+    }
+    y0, args = problems.arrays((y0, frame.args))
+    term, solver = cfjax.LieTerm(field), cfjax.RKMK8(coordinates=coordinates)
+    ys: Any = cfjax.integrate(term, solver, 0.0, 2.0, y0, args, num_steps=20).ys
+    times, weights = np.polynomial.legendre.leggauss(20)
+    path = sum(w * frame.exact(1 + t)[:, 0] for t, w in zip(times, weights, strict=True))
+    # The error of the method, as tests of each of the coordinates find.
+    np.testing.assert_allclose(ys["frame"][-1], frame.exact(2.0), rtol=0, atol=1e-11)
+    np.testing.assert_allclose(ys["lattice"][0][-1], lattice.exact(2.0), rtol=0, atol=1e-11)
+    np.testing.assert_allclose(ys["path"][-1], path, rtol=0, atol=1e-11)
+    np.testing.assert_array_equal(ys["lattice"][1][-1], np.ones(2))

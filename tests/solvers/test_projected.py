@@ -231,29 +231,7 @@ def each_problem(*slow):
 
 @each_problem("SU(3)", "rows", "Riccati", "bordered", "orthonormal columns, low rank")
 def test_vmap_and_leading_axes_are_single_solves(given):
-    y0, args = problems.arrays((given.y0, given.args))
-    scales, options = jnp.asarray([0.3, 1.0]), {"num_steps": 3}
-
-    def of_one(t, y, args):
-        scale, args = args
-        return given.term.prod(given.field(t, y, args), scale)
-
-    def of_both(t, y, args):
-        scales, args = args
-        return jax.vmap(lambda scale, y: of_one(t, y, (scale, args)))(scales, y)
-
-    def solve(field, y0, scale):
-        term = cfjax.LieTerm(field)
-        ys = cfjax.integrate(term, RKMK5, 0.0, 1.0, y0, (scale, args), **options).ys
-        return jax.tree_util.tree_map(lambda y: y[-1], ys)
-
-    stack = lambda *xs: jnp.stack(xs)  # noqa: E731
-    expected = jax.tree_util.tree_map(stack, *(solve(of_one, y0, x) for x in scales))
-    assert max(np.abs(x[0] - x[1]).max() for x in jax.tree_util.tree_leaves(expected)) > 0.01
-    pairs = jax.tree_util.tree_map(stack, y0, y0)
-    problems.assert_close(solve(of_both, pairs, scales), expected, 1e-14)
-    found = jax.vmap(lambda x: solve(of_one, y0, x))(scales)
-    problems.assert_close(found, expected, 1e-14)
+    matrix_problems.check_batches(given, RKMK5, lambda scale, field: given.term.prod(field, scale))
 
 
 def test_single_precision():
@@ -262,33 +240,6 @@ def test_single_precision():
     assert {x.dtype for x in jax.tree_util.tree_leaves(end)} == {jnp.dtype("float32")}
     # Some tens of roundings of numbers up to 3.
     problems.assert_close(end, BOTH.exact(2.0), 2e-5)
-
-
-def test_products_with_arrays_and_parts_at_rest():
-    """A frame with orthonormal columns, a lattice, and how far the frame's first column leads."""
-    frame, lattice = PROBLEMS["SO(5)"], PROBLEMS["Toda"]
-
-    def field(t, y, args):
-        return {
-            "frame": frame.field(t, y["frame"], args),
-            "lattice": (lattice.field(t, y["lattice"][0], None), None),
-            "path": y["frame"][:, 0],
-        }
-
-    y0 = {
-        "frame": frame.y0,
-        "lattice": (lattice.y0, np.ones(2)),
-        "path": np.zeros(5),
-    }
-    y0, args = problems.arrays((y0, frame.args))
-    ys: Any = cfjax.integrate(cfjax.LieTerm(field), RKMK8, 0.0, 2.0, y0, args, num_steps=20).ys
-    times, weights = np.polynomial.legendre.leggauss(20)
-    path = sum(w * frame.exact(1 + t)[:, 0] for t, w in zip(times, weights, strict=True))
-    # The error of the method, as found above.
-    np.testing.assert_allclose(ys["frame"][-1], frame.exact(2.0), rtol=0, atol=1e-11)
-    np.testing.assert_allclose(ys["lattice"][0][-1], lattice.exact(2.0), rtol=0, atol=1e-11)
-    np.testing.assert_allclose(ys["path"][-1], path, rtol=0, atol=1e-11)
-    np.testing.assert_array_equal(ys["lattice"][1][-1], np.ones(2))
 
 
 # Refusals
