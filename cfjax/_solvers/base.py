@@ -154,6 +154,23 @@ def is_finite(y: PyTree) -> Bool[Array, ""]:
     return jnp.asarray([jnp.all(jnp.isfinite(leaf)) for leaf in jtu.tree_leaves(y)], bool).all()
 
 
+def finite_if_complex(error: PyTree) -> PyTree:
+    """The estimate of a step's error, with a large number where a complex one is not finite.
+
+    For diffrax an error of NaN is infinite, so that the step is taken again, shorter. But it
+    divides by the tolerance, and a complex infinity over a number is NaN, which would be the length
+    of the next step.
+    """
+
+    def entries(e: Array) -> Array:
+        if not jnp.iscomplexobj(e):
+            return e
+        # It can be divided by a small tolerance.
+        return jnp.where(jnp.isfinite(e), e, float(jnp.finfo(e.dtype).max) ** 0.5)
+
+    return jtu.tree_map(entries, error)
+
+
 def size(x: Array) -> Real[Array, ""]:
     """The largest modulus of an entry."""
     return jnp.max(jnp.abs(x), initial=0)

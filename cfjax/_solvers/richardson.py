@@ -12,6 +12,7 @@ from jax import lax
 from jaxtyping import Array, PyTree
 
 from .._control_term import is_driven
+from .base import finite_if_complex
 from .dense import Interpolation, Substeps
 from .solver import AbstractSolver, as_own
 from .substeps import first_failure
@@ -147,6 +148,7 @@ class Richardson(AbstractSolver, diffrax.AbstractAdaptiveSolver, diffrax.Abstrac
             # What a failed step returns may look like a small error. As in diffrax, it is rejected.
             okay = diffrax.is_okay(result)
             error = jtu.tree_map(lambda e: jnp.where(okay, e, jnp.inf), error)
+        error = finite_if_complex(error)
         if self.as_in_paper:
             return y1, error, whole, state, result
         return y2, error, dict(first=first, second=second), state_2, result

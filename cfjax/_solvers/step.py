@@ -14,7 +14,7 @@ from jaxtyping import Array, Bool, PyTree, Real
 
 from .._field import dexpinv, from_chart, has_dexpinv, is_field
 from .._term import product
-from .base import AbstractLieSolver, State, result_of, time_at
+from .base import AbstractLieSolver, State, finite_if_complex, result_of, time_at
 from .compiled import (
     computed_again,
     control_of,
@@ -240,7 +240,7 @@ def finish_step(
     (end, last, error), path = scalarised(outputs, y0, is_pair=True)
     y1, compensation = Sums(y0, solver_state.compensation).fast_two_sum(end)
     state = State(compensation, last, solver_state.zero)
-    return y1, error, dict(path=path), state, result_of(y1)
+    return y1, finite_if_complex(error), dict(path=path), state, result_of(y1)
 
 
 # diffrax traces a step three times, which takes longer than all else that it traces. Inline, the
