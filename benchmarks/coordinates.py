@@ -11,7 +11,8 @@ The problems:
 
 - SO(n), SU(n): `y' = (b + y c y^H) y` with random b and c, from the identity; many at once too.
 - Sp(4): an orbit of Henon and Heiles, and the derivative of the flow as a symplectic matrix.
-- Toda's flow of a random symmetric matrix; Oja's of 5 columns of length 200.
+- Toda's flow of random symmetric matrices; Oja's of 5 columns of length 200.
+- Vorticity on the sphere, as a matrix; the Wilson flow of the links of a lattice.
 """
 
 import functools
@@ -31,7 +32,7 @@ import results
 from cfjax._integrate import equal_steps
 from cfjax._measure.work_precision import take_turns
 from cfjax._solvers.solver import as_own
-from cfjax.scenes import toda
+from cfjax.scenes import toda, wilson_flow, zeitlin
 
 TARGETS = (1e-4, 1e-7, 1e-10)
 # Steps that are timed, and most that are tried.
@@ -115,12 +116,18 @@ def henon_heiles() -> Problem:
     return Problem(field, y0, None, t1, exact, of, without=PROJECTED)
 
 
-def lattice(n: int) -> Problem:
-    a = np.random.default_rng(n).normal(size=(n, n))
-    y0, t1 = (a + a.T) / np.linalg.norm(a + a.T, 2), 3.0
+def lattice(n: int, many: int = 0) -> Problem:
+    a = np.random.default_rng(n).normal(size=(many or 1, n, n))
+    y0 = a + np.swapaxes(a, 1, 2)
+    y0, t1 = y0 / np.linalg.norm(y0, 2, (1, 2))[:, None, None], 3.0
+    exact = np.stack([toda.reference(t1, y) for y in y0])
+    if not many:
+        y0, exact = y0[0], exact[0]
     return Problem(
         lambda t, y, args: cfjax.Conjugation(jnp.triu(y, 1) - jnp.tril(y, -1)),
-        *(y0, None, t1, toda.reference(t1, y0)),
+        *(y0, None, t1, exact),
+        without=("CF4",) if many else (),
+        is_short=bool(many),
     )
 
 
@@ -135,6 +142,17 @@ def oja(n: int = 200, p: int = 5) -> Problem:
     )
 
 
+def fluid() -> Problem:
+    given = zeitlin.problem()
+    y0, t1, args = given["y0"], given["t1"], jnp.asarray(given["args"])
+    return Problem(zeitlin.field, y0, args, t1, zeitlin.reference(t1, y0))
+
+
+def links() -> Problem:
+    y0, t1 = wilson_flow.y0(), wilson_flow.t1
+    return Problem(wilson_flow.field, y0, None, t1, wilson_flow.reference(t1, y0))
+
+
 PROBLEMS: dict[str, Callable[[], Problem]] = {
     "SO(3)": lambda: group(3),
     "SU(3)": lambda: group(3, is_complex=True),
@@ -145,8 +163,12 @@ PROBLEMS: dict[str, Callable[[], Problem]] = {
     "Toda, n = 8": lambda: lattice(8),
     "Toda, n = 32": lambda: lattice(32),
     "Oja, 200 x 5": oja,
+    "fluid, N = 32": fluid,
+    "links, 1024 of SU(3)": links,
     "SO(3), 1000 at once": lambda: group(3, many=1000),
+    "SU(3), 1000 at once": lambda: group(3, is_complex=True, many=1000),
     "SO(8), 1000 at once": lambda: group(8, many=1000),
+    "Toda, n = 8, 1000 at once": lambda: lattice(8, many=1000),
 }
 # Of others the programs take long to compile for what they show.
 WITH_GRADIENT = ("SO(3)", "SU(4)", "SO(8)")
@@ -211,9 +233,11 @@ def method(given: Problem, name: str) -> tuple[Any, Any]:
     return cfjax.LieTerm(given.field), LIE[name]
 
 
-def measure(quick: bool) -> Iterator[results.Row]:
+def measure(quick: bool, only: tuple[str, ...] = ()) -> Iterator[results.Row]:
     rounds = 3 if quick else 9
     for problem, make in PROBLEMS.items():
+        if only and problem not in only:
+            continue
         given = make()
         names = [name for name in METHODS if name not in given.without]
         yield from _equal(problem, given, names, rounds)
@@ -339,4 +363,4 @@ def _gradients(
 
 
 if __name__ == "__main__":
-    results.run(__file__, __doc__, measure)
+    results.run(__file__, __doc__, measure, PROBLEMS)

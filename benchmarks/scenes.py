@@ -1,6 +1,6 @@
 """Adaptive steps on every scene: error and time at a tolerance, against Tsit5 in plain space.
 
-On each scene the method that is recommended for such fields runs with
+On each scene the methods that are recommended for such fields run with
 `diffrax.PIDController(rtol=0, atol=tolerance)`, at tolerances from 1e-4 to 1e-11, and Tsit5 on the
 velocities in plain space at the tolerance that leads to the same error, in turns. An error is the
 root of the mean square over the numbers of the state, which is how diffrax measures that of a step.
@@ -38,8 +38,16 @@ TOLERANCES = (1e-4, 1e-6, 1e-8, 1e-11)
 TIMED = (1e-6, 1e-8, 1e-11)
 
 
+# Of fields of matrices and columns: with exponentials, and with stages in plain space.
+ON_MATRICES = {
+    "CF54": cfjax.CF54(),
+    "RKMK5, projected": cfjax.RKMK5(coordinates="projected"),
+    "RKMK8, projected": cfjax.RKMK8(coordinates="projected"),
+}
+
+
 class Scene(NamedTuple):
-    solver: diffrax.AbstractSolver
+    solvers: dict[str, diffrax.AbstractSolver]
     problem: dict[str, Any]
     # The exact final state, and a bound of its error.
     reference: Callable[[], Any]
@@ -48,7 +56,7 @@ class Scene(NamedTuple):
 
 
 def scenes() -> dict[str, Scene]:
-    attitude = cfjax.RKMK(diffrax.Dopri8.tableau)
+    attitude, magnus = {"RKMK8": cfjax.RKMK8()}, {"Magnus6": cfjax.Magnus6()}
     track, turning, flowing = covariance.problem(), spins.problem(), wilson_flow.problem()
     rod, fluid, tilted = heat.problem(), zeitlin.problem(), heavy_top.problem()
     return {
@@ -66,63 +74,63 @@ def scenes() -> dict[str, Scene]:
             heavy_top.velocity,
         ),
         "spins": Scene(
-            cfjax.CF54(),
+            {"CF54": cfjax.CF54()},
             turning,
             lambda: spins.reference(spins.t1, turning["y0"], turning["args"]),
             1e-12,
             spins.velocity,
         ),
         "Wilson flow": Scene(
-            cfjax.CF54(),
+            ON_MATRICES,
             flowing,
             lambda: wilson_flow.reference(wilson_flow.t1, flowing["y0"]),
             1e-12,
             wilson_flow.velocity,
         ),
         "Stiefel, first": Scene(
-            cfjax.CF54(), stiefel.problem("first"), lambda: stiefel.reference("first", 100)
+            ON_MATRICES, stiefel.problem("first"), lambda: stiefel.reference("first", 100)
         ),
         "Stiefel, second": Scene(
-            cfjax.CF54(), stiefel.problem("second"), lambda: stiefel.reference("second", 100)
+            ON_MATRICES, stiefel.problem("second"), lambda: stiefel.reference("second", 100)
         ),
-        "Toda": Scene(cfjax.CF54(), toda.problem(), lambda: toda.reference(toda.t1)),
+        "Toda": Scene(ON_MATRICES, toda.problem(), lambda: toda.reference(toda.t1)),
         "Zeitlin": Scene(
-            cfjax.CF54(),
+            ON_MATRICES,
             fluid,
             lambda: zeitlin.reference(zeitlin.t1, fluid["y0"]),
             1e-11,
             zeitlin.velocity,
         ),
         "covariance": Scene(
-            cfjax.CF4(),
+            {"CF4": cfjax.CF4()},
             track,
             lambda: covariance.reference(covariance.t1, track["y0"], track["args"]),
             1e-13,
             covariance.velocity,
         ),
         "heat": Scene(
-            cfjax.CF43(),
+            {"CF43": cfjax.CF43()},
             rod,
             lambda: np.asarray(
                 heat.from_grid(jnp.asarray(heat.reference(heat.t1, rod["args"].mu)))
             ),
         ),
         "Landau-Zener": Scene(
-            cfjax.Magnus6(),
+            magnus,
             landau_zener.problem(),
             lambda: landau_zener.reference(landau_zener.t1),
             1e-13,
             landau_zener.velocity,
         ),
         "transmon": Scene(
-            cfjax.Magnus6(),
+            magnus,
             transmon.problem(),
             lambda: transmon.reference(transmon.corrected()),
             1e-12,
             transmon.velocity,
         ),
         "annealing": Scene(
-            cfjax.Magnus6(),
+            magnus,
             annealing.problem(),
             lambda: annealing.reference(annealing.t1),
             1e-11,
@@ -140,12 +148,13 @@ class Run(NamedTuple):
 class Program:
     """A method on a scene, compiled once for all tolerances."""
 
-    def __init__(self, scene: Scene, in_space: bool, exact: Any):
+    def __init__(self, scene: Scene, name: str | None, exact: Any):
+        """Without a name that of Tsit5 in plain space."""
         problem, self.exact = scene.problem, exact
         field = problem["term"].field
         velocity = scene.velocity or (lambda t, y, args: cfjax.tangent(field(t, y, args), y))
-        term = diffrax.ODETerm(velocity) if in_space else problem["term"]
-        solver = diffrax.Tsit5() if in_space else scene.solver
+        term = diffrax.ODETerm(velocity) if name is None else problem["term"]
+        solver = diffrax.Tsit5() if name is None else scene.solvers[name]
 
         def solve(y0: Any, args: Any, dt0: Any, tolerance: Any) -> tuple[Any, Any]:
             sol = diffrax.diffeqsolve(
@@ -186,44 +195,43 @@ class Program:
 
 
 def _distance(y: Any, exact: Any) -> float:
-    # q and -q are the same attitude, but a solution goes to one of them.
+    if isinstance(exact, dict) and "q" in exact:
+        # q and -q are the same attitude.
+        exact = exact | {"q": exact["q"] * np.sign(np.vdot(y["q"], exact["q"]))}
     pairs = zip(jax.tree.leaves(y), jax.tree.leaves(exact), strict=True)
     differences = [np.abs(np.asarray(a) - np.asarray(b)).ravel() for a, b in pairs]
     return float(np.sqrt(np.mean(np.concatenate(differences) ** 2)))
 
 
-def measure(quick: bool) -> Iterator[results.Row]:
+def measure(quick: bool, only: tuple[str, ...] = ()) -> Iterator[results.Row]:
     for name, scene in scenes().items():
+        if only and name not in only:
+            continue
         exact = scene.reference()
-        ours, theirs = (Program(scene, in_space, exact) for in_space in (False, True))
-        for tolerance in TOLERANCES:
-            run = ours.run(tolerance)
-            row: results.Row = {
-                "scene": name,
-                "method": _name(scene.solver),
-                "tolerance": tolerance,
-                "error": results.digits(run.error),
-                "steps": run.num_steps,
-            }
-            # Below it the error is that of the reference.
-            if run.error > 10 * scene.reference_error:
-                same = theirs.to_error(run.error, tolerance)
-                row |= {
-                    "Tsit5's error": results.digits(same.error),
-                    "Tsit5's steps": same.num_steps,
-                }
-                if tolerance in TIMED:
-                    timed = [ours.timed(run.tolerance), theirs.timed(same.tolerance)]
-                    seconds = take_turns(timed, repeats=3 if quick else 11)
-                    row["over Tsit5"] = results.ratios(*seconds)
-            yield row
+        theirs = Program(scene, None, exact)
+        for method in scene.solvers:
+            ours = Program(scene, method, exact)
+            for row in _rows(scene, ours, theirs, repeats=3 if quick else 11):
+                yield {"scene": name, "method": method} | row
 
 
-def _name(solver: diffrax.AbstractSolver) -> str:
-    if isinstance(solver, cfjax.RKMK):
-        return "RKMK(Dopri8)" if len(solver.b) > 8 else "RKMK(Tsit5)"
-    return type(solver).__name__
+def _rows(scene: Scene, ours: Program, theirs: Program, repeats: int) -> Iterator[results.Row]:
+    for tolerance in TOLERANCES:
+        run = ours.run(tolerance)
+        row: results.Row = {
+            "tolerance": tolerance,
+            "error": results.digits(run.error),
+            "steps": run.num_steps,
+        }
+        # Below it the error is that of the reference.
+        if run.error > 10 * scene.reference_error:
+            same = theirs.to_error(run.error, tolerance)
+            row |= {"Tsit5's error": results.digits(same.error), "Tsit5's steps": same.num_steps}
+            if tolerance in TIMED:
+                timed = [ours.timed(run.tolerance), theirs.timed(same.tolerance)]
+                row["over Tsit5"] = results.ratios(*take_turns(timed, repeats=repeats))
+        yield row
 
 
 if __name__ == "__main__":
-    results.run(__file__, __doc__, measure)
+    results.run(__file__, __doc__, measure, scenes(), key="scene")
