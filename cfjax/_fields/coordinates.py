@@ -74,6 +74,10 @@ class BesideCayley(AbstractProjected):
     v: Inexact[Array, "n n"]
     beside: "Cayley"
 
+    def tangent(self, point: Array) -> Array:
+        # What moves the end: a fluid may turn far while its vorticity changes little.
+        return self.beside.tangent(point)
+
     def rate(self, field: Any, start: Any) -> "BesideCayley":
         return BesideCayley(field.v, self.beside.rate(field.beside, start))
 

@@ -402,18 +402,20 @@ class RKMK(AbstractRKMK, diffrax.AbstractAdaptiveSolver):
     With `coordinates="projected"` a step takes no exponentials and no commutators. Within a step it
     moves along straight lines: the stages are those of the tableau in plain space, off the manifold
     by their own error, and only the end of the step, or the output within it, is brought back to
-    the manifold. The order, the order of output and the cost of the estimate are as above; the
-    estimate is that of plain space. It takes these fields, with leading axes or without, and arrays
-    and None beside them:
+    the manifold. The order, the order of output and the cost of the estimate are as above. It takes
+    these fields, with leading axes or without, and arrays and None beside them:
 
     - `LeftMatrix` and `RightMatrix` with a skew-Hermitian `a`, on columns or rows of full rank. The
       end keeps their products, so matrices stay orthogonal or unitary. The determinant of a complex
       matrix is only as accurate as the solution. A step takes four or five products with the point
-      more than in plain space, and an inverse where the columns are not orthonormal.
-    - `LowRankSkew` and `BorderedSkew`. The end has orthonormal columns.
+      more than in plain space, and an inverse where the columns are not orthonormal. The estimate
+      is that of plain space.
+    - `LowRankSkew` and `BorderedSkew`. The end has orthonormal columns, and the estimate is that of
+      plain space.
     - `Conjugation` and `Congruence` without `q`, with any `a`. Beside the point a step computes an
-      element of the algebra in Cayley's coordinates, which moves the start to the end. This takes
-      three products of matrices a stage, and two solves a step.
+      element of the algebra in Cayley's coordinates, which moves the start to the end, and whose
+      estimate is that of the step. This takes three products of matrices a stage, and two solves a
+      step.
 
     The function of the term is called off the manifold, and must return elements of the same
     algebra there.

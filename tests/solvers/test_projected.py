@@ -138,13 +138,25 @@ def test_one_step_is_the_unitary_matrix_nearest_to_that_of_plain_space(which):
     np.testing.assert_allclose(found, nearest, rtol=0, atol=2e-14)
 
 
-@pytest.mark.parametrize("problem", ["SO(5)", "Riccati"])
-def test_the_estimate_is_that_of_plain_space(problem):
+def test_the_estimate_is_that_of_plain_space():
     # Not first same as last: there the last velocity is that at the projected end.
-    given, tableau = PROBLEMS[problem], diffrax.Dopri8.tableau
+    given, tableau = PROBLEMS["SO(5)"], diffrax.Dopri8.tableau
     _, estimate = by_hand(given, tableau, 0.7)
     found = one_step(given, cfjax.RKMK(tableau, **PROJECTED), 0.7, 1)
     np.testing.assert_allclose(found, estimate, rtol=0, atol=2e-14)
+
+
+def test_the_estimate_of_a_flow_from_both_sides_is_of_its_end():
+    """By an element d of the algebra, which moves the end by `d y + y d^H`.
+
+    Between the ends of both methods is the same but for products of d and the element of the step,
+    whose norm is at most 1.5 times the length of the step.
+    """
+    given = PROBLEMS["Riccati"]
+    ends = cfjax.RKMK(diffrax.Dopri8.tableau, **PROJECTED, estimate="group")
+    for h in (0.2, 0.1):
+        algebra, group = (one_step(given, x, h, 1) for x in (cfjax.RKMK8(**PROJECTED), ends))
+        assert np.linalg.norm(algebra - group) < 1.5 * h * np.linalg.norm(group)
 
 
 def test_control_keeps_to_its_tolerance():
