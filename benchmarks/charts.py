@@ -23,10 +23,13 @@ CHARTS: dict[str, Callable[..., WorkPrecision]] = {
 FIGURE_2 = "rigid_body"
 
 
-def measure(quick: bool) -> Iterator[results.Row]:
+def measure(quick: bool, only: tuple[str, ...] = ()) -> Iterator[results.Row]:
     budget = 3.0 if quick else 20.0
     for name, chart in CHARTS.items():
-        yield from _rows(name, chart(budget=budget, progress=False))
+        if not only or name in only:
+            yield from _rows(name, chart(budget=budget, progress=False))
+    if only and FIGURE_2 not in only:
+        return
     repeats = 10 if quick else paper.REPEATS
     with on_terminal(transient=True) as progress:
         yield from _rows(FIGURE_2, paper.efficiencies(paper.STEP_COUNTS, repeats, progress))
@@ -64,4 +67,4 @@ def draw() -> dict[str, Figure]:
 
 
 if __name__ == "__main__":
-    results.run(__file__, __doc__, measure)
+    results.run(__file__, __doc__, measure, [*CHARTS, FIGURE_2], key="chart")

@@ -158,6 +158,7 @@ PROBLEMS: dict[str, Callable[[], Problem]] = {
     "SU(3)": lambda: group(3, is_complex=True),
     "Sp(4)": henon_heiles,
     "SU(4)": lambda: group(4, is_complex=True),
+    "SO(5)": lambda: group(5),
     "SO(8)": lambda: group(8),
     "SO(32)": lambda: group(32),
     "Toda, n = 8": lambda: lattice(8),

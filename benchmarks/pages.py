@@ -279,15 +279,15 @@ def scenes() -> list[list[str]]:
         ["", "method", "error over tolerance", "steps over Tsit5's"]
         + [f"time over Tsit5's, at {power(tolerance)}" for tolerance in at]
     ]
-    for scene in values(rows, "scene"):
-        of_scene = pick(rows, scene=scene)
-        same = [row for row in of_scene if "Tsit5's steps" in row]
+    for scene, method in dict.fromkeys((row["scene"], row["method"]) for row in rows):
+        of_method = pick(rows, scene=scene, method=method)
+        same = [row for row in of_method if "Tsit5's steps" in row]
         timed = {row["tolerance"]: cell(row["over Tsit5"]) for row in same if "over Tsit5" in row}
         table.append(
             [
                 scene,
-                code(of_scene[0]["method"]),
-                between(row["error"] / row["tolerance"] for row in of_scene),
+                COORDINATES.get(method) or code(method),
+                between(row["error"] / row["tolerance"] for row in of_method),
                 between(row["steps"] / row["Tsit5's steps"] for row in same),
                 *(timed.get(tolerance, "") for tolerance in at),
             ]
@@ -1521,13 +1521,23 @@ def scenes_body() -> str:
     return _scene("rigid body", 1e-11)
 
 
-@number
-def scenes_others() -> str:
+def _of_scenes(*methods: str) -> str:
     """The times over those of Tsit5, of scenes where a step takes more work than in plain space."""
     rows = [row for row in load("scenes")["rows"] if row["tolerance"] in (1e-6, 1e-8)]
     others = ("spins", "Wilson flow", "Stiefel, first", "Stiefel, second", "Toda", "Zeitlin")
     rows = [row for row in rows if row["scene"] in (*others, "covariance")]
+    rows = [row for row in rows if row["method"] in methods]
     return _medians(row["over Tsit5"] for row in rows if "over Tsit5" in row)
+
+
+@number
+def scenes_others() -> str:
+    return _of_scenes("CF4", "CF54")
+
+
+@number
+def scenes_projected() -> str:
+    return _of_scenes("RKMK5, projected", "RKMK8, projected")
 
 
 # Programs of the benchmark of variations.

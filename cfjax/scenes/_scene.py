@@ -51,6 +51,13 @@ class Scene(Protocol):
         ...
 
 
+# Methods of a chart, with stages in plain space.
+PROJECTED = {
+    "RKMK5, projected": cfjax.RKMK5(coordinates="projected"),
+    "RKMK8, projected": cfjax.RKMK8(coordinates="projected"),
+}
+
+
 def by_name(*solvers: diffrax.AbstractSolver, term: Any = None) -> dict[str, Any]:
     """Methods of a chart, each by the name of its class. They solve `term`, if it is given."""
     methods = {type(solver).__name__: solver for solver in solvers}

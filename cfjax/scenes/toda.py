@@ -24,10 +24,10 @@ from jaxtyping import Array, Float
 import cfjax
 
 from . import _figures as figures
-from ._scene import by_name, in_plain_space, solve
+from ._scene import PROJECTED, by_name, in_plain_space, solve
 
 t0, t1 = 0.0, 10.0
-solver = cfjax.CF4()
+solver = cfjax.RKMK8(coordinates="projected")
 
 # The particles of `y0()`: they run into each other.
 positions = np.array([-10.0, -5.0, -1.0, 4.0, 9.0])
@@ -110,6 +110,7 @@ def chart(**options: Any) -> cfjax.WorkPrecision:
     return cfjax.work_precision(
         **problem(),
         methods=by_name(cfjax.CF3(), cfjax.CF4(), cfjax.RKMK4(), cfjax.CF43(), cfjax.CF54())
+        | PROJECTED
         | in_plain_space(velocity, diffrax.Dopri5(), diffrax.Tsit5()),
         reference=reference(t1),
         num_steps=[20 * 2**k for k in range(7)],
@@ -133,7 +134,7 @@ def picture() -> figures.Figure:
         diagonal.plot(times, ys[:, k, k], color=colour)
     for value in values:
         diagonal.axhline(value, color="0.6", linestyle=":", linewidth=1, zorder=0)
-    for name, y in {"CF4": ys, "Tsit5": others}.items():
+    for name, y in {"RKMK8, projected": ys, "Tsit5": others}.items():
         off = np.abs(np.linalg.eigvalsh((y + np.swapaxes(y, 1, 2)) / 2) - values).max(-1)
         drift.semilogy(times, np.maximum(off, 1e-16), label=f"{name}, {n} steps")
     lattice.set(title="Positions", xlabel="q", ylabel="t")

@@ -24,10 +24,10 @@ import cfjax
 from .._numerics.matmul import matmul
 from .._xla import call
 from . import _figures as figures
-from ._scene import by_dop853, by_name, in_plain_space, solve
+from ._scene import PROJECTED, by_dop853, by_name, in_plain_space, solve
 
 t0, t1 = 0.0, 0.5
-solver = cfjax.CF4()
+solver = cfjax.RKMK8(coordinates="projected")
 
 Links = Complex[Array | np.ndarray, "d *sides 3 3"]
 
@@ -117,6 +117,7 @@ def chart(**options: Any) -> cfjax.WorkPrecision:
     return cfjax.work_precision(
         **problem(),
         methods=by_name(cfjax.CF3(), cfjax.CF4(), cfjax.Luscher3(), cfjax.CK34(), cfjax.CK54())
+        | PROJECTED
         | in_plain_space(velocity, diffrax.Tsit5()),
         reference=reference(t1, y0()),
         num_steps=[5 * 2**k for k in range(5)],
