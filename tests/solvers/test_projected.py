@@ -297,6 +297,25 @@ def test_a_matrix_that_is_not_skew_later_is_an_error(since):
         cfjax.integrate(cfjax.LieTerm(field), RKMK5, 0.0, 1.0, y0, num_steps=4)
 
 
+def test_output_of_a_matrix_that_is_not_skew_is_nan():
+    """The last of the stages for output alone has no other after it that would show it."""
+    a, time = jnp.asarray(skew(3)), RKMK8._extension.times[-1]
+    assert 0 < time < 1
+    assert time not in RKMK8.c
+
+    def field(t, y, time):
+        return cfjax.LeftMatrix(a.at[0, 0].add(jnp.where(jnp.abs(t - time) < 1e-9, 1e-3, 0.0)))
+
+    @jax.jit
+    def output(time):
+        options: Any = {"saveat": diffrax.SaveAt(ts=jnp.asarray([0.3, 0.6]))}
+        term, y0 = cfjax.LieTerm(field), jnp.eye(3)
+        return diffrax.diffeqsolve(term, RKMK8, 0.0, 1.0, 1.0, y0, time, **options).ys
+
+    assert np.isfinite(output(-1.0)).all()
+    assert np.isnan(output(time)).all()
+
+
 @pytest.mark.slow
 def test_control_does_not_pass_a_matrix_that_is_not_skew():
     a = jnp.asarray(skew(3))
