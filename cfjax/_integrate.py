@@ -36,7 +36,8 @@ _BLOW_UP = (
     f"{diffrax.RESULTS[diffrax.RESULTS.nonfinite].rstrip('.')}: the solution grows without bound, "
     "or the steps are too long, which more num_steps cure. (A step of a Munthe-Kaas method, such "
     "as cfjax.RKMK8, must turn by less than 2 pi; with coordinates='projected' and 'cayley' by "
-    "less than pi, and with 'projected' matrices that act from one side must be skew-Hermitian.)"
+    "less than pi, and with 'projected' matrices that act from one side must be skew-Hermitian, on "
+    "columns or rows of full rank.)"
 )
 
 

@@ -12,8 +12,11 @@ from .step import Chart
 
 
 def landed(field: PyTree, start: PyTree) -> PyTree:
-    """Where a field in these coordinates leads from the start of a step, on the manifold."""
-    return jtu.tree_map(jnp.add, start, landing(field, start)[0])
+    """Where a field in these coordinates leads from the start of a step, on the manifold; or NaN
+    where there is no such point.
+    """
+    increment, is_there = landing(field, start)
+    return jtu.tree_map(lambda y, v: jnp.where(is_there, y + v, jnp.nan), start, increment)
 
 
 class AbstractCoordinateChart(Chart):

@@ -7,7 +7,7 @@ import jax.numpy as jnp
 import numpy as np
 import problems
 import pytest
-from matrix_problems import PROBLEMS
+from matrix_problems import PROBLEMS, skew
 
 import cfjax
 
@@ -156,3 +156,20 @@ def test_products_with_arrays_and_parts_at_rest(coordinates):
     np.testing.assert_allclose(ys["lattice"][0][-1], lattice.exact(2.0), rtol=0, atol=1e-11)
     np.testing.assert_allclose(ys["path"][-1], path, rtol=0, atol=1e-11)
     np.testing.assert_array_equal(ys["lattice"][1][-1], np.ones(2))
+
+
+@pytest.mark.parametrize("coordinates", NAMES)
+@pytest.mark.parametrize("cls, factor", [(cfjax.Conjugation, 1.0), (cfjax.Congruence, 1.0j)])
+def test_multiples_of_the_identity_that_move_nothing(coordinates, cls, factor):
+    """They are no turn, whatever their size, and no error."""
+    a, y0 = skew(3, True), jnp.diag(jnp.arange(3.0)).astype(complex)
+    unit = factor * jnp.eye(3, dtype=complex)
+    term = cfjax.LieTerm(lambda t, y, s: cls(jnp.cos(t).astype(complex) * a + s * unit))
+
+    def end(size):
+        s = jnp.asarray(size, complex)
+        solver = cfjax.RKMK5(coordinates=coordinates)
+        return cfjax.integrate(term, solver, 0.0, 1.0, y0, s, num_steps=4).ys[-1]
+
+    # Rounding of a matrix with such entries.
+    np.testing.assert_allclose(end(50.0), end(0.0), rtol=0, atol=5e-14)

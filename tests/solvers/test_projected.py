@@ -267,10 +267,17 @@ def test_more_columns_than_rows_are_refused():
 
 
 @pytest.mark.parametrize(
-    "cls", [cfjax.LeftMatrix, pytest.param(cfjax.RightMatrix, marks=pytest.mark.slow)]
+    "cls, is_batch",
+    [
+        (cfjax.LeftMatrix, False),
+        (cfjax.LeftMatrix, True),
+        pytest.param(cfjax.RightMatrix, False, marks=pytest.mark.slow),
+    ],
 )
-def test_a_matrix_that_is_not_skew_is_an_error(cls):
+def test_a_matrix_that_is_not_skew_is_an_error(cls, is_batch):
     a, y0 = jnp.asarray(skew(3)).at[0, 0].add(1e-9), jnp.eye(3)
+    if is_batch:
+        a, y0 = jnp.stack([jnp.asarray(skew(3)), a]), jnp.stack([y0] * 2)
     term = cfjax.LieTerm(lambda t, y, args: cls(a))
     message = "skew-Hermitian"
     with pytest.raises(RuntimeError, match=message):
@@ -280,17 +287,45 @@ def test_a_matrix_that_is_not_skew_is_an_error(cls):
         diffrax.diffeqsolve(term, RKMK5, 0.0, 1.0, 0.1, y0, stepsize_controller=control)
 
 
-def test_a_matrix_that_is_not_skew_later_is_an_error():
-    """From within the first step on, one of two elements."""
+@pytest.mark.parametrize("y0", [np.zeros(3), np.ones((3, 2))], ids=["zero", "equal columns"])
+def test_columns_without_full_rank_are_an_error(y0):
+    a = jnp.asarray(skew(3))
+    term = cfjax.LieTerm(lambda t, y, args: cfjax.LeftMatrix(a))
+    with pytest.raises(RuntimeError, match="columns or rows of full rank"):
+        cfjax.integrate(term, RKMK5, 0.0, 1.0, jnp.asarray(y0), num_steps=2)
+
+
+@pytest.mark.parametrize("since", [0.3, 0.999])
+def test_a_matrix_that_is_not_skew_later_is_an_error(since):
+    """From within the first step on, or in the last stage of all alone; one of two elements."""
     a, y0 = jnp.asarray(skew(3)), jnp.stack([jnp.eye(3)] * 2)
 
     def field(t, y, args):
         # The projection alone would bring the end back.
-        later = 1e-9 * jnp.maximum(t - 0.3, 0.0)
+        later = jnp.where(t > since, 1e-9, 0.0)
         return cfjax.LeftMatrix(jnp.stack([a, a.at[0, 0].add(later)]))
 
     with pytest.raises(RuntimeError, match="without bound, or the steps"):
         cfjax.integrate(cfjax.LieTerm(field), RKMK5, 0.0, 1.0, y0, num_steps=4)
+
+
+def test_output_of_a_matrix_that_is_not_skew_is_nan():
+    """The last of the stages for output alone has no other after it that would show it."""
+    a, time = jnp.asarray(skew(3)), RKMK8._extension.times[-1]
+    assert 0 < time < 1
+    assert time not in RKMK8.c
+
+    def field(t, y, time):
+        return cfjax.LeftMatrix(a.at[0, 0].add(jnp.where(jnp.abs(t - time) < 1e-9, 1e-3, 0.0)))
+
+    @jax.jit
+    def output(time):
+        options: Any = {"saveat": diffrax.SaveAt(ts=jnp.asarray([0.3, 0.6]))}
+        term, y0 = cfjax.LieTerm(field), jnp.eye(3)
+        return diffrax.diffeqsolve(term, RKMK8, 0.0, 1.0, 1.0, y0, time, **options).ys
+
+    assert np.isfinite(output(-1.0)).all()
+    assert np.isnan(output(time)).all()
 
 
 @pytest.mark.slow

@@ -1,5 +1,6 @@
 """Variations of solutions against exact answers: closed forms, or derivatives of other programs."""
 
+import functools
 from typing import Any
 
 import diffrax
@@ -590,6 +591,62 @@ def test_solvers(solver, tol, derivatives):
     y0 = attitude_start(transition=True, log_density=0.0)
     found = end(attitude_term(), solver, y0, ARGS, 2.0, 40)
     np.testing.assert_allclose(found.transition, derivatives[1], atol=tol)
+
+
+@pytest.mark.parametrize("coordinates", ["projected", "cayley"])
+def test_coordinates_of_a_step(coordinates):
+    """`y' = k b y + y c`, whose flow is linear in the start, with each kind of coordinates."""
+    b, c = hat([0.3, -0.5, 0.8]), np.array([[0.0, 0.7], [-0.7, 0.0]])
+    gain, p0 = np.array([[0.3, 0.1], [-0.2, 0.2], [0.05, 0.4]]), np.diag([0.1, 0.2, 0.3])
+    basis = np.stack([hat(x) for x in np.eye(3)])
+
+    def field(t, y, k):
+        r, q, x = y["r"], y["columns"], y["x"]
+        return {
+            "r": cfjax.LeftMatrix(k * b + r @ b.T @ r.T),
+            "columns": cfjax.LowRankSkew(k * b @ q + q @ (c - k * (q.T @ b @ q)) / 2),
+            # Which commutes with its square.
+            "x": cfjax.Conjugation(k * b + x @ x),
+        }
+
+    def noise(t, y, args, dw):
+        turn = cfjax.LeftMatrix(jnp.tensordot(gain @ dw, basis, 1))
+        return {"r": turn, "columns": None, "x": None}
+
+    rng = np.random.default_rng(4)
+    y0 = {
+        "r": scipy.linalg.expm(hat([0.2, 0.1, -0.4])),
+        "columns": np.linalg.qr(rng.normal(size=(3, 2)))[0],
+        "x": rng.normal(size=(3, 3)) / 3,
+    }
+    k, t = 1.2, 1.0
+    term = VariationTerm(
+        LieTerm(field), noise=noise, channels=2, parameters=lambda k: k, basis=basis
+    )
+    slices = term.slices(0.0, y0, k)
+    covariance = np.zeros((18, 18))
+    covariance[slices["r"], slices["r"]] = p0
+    start = term.start(0.0, y0, k, transition=True, covariance=covariance, sensitivity=True)
+    found = end(term, RKMK8(coordinates=coordinates), start, k, t, 10)
+    turn, other = scipy.linalg.expm(t * k * b), scipy.linalg.expm(t * c)
+    phi, p = van_loan(k * b, gain @ gain.T, p0, t)
+    of_x = np.kron(turn, turn)
+    # The error of order 8 of steps by a tenth of a radian.
+    close = functools.partial(np.testing.assert_allclose, rtol=0, atol=2e-11)
+    transition = {name: found.transition[at, at] for name, at in slices.items()}
+    close(transition["r"], phi)
+    close(transition["x"], of_x)
+    # Of changes along the manifold: turns of the columns.
+    changes = np.stack([(x @ y0["columns"]).ravel() for x in basis], axis=1)
+    close(transition["columns"] @ changes, np.kron(turn, other.T) @ changes)
+    close(found.covariance[slices["r"], slices["r"]], p)
+    velocities = {
+        "r": t * np.array([0.3, -0.5, 0.8]),
+        "columns": t * b @ turn @ y0["columns"] @ other,
+        "x": t * (b @ found.state["x"] - found.state["x"] @ b),
+    }
+    for name, v in velocities.items():
+        close(found.sensitivity[slices[name], 0], v.ravel())
 
 
 def test_solvers_of_time_alone_say_why_not():
