@@ -113,3 +113,24 @@ def test_a_full_turn_in_rolled_stages():
             term, cfjax.RKMK5(unroll=unroll), 0.0, 2.0, Q, 0.3, num_steps=2, throw=False
         )
         assert sol.result == diffrax.RESULTS.successful
+
+
+def test_output_after_a_full_turn_in_a_stage_for_output_alone_is_nan():
+    solver = cfjax.RKMK8()
+    # The stages after it start with this turn.
+    time = solver._extension.times[-2]
+    assert 0 < time < 1
+    assert time not in solver.c
+
+    def field(t, y, time):
+        speed = jnp.where(jnp.abs(t - time) < 1e-9, 1e3, 1.0)
+        return cfjax.Rotation(speed * jnp.asarray([0.6, 0.0, 0.8]))
+
+    @jax.jit
+    def output(time):
+        options = {"saveat": diffrax.SaveAt(ts=jnp.asarray([0.3, 0.6]))}
+        term, y0 = cfjax.LieTerm(field), jnp.eye(3)
+        return diffrax.diffeqsolve(term, solver, 0.0, 1.0, 1.0, y0, time, **options).ys
+
+    assert np.isfinite(output(-1.0)).all()
+    assert np.isnan(output(time)).all()
