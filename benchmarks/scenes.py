@@ -6,7 +6,7 @@ velocities in plain space at the tolerance that leads to the same error, in turn
 root of the mean square over the numbers of the state, which is how diffrax measures that of a step.
 """
 
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Mapping
 from typing import Any, NamedTuple
 
 import diffrax
@@ -47,7 +47,7 @@ ON_MATRICES = {
 
 
 class Scene(NamedTuple):
-    solvers: dict[str, diffrax.AbstractSolver]
+    solvers: Mapping[str, diffrax.AbstractSolver]
     problem: dict[str, Any]
     # The exact final state, and a bound of its error.
     reference: Callable[[], Any]

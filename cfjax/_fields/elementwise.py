@@ -7,7 +7,6 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 import jax.tree_util as jtu
-from jax import lax
 from jaxtyping import Array, Bool, PyTree, Real
 
 from .._arrays import Weight
@@ -18,6 +17,7 @@ from .._field import (
     combine,
     is_field,
 )
+from .._numerics.vectors import kept_on_arrays
 
 
 def each(fun: Callable[..., PyTree], num_axes: int) -> Callable[..., PyTree]:
@@ -281,7 +281,6 @@ class ElementwiseCoordinates(Elementwise, AbstractCoordinates):
 
     def landing(self, start: Any) -> tuple[Any, Bool[Array, ""]]:
         increment, is_there = self._each(lambda u, start: u.landing(start))(self.field, start)
-        # A branch keeps the step from being compiled as a program of single numbers. With 3 x 3
-        # matrices and RKMK8 that has 29 000 instructions in place of 800, and takes three times as
-        # long.
-        return increment, lax.cond(jnp.all(is_there), lambda: True, lambda: False)
+        # With 3 x 3 matrices and RKMK8 the program of single numbers has 29 000 instructions in
+        # place of 800, and takes three times as long.
+        return increment, kept_on_arrays(jnp.all(is_there))
