@@ -1300,6 +1300,17 @@ def coordinates_gradient() -> str:
     return f"{own} times as long as its solve, that of `CF4` {other} times"
 
 
+@number
+def coordinates_symplectic() -> str:
+    """The time of CF54 over that of RKMK8 in Cayley's coordinates, in equal and adaptive steps."""
+    rows = pick(load("coordinates")["rows"], problem="Sp(4)", to=1e-10)
+    medians = [
+        [one(rows, steps=steps, method=name)["over Tsit5"][2] for steps in ("equal", "adaptive")]
+        for name in ("CF54", "RKMK8, Cayley")
+    ]
+    return f"{between(a / b for a, b in zip(*medians, strict=True))} times"
+
+
 def _exact(error: float) -> str:
     """As 2e-3 or 1.5e-4."""
     return f"{error:.1e}".replace(".0e", "e").replace("e-0", "e-")
