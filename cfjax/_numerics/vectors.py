@@ -8,6 +8,7 @@ from typing import Any
 
 from jaxtyping import Array, Float
 
+from .._xla import computed_once as computed_once
 from .._xla import materialised as materialised
 from .._xla import materialised_in_rows as materialised_in_rows
 from .._xla import pack as pack
