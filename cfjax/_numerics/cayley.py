@@ -19,7 +19,7 @@ from .vectors import computed_once, pack, unpack
 
 # Larger ones are written out at length: with 8 equations a step has 42 000 instructions.
 _WRITTEN_OUT = 4
-# Above, a sweep takes longer than LU, as measured. For complex numbers LU is the better program.
+# Above, a sweep takes longer than LU, as measured.
 _SWEPT, _SWEPT_COMPLEX = 16, 8
 
 
@@ -30,7 +30,35 @@ def solve(m: Inexact[Array, "n n"], z: Inexact[Array, "n *k"]) -> Inexact[Array,
     it, and otherwise by elimination with pivots.
     """
     m, z = promoted(m, z)
+    return _solve(m, _constant_inverse(m), z)
+
+
+def solve_from_right(z: Inexact[Array, "*k n"], m: Inexact[Array, "n n"]) -> Inexact[Array, "*k n"]:
+    """`z m^-1`, in the same way."""
+    m, z = promoted(m, z)
+    return _solve_from_right(z, m, _constant_inverse(m))
+
+
+def solve_from_both(
+    left: Inexact[Array, "n n"], z: Inexact[Array, "n n"], right: Inexact[Array, "n n"]
+) -> Inexact[Array, "n n"]:
+    """`left^-1 z right^-1`, in the same way, for matrices of one dtype."""
+    if len(left) <= _WRITTEN_OUT or not _is_swept(left):
+        return solve_from_right(solve(left, z), right)
+    inverses = _swept_or_eliminated(lax.stop_gradient([left, right]))
+    return _solve_from_right(_solve(left, inverses[0], z), right, inverses[1])
+
+
+def congruence_by_inverse(
+    m: Inexact[Array, "n n"], z: Inexact[Array, "n n"]
+) -> Inexact[Array, "n n"]:
+    """`m^-1 z m^-H`, in the same way, for matrices of one dtype."""
     inverse = _constant_inverse(m)
+    left = _solve(m, inverse, z)
+    return _solve(m, inverse, left.conj().T).conj().T
+
+
+def _solve(m: Array, inverse: Array | None, z: Array) -> Array:
     if inverse is None:
         return jnp.linalg.solve(m, z)
     return lax.custom_linear_solve(
@@ -41,10 +69,7 @@ def solve(m: Inexact[Array, "n n"], z: Inexact[Array, "n *k"]) -> Inexact[Array,
     )
 
 
-def solve_from_right(z: Inexact[Array, "*k n"], m: Inexact[Array, "n n"]) -> Inexact[Array, "*k n"]:
-    """`z m^-1`, in the same way."""
-    m, z = promoted(m, z)
-    inverse = _constant_inverse(m)
+def _solve_from_right(z: Array, m: Array, inverse: Array | None) -> Array:
     if inverse is None:
         return jnp.linalg.solve(m.T, z.T).T
     return lax.custom_linear_solve(
@@ -55,22 +80,35 @@ def solve_from_right(z: Inexact[Array, "*k n"], m: Inexact[Array, "n n"]) -> Ine
     )
 
 
+def _is_swept(m: Array) -> bool:
+    return len(m) <= (_SWEPT_COMPLEX if jnp.iscomplexobj(m) else _SWEPT)
+
+
 def _constant_inverse(m: Inexact[Array, "n n"]) -> Inexact[Array, "n n"] | None:
     """The inverse without a derivative; or None where solving by LU is faster."""
-    m, n = lax.stop_gradient(m), len(m)
-    if n <= _WRITTEN_OUT:
+    m = lax.stop_gradient(m)
+    if len(m) <= _WRITTEN_OUT:
         return _inverse(m)
-    if n > (_SWEPT_COMPLEX if jnp.iscomplexobj(m) else _SWEPT):
+    if not _is_swept(m):
         return None
-    return lax.cond(_is_safe_without_pivots(m), _swept, jnp.linalg.inv, m)
+    return _swept_or_eliminated([m])[0]
+
+
+def _swept_or_eliminated(matrices: list[Array]) -> list[Array]:
+    """Their inverses. One branch for all keeps the program short."""
+    are_safe = functools.reduce(operator.and_, map(_is_safe_without_pivots, matrices))
+    return lax.cond(
+        are_safe,
+        lambda: [_swept(m) for m in matrices],
+        lambda: list(jnp.linalg.inv(jnp.stack(matrices))),
+    )
 
 
 def _is_safe_without_pivots(m: Inexact[Array, "n n"]) -> Bool[Array, ""]:
-    """Whether all matrices of a batch are near enough to the identity, or `m - I` skew-Hermitian.
+    """Whether `m - I` is small or nearly skew-Hermitian, for all matrices of a batch.
 
-    The eigenvalues of `m + m^H` are at least 1, by Gershgorin's circles, and entries of m at most
-    4. Then so large are the eigenvalues of its parts and Schur complements too, and all numbers on
-    the way are small.
+    Then the eigenvalues of `m + m^H` are at least 1, by Gershgorin's circles. So are those of each
+    Schur complement, so the real part of a pivot is at least 1/2. No entry of m is above 4.
     """
     # The largest over the batch is of one matrix for all: a condition on it stays a branch. To sum
     # rows of each member would take as long as a product.

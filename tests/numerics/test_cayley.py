@@ -10,10 +10,12 @@ from scipy.linalg import expm, logm
 
 from cfjax._numerics.cayley import (
     TangentCoordinates,
+    congruence_by_inverse,
     dcayinv,
     is_within_half_a_turn,
     log_determinant,
     solve,
+    solve_from_both,
     solve_from_right,
 )
 
@@ -48,6 +50,21 @@ def test_systems_against_numpy(n, dtype):
     for found, expected in pairs:
         assert found.dtype == dtype
         np.testing.assert_allclose(found, expected, rtol=0, atol=atol)
+
+
+@pytest.mark.parametrize("is_complex", [False, True])
+@pytest.mark.parametrize("n", [4, 6, 17])
+def test_systems_from_both_sides(n, is_complex):
+    dtype = np.complex128 if is_complex else np.float64
+    m, z = np.eye(n) - skew(n, 1.0, is_complex), matrices.random((n, n), 3, dtype)
+    for right in (m.conj().T, np.eye(n) - 0.1 * matrices.random((n, n), 4, dtype)):
+        # Some roundings of entries of some units.
+        expected = np.linalg.solve(m, z) @ np.linalg.inv(right)
+        found = jax.jit(solve_from_both)(m, z, right)
+        np.testing.assert_allclose(found, expected, rtol=0, atol=1e-14)
+    found = jax.jit(congruence_by_inverse)(m, z)
+    expected = np.linalg.solve(m, z) @ np.linalg.inv(m.conj().T)
+    np.testing.assert_allclose(found, expected, rtol=0, atol=1e-14)
 
 
 @pytest.mark.parametrize("n", [2, 3, 4])
