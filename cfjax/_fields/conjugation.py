@@ -10,7 +10,7 @@ from jax import lax
 from jaxtyping import Array, Bool, Inexact
 
 from .._arrays import Weight
-from .._numerics.cayley import dcayinv, solve, solve_from_right
+from .._numerics.cayley import congruence_by_inverse, dcayinv, solve_from_both
 from .._numerics.expm import expm, expm_parts
 from .._numerics.expm_both import expm_both_parts
 from .._numerics.expm_source import expm_parts_with_source
@@ -135,8 +135,8 @@ class Conjugation(AbstractTwoSided):
 
     def cayley_increment(self, x: Inexact[Array, "n n"]) -> Inexact[Array, "n n"]:
         u, x = promoted(self.a, x)
-        left = solve(plus_identity(-u / 2), _commutator(u, x))
-        return solve_from_right(left, plus_identity(u / 2))
+        change = _commutator(u, x)
+        return solve_from_both(plus_identity(-u / 2), change, plus_identity(u / 2))
 
     def commutator(self, other: Any) -> "Conjugation":
         return Conjugation(_commutator(self.a, other.a))
@@ -219,9 +219,8 @@ class Congruence(AbstractTwoSided):
     def cayley_increment(self, x: Inexact[Array, "n n"]) -> Inexact[Array, "n n"]:
         is_hermitian = jnp.all(x == _adjoint(x))
         u, x = promoted(self.a, x)
-        matrix = plus_identity(-u / 2)
-        left = solve(matrix, _linear_part(u, x))
-        return _without_skew_part(_adjoint(solve(matrix, _adjoint(left))), is_hermitian)
+        moved = congruence_by_inverse(plus_identity(-u / 2), _linear_part(u, x))
+        return _without_skew_part(moved, is_hermitian)
 
     def velocity(self, x: Inexact[Array, "n n"]) -> Inexact[Array, "n n"]:
         v = _linear_part(self.a, x)

@@ -6,29 +6,134 @@ It maps the algebra of every group of matrices with `y^H J y = J` to the group, 
 import functools
 import operator
 from collections.abc import Iterable
+from typing import Any
 
 import jax.numpy as jnp
+import numpy as np
 from jax import lax
 from jaxtyping import Array, Bool, Inexact, Real
 
 from .matmul import matmul, plus_identity, promoted, small_product
-from .squaring import magnitude
-from .vectors import pack, unpack
+from .squaring import magnitude, max_over_batch
+from .vectors import computed_once, pack, unpack
 
-# A system of 8 equations written out has 42 000 instructions in a step, and gains nothing.
+# Larger ones are written out at length: with 8 equations a step has 42 000 instructions.
 _WRITTEN_OUT = 4
+# Above, a sweep takes longer than LU, as measured.
+_SWEPT, _SWEPT_COMPLEX = 16, 8
 
 
 def solve(m: Inexact[Array, "n n"], z: Inexact[Array, "n *k"]) -> Inexact[Array, "n *k"]:
-    """`m^-1 z`: by the adjugate up to n = 4, otherwise by elimination with pivots."""
+    """`m^-1 z`, whose derivatives are products with m^-1.
+
+    By the adjugate up to n = 4, by a sweep up to n = 16 where m is near enough to the identity for
+    it, and otherwise by elimination with pivots.
+    """
     m, z = promoted(m, z)
-    return small_product(_inverse(m), z) if len(m) <= _WRITTEN_OUT else jnp.linalg.solve(m, z)
+    return _solve(m, _constant_inverse(m), z)
 
 
 def solve_from_right(z: Inexact[Array, "*k n"], m: Inexact[Array, "n n"]) -> Inexact[Array, "*k n"]:
     """`z m^-1`, in the same way."""
     m, z = promoted(m, z)
-    return small_product(z, _inverse(m)) if len(m) <= _WRITTEN_OUT else solve(m.T, z.T).T
+    return _solve_from_right(z, m, _constant_inverse(m))
+
+
+def solve_from_both(
+    left: Inexact[Array, "n n"], z: Inexact[Array, "n n"], right: Inexact[Array, "n n"]
+) -> Inexact[Array, "n n"]:
+    """`left^-1 z right^-1`, in the same way, for matrices of one dtype."""
+    if len(left) <= _WRITTEN_OUT or not _is_swept(left):
+        return solve_from_right(solve(left, z), right)
+    inverses = _swept_or_eliminated(lax.stop_gradient([left, right]))
+    return _solve_from_right(_solve(left, inverses[0], z), right, inverses[1])
+
+
+def congruence_by_inverse(
+    m: Inexact[Array, "n n"], z: Inexact[Array, "n n"]
+) -> Inexact[Array, "n n"]:
+    """`m^-1 z m^-H`, in the same way, for matrices of one dtype."""
+    inverse = _constant_inverse(m)
+    left = _solve(m, inverse, z)
+    return _solve(m, inverse, left.conj().T).conj().T
+
+
+def _solve(m: Array, inverse: Array | None, z: Array) -> Array:
+    if inverse is None:
+        return jnp.linalg.solve(m, z)
+    return lax.custom_linear_solve(
+        lambda z: small_product(m, z),
+        z,
+        lambda _, z: small_product(inverse, z),
+        lambda _, z: small_product(inverse.T, z),
+    )
+
+
+def _solve_from_right(z: Array, m: Array, inverse: Array | None) -> Array:
+    if inverse is None:
+        return jnp.linalg.solve(m.T, z.T).T
+    return lax.custom_linear_solve(
+        lambda z: small_product(z, m),
+        z,
+        lambda _, z: small_product(z, inverse),
+        lambda _, z: small_product(z, inverse.T),
+    )
+
+
+def _is_swept(m: Array) -> bool:
+    return len(m) <= (_SWEPT_COMPLEX if jnp.iscomplexobj(m) else _SWEPT)
+
+
+def _constant_inverse(m: Inexact[Array, "n n"]) -> Inexact[Array, "n n"] | None:
+    """The inverse without a derivative; or None where solving by LU is faster."""
+    m = lax.stop_gradient(m)
+    if len(m) <= _WRITTEN_OUT:
+        return _inverse(m)
+    if not _is_swept(m):
+        return None
+    return _swept_or_eliminated([m])[0]
+
+
+def _swept_or_eliminated(matrices: list[Array]) -> list[Array]:
+    """Their inverses. One branch for all keeps the program short."""
+    are_safe = functools.reduce(operator.and_, map(_is_safe_without_pivots, matrices))
+    return lax.cond(
+        are_safe,
+        lambda: [_swept(m) for m in matrices],
+        lambda: list(jnp.linalg.inv(jnp.stack(matrices))),
+    )
+
+
+def _is_safe_without_pivots(m: Inexact[Array, "n n"]) -> Bool[Array, ""]:
+    """Whether `m - I` is small or nearly skew-Hermitian, for all matrices of a batch.
+
+    Then the eigenvalues of `m + m^H` are at least 1, by Gershgorin's circles. So are those of each
+    Schur complement, so the real part of a pivot is at least 1/2. No entry of m is above 4.
+    """
+    # The largest over the batch is of one matrix for all: a condition on it stays a branch. To sum
+    # rows of each member would take as long as a product.
+    defect = max_over_batch(magnitude(m + m.conj().T - 2 * jnp.eye(len(m), dtype=m.dtype)))
+    size = max_over_batch(magnitude(m))
+    # NaN stays NaN by each way.
+    return (jnp.max(jnp.sum(defect, axis=1)) <= 1) & (jnp.max(size) <= 4)
+
+
+def _swept(m: Inexact[Array, "n n"]) -> Inexact[Array, "n n"]:
+    """The inverse, by Gauss and Jordan's elimination without pivots.
+
+    The first equation and the first unknown change places in `m x = y`, and go last. After n turns
+    it is `x = m^-1 y`, in the order of the start.
+    """
+
+    def turn(_: Any, m: Array) -> Array:
+        factor = 1 / m[0, 0]
+        row, column = factor * m[0, 1:], m[1:, 0]
+        rest = m[1:, 1:] - column[:, None] * row[None, :]
+        left = jnp.concatenate([rest, row[None, :]])
+        right = jnp.append(-factor * column, factor)
+        return jnp.concatenate([left, right[:, None]], axis=1)
+
+    return lax.fori_loop(0, len(m), turn, m)
 
 
 def dcayinv(u: Inexact[Array, "n n"], a: Inexact[Array, "n n"]) -> Inexact[Array, "n n"]:
@@ -44,12 +149,14 @@ def dcayinv(u: Inexact[Array, "n n"], a: Inexact[Array, "n n"]) -> Inexact[Array
 def _inverse(m: Inexact[Array, "n n"]) -> Inexact[Array, "n n"]:
     """The adjugate over the determinant, for n up to 4. Units of coordinates have no effect."""
     n = len(m)
+    if n == 4:
+        return _inverse_of_four(m)
     x = unpack(m.reshape(n * n))
     if n == 1:
         adjugate, det = [jnp.ones_like(x[0])], x[0]
     elif n == 2:
         adjugate, det = [x[3], -x[1], -x[2], x[0]], x[0] * x[3] - x[1] * x[2]
-    elif n == 3:
+    else:
         # Rows and columns in cyclic order give the signs.
         adjugate = [
             x[3 * ((j + 1) % 3) + (i + 1) % 3] * x[3 * ((j + 2) % 3) + (i + 2) % 3]
@@ -58,32 +165,28 @@ def _inverse(m: Inexact[Array, "n n"]) -> Inexact[Array, "n n"]:
             for j in range(3)
         ]
         det = _sum(x[j] * adjugate[3 * j] for j in range(3))
-    else:
-        adjugate = _adjugate_of_four(x)
-        det = _sum(x[j] * adjugate[4 * j] for j in range(4))
     factor = 1 / det
     return pack([factor * entry for entry in adjugate]).reshape(n, n)
 
 
-def _adjugate_of_four(x: list[Array]) -> list[Array]:
-    """By Laplace's expansion: minors of the first two rows, and of the last two."""
+def _inverse_of_four(m: Inexact[Array, "4 4"]) -> Inexact[Array, "4 4"]:
+    """By Laplace's expansion: minors of the first two rows, and of the last two.
 
-    def minors(row: int) -> dict[tuple[int, int], Array]:
-        a, b = x[4 * row : 4 * row + 4], x[4 * row + 4 : 4 * row + 8]
-        return {(i, j): a[i] * b[j] - a[j] * b[i] for i in range(4) for j in range(i + 1, 4)}
-
-    top, bottom = minors(0), minors(2)
-
-    def cofactor(i: int, j: int) -> Array:
-        """Without row i and column j, with its sign."""
-        a, b, c = (k for k in range(4) if k != j)
-        # The other row of the pair that has row i.
-        row, pairs = (1 - i, bottom) if i < 2 else (5 - i, top)
-        y = [x[4 * row + k] for k in (a, b, c)]
-        minor = y[0] * pairs[b, c] - y[1] * pairs[a, c] + y[2] * pairs[a, b]
-        return minor if (i + j) % 2 == 0 else -minor
-
-    return [cofactor(j, i) for i in range(4) for j in range(4)]
+    As arrays, with columns in cyclic order, they are a third of the instructions of entries.
+    """
+    cyclic = jnp.concatenate([m, m[:, :3]], axis=1)
+    first, second = ([rows[:, j : j + 4] for j in range(4)] for rows in (cyclic[::2], cyclic[1::2]))
+    pairs = [(2, 3), (1, 3), (1, 2)]
+    # Twelve cofactors would compute each minor anew.
+    minors = computed_once(
+        jnp.stack([first[i] * second[j] - first[j] * second[i] for i, j in pairs])
+    )
+    # The other row of a pair goes with the minors of the other pair.
+    a, b, c = minors[:, ::-1]
+    of_first, of_second = (x[1] * a - x[2] * b + x[3] * c for x in (second, first))
+    cofactors = jnp.stack([of_first, of_second], axis=1).reshape(4, 4)
+    cofactors = jnp.where(np.indices((4, 4)).sum(axis=0) % 2 == 0, cofactors, -cofactors)
+    return (1 / jnp.sum(m[0] * cofactors[0])) * cofactors.T
 
 
 def log_determinant(u: Inexact[Array, "3 3"]) -> Inexact[Array, ""]:

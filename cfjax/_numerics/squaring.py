@@ -60,7 +60,7 @@ def max_over_batch(s: Array) -> Array:
 @max_over_batch.def_vmap
 def _(axis_size: int, in_batched: list[bool], s: Array) -> tuple[Array, bool]:
     del axis_size, in_batched
-    return max_over_batch(jnp.max(s, initial=0, where=s == s)), False
+    return max_over_batch(jnp.max(s, axis=0, initial=0, where=s == s)), False
 
 
 def squared(

@@ -8,6 +8,7 @@ from typing import Any
 
 from jaxtyping import Array, Float
 
+from .._xla import computed_once as computed_once
 from .._xla import kept_on_arrays as kept_on_arrays
 from .._xla import materialised as materialised
 from .._xla import materialised_in_rows as materialised_in_rows

@@ -10,10 +10,12 @@ from scipy.linalg import expm, logm
 
 from cfjax._numerics.cayley import (
     TangentCoordinates,
+    congruence_by_inverse,
     dcayinv,
     is_within_half_a_turn,
     log_determinant,
     solve,
+    solve_from_both,
     solve_from_right,
 )
 
@@ -34,7 +36,7 @@ def skew(n, angle=1.0, is_complex=False):
 
 
 @pytest.mark.parametrize("dtype", matrices.DTYPES)
-@pytest.mark.parametrize("n", [1, 2, 3, 4, 5])
+@pytest.mark.parametrize("n", [1, 2, 3, 4, 5, 17])
 def test_systems_against_numpy(n, dtype):
     m = (np.eye(n) - 0.4 * matrices.random((n, n), 1)).astype(dtype)
     m = m + (0.2 * matrices.random((n, n), 2, dtype)).astype(dtype)
@@ -50,6 +52,21 @@ def test_systems_against_numpy(n, dtype):
         np.testing.assert_allclose(found, expected, rtol=0, atol=atol)
 
 
+@pytest.mark.parametrize("is_complex", [False, True])
+@pytest.mark.parametrize("n", [4, 6, 17])
+def test_systems_from_both_sides(n, is_complex):
+    dtype = np.complex128 if is_complex else np.float64
+    m, z = np.eye(n) - skew(n, 1.0, is_complex), matrices.random((n, n), 3, dtype)
+    for right in (m.conj().T, np.eye(n) - 0.1 * matrices.random((n, n), 4, dtype)):
+        # Some roundings of entries of some units.
+        expected = np.linalg.solve(m, z) @ np.linalg.inv(right)
+        found = jax.jit(solve_from_both)(m, z, right)
+        np.testing.assert_allclose(found, expected, rtol=0, atol=1e-14)
+    found = jax.jit(congruence_by_inverse)(m, z)
+    expected = np.linalg.solve(m, z) @ np.linalg.inv(m.conj().T)
+    np.testing.assert_allclose(found, expected, rtol=0, atol=1e-14)
+
+
 @pytest.mark.parametrize("n", [2, 3, 4])
 def test_units_scale_rounding(n):
     """Entries of any size by a change of units, as of kilometres and seconds."""
@@ -57,6 +74,105 @@ def test_units_scale_rounding(n):
     scaled = d[:, None] * m / d
     found = np.asarray(solve(scaled, np.eye(n))) / d[:, None] * d
     np.testing.assert_allclose(found, np.linalg.inv(m), rtol=0, atol=1e-14)
+
+
+def far_from_the_identity(kind, n=6):
+    """Matrices x for which elimination of `I - x` needs pivots, or loses digits without them."""
+    a = matrices.random((n, n), 3)
+    if kind == "no first pivot":
+        return a - np.diag(np.diag(a)) + np.diag([1.0] + [0.5] * (n - 1))
+    if kind == "nearly none":
+        return a - np.diag(np.diag(a)) + np.diag([1 + 1e-13] + [0.5] * (n - 1))
+    if kind == "no second pivot":
+        # The first part of two is singular, and the first pivot is not.
+        a[:2, :2] = [[0, -1], [-1, 0]]
+        return a
+    if kind == "large":
+        return 30 * a
+    if kind == "near a pole":
+        a = (a - a.T) / np.linalg.norm(a - a.T, 2)
+        return (1 - 1e-6) * np.eye(n) + a * (1 - np.eye(n))
+    if kind == "not normal":
+        return np.triu(50 * a, 1) + 0.3 * a
+    form = np.kron([[0, 1], [-1, 0]], np.eye(n // 2))
+    if kind == "symplectic":
+        return 20 * form @ (a + a.T)
+    form = np.diag([-1.0] + [1.0] * (n - 1))
+    return 3 * form @ (a - a.T)
+
+
+KINDS = [
+    *("no first pivot", "nearly none", "no second pivot", "large", "near a pole", "not normal"),
+    *("symplectic", "Lorentz"),
+]
+
+
+@pytest.mark.parametrize("in_batch", [False, True])
+@pytest.mark.parametrize("kind", KINDS)
+def test_no_matrix_gives_a_silently_wrong_number(kind, in_batch):
+    """Also in a batch with one for which a sweep without pivots would do."""
+    x, z = far_from_the_identity(kind), matrices.random((6, 3), 5)
+    m = np.eye(6) - x
+    given = np.stack([m, np.eye(6) - skew(6)]) if in_batch else m[None]
+    found = jax.jit(jax.vmap(lambda m: (solve(m, z), solve_from_right(z.T, m))))(jnp.asarray(given))
+    for m, right, left in zip(given, *found, strict=True):
+        inverse = np.linalg.inv(m)
+        # Some roundings, times the condition, of the largest.
+        atol = 100 * UNIT["float64"] * np.linalg.cond(m) * np.abs(inverse).max()
+        np.testing.assert_allclose(right, inverse @ z, rtol=0, atol=atol)
+        np.testing.assert_allclose(left, z.T @ inverse, rtol=0, atol=atol)
+
+
+@pytest.mark.parametrize("dtype", matrices.DTYPES)
+@pytest.mark.parametrize("n", [5, 8])
+def test_skew_systems_of_any_angle(n, dtype):
+    """They take no pivots up to entries of 4, and lose no digits by that."""
+    for size in (1e-8, 0.1, 1.0, 3.0, 30.0, 1e4):
+        m = (np.eye(n) - size * skew(n, 1.0, np.issubdtype(dtype, np.complexfloating))).astype(
+            dtype
+        )
+        wide = np.complex128 if np.iscomplexobj(m) else np.float64
+        expected = np.linalg.inv(m.astype(wide))
+        # Some roundings, times the condition.
+        atol = 20 * UNIT[np.dtype(dtype).name] * np.linalg.cond(m)
+        np.testing.assert_allclose(solve(m, np.eye(n, dtype=dtype)), expected, rtol=0, atol=atol)
+
+
+def test_a_member_that_is_not_finite_spoils_no_other():
+    good = np.eye(5) - skew(5)
+    for bad in (np.nan, np.inf):
+        m = np.stack([good, np.full((5, 5), bad)])
+        found = np.asarray(jax.vmap(solve)(jnp.asarray(m), jnp.asarray(m)))
+        assert not np.isfinite(found[1]).any()
+        np.testing.assert_allclose(found[0], np.eye(5), rtol=0, atol=1e-15 * 5)
+
+
+@pytest.mark.parametrize("is_far", [False, True])
+@pytest.mark.parametrize("n", [3, 4, 6])
+def test_derivatives_of_systems(n, is_far):
+    """`W = m^-1` has the derivative `-W m' W`, and that the next one."""
+    x = far_from_the_identity("Lorentz", n) if is_far else skew(n)
+    m, z, dm = (
+        jnp.asarray(x) for x in (np.eye(n) - x, *(matrices.random((n, n), k) for k in (6, 7)))
+    )
+    w = jnp.linalg.inv(m)
+    for fun, first, second in [
+        (lambda m: solve(m, z), w @ dm @ w @ z, 2 * w @ dm @ w @ dm @ w @ z),
+        (lambda m: solve_from_right(z, m), z @ w @ dm @ w, 2 * z @ w @ dm @ w @ dm @ w),
+    ]:
+
+        def slope(m, fun=fun):
+            return jax.jvp(fun, (m,), (dm,))[1]
+
+        value, twice = jax.jvp(slope, (m,), (dm,))
+        # Roundings of products of matrices as large as these.
+        atol = 1e-14 * float(jnp.abs(w).max()) ** 2 * n**2
+        np.testing.assert_allclose(value, -first, rtol=0, atol=atol)
+        np.testing.assert_allclose(twice, second, rtol=1e-12, atol=10 * atol)
+        gradient = jax.grad(lambda m, fun=fun: jnp.sum(z * fun(m)))(m)
+        np.testing.assert_allclose(
+            jnp.sum(gradient * dm), -jnp.sum(z * first), rtol=1e-12, atol=atol
+        )
 
 
 @pytest.mark.parametrize("is_complex", [False, True])
