@@ -4,11 +4,18 @@ from typing import ClassVar
 
 import jax.numpy as jnp
 import jax.tree_util as jtu
+from jax import lax
 from jaxtyping import PyTree
 
 from .._field import has_rate, in_coordinates, landing, rate
 from .compiled import materialised_in_rows
 from .step import Chart
+
+_NOT_SKEW = (
+    'coordinates="projected" needs skew-Hermitian matrices a in LeftMatrix and RightMatrix, as for '
+    "orthogonal and unitary matrices, and a is not skew-Hermitian at the start. Use a "
+    "commutator-free method, for example cfjax.CF4()."
+)
 
 
 def landed(field: PyTree, start: PyTree) -> PyTree:
@@ -55,6 +62,11 @@ class ProjectedChart(AbstractCoordinateChart):
     __slots__ = ()
 
     name = "projected"
+
+    @classmethod
+    def case_of_start(cls, field, y0):
+        has_step = has_rate(in_coordinates(cls.name, lax.stop_gradient(field()), y0))
+        return None if has_step is None else (~has_step, _NOT_SKEW)
 
 
 class CayleyChart(AbstractCoordinateChart):

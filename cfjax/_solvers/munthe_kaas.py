@@ -11,7 +11,6 @@ import equinox as eqx
 import jax.numpy as jnp
 import jax.tree_util as jtu
 import numpy as np
-from jax import lax
 from jaxtyping import Array, Bool, PyTree, Real
 
 from .._control_term import is_driven
@@ -20,8 +19,6 @@ from .._field import (
     AbstractCoordinates,
     bracket,
     combine,
-    has_rate,
-    in_coordinates,
     is_field,
     no_bracket_message,
     tangent,
@@ -38,12 +35,6 @@ from .dense import Path
 from .stages import rolled_elements
 from .step import AbstractChartSolver, Chart, Step
 from .sums import Sums
-
-_NOT_SKEW = (
-    'coordinates="projected" needs skew-Hermitian matrices a in LeftMatrix and RightMatrix, as for '
-    "orthogonal and unitary matrices, and a is not skew-Hermitian at the start. Use a "
-    "commutator-free method, for example cfjax.CF4()."
-)
 
 # The rows of the stages after the first, and the weights.
 _RungeKutta = tuple[tuple[tuple[float, ...], ...], tuple[float, ...]]
@@ -285,12 +276,10 @@ class AbstractRKMK(AbstractMuntheKaas):
 
     def start(self, terms, t0, t1, y0, args):
         state, fault = super().start(terms, t0, t1, y0, args)
-        if self.coordinates == "projected":
-            value = product(terms, terms.vf(t0, y0, args), terms.contr(t0, t1))
-            is_defined = has_rate(in_coordinates("projected", lax.stop_gradient(value), y0))
-            if is_defined is not None:
-                fault = fault.with_case(~is_defined, _NOT_SKEW)
-        return state, fault
+        case = self.chart_type.case_of_start(
+            lambda: product(terms, terms.vf(t0, y0, args), terms.contr(t0, t1)), y0
+        )
+        return state, fault if case is None else fault.with_case(*case)
 
     def order(self, terms) -> int:
         return _order(*self._end)

@@ -74,6 +74,13 @@ class Chart(NamedTuple):
         return cls(value, product, sums, first_value, first_field, start)
 
     @classmethod
+    def case_of_start(
+        cls, field: Callable[[], PyTree], y0: PyTree
+    ) -> tuple[Bool[Array, ""], str] | None:
+        """Whether the first field has no step in this chart, and what to do; None if it has one."""
+        return None
+
+    @classmethod
     def charted(
         cls, sums: Sums, field: PyTree, point: PyTree, earlier: Sequence[PyTree] = ()
     ) -> tuple[PyTree, PyTree]:
