@@ -196,10 +196,14 @@ def test_scenes_solve_with_the_method_that_readme_recommends():
     rows = re.findall(r"^\| `(\w+)\(.*\| (.*?) \|$", readme, re.MULTILINE)
     methods = {name: text for name, text in rows if hasattr(cfjax, name)}
     assert len(methods) > 10
+    projected = 'RKMK8(coordinates="projected")'
     seen = set()
     for name, module in SCENES.items():
         problem = module.problem()
         chosen = type(module.solver).__name__
+        coordinates = getattr(module.solver, "coordinates", "exponential")
+        if coordinates != "exponential":
+            chosen = f'{chosen}(coordinates="{coordinates}")'
         if isinstance(problem["term"], cfjax.VariationTerm):
             # With variations by the method for the state.
             problem |= {"term": problem["term"].term, "y0": problem["y0"].state}
@@ -223,9 +227,9 @@ def test_scenes_solve_with_the_method_that_readme_recommends():
         else:
             assert all(f"`{chosen}`" in str(kind) for kind in kinds), (name, kinds)
             # A Magnus method refuses fields that depend on the state.
-            assert chosen in ("CF4", "Magnus6"), name
+            assert chosen in ("CF4", "Magnus6", projected), name
         seen.add(chosen)
-    assert seen == {"CF4", "ETD54", "Kraus4", "Magnus4", "Magnus6", "RKL2", "RKMK8"}
+    assert seen == {"CF4", "ETD54", "Kraus4", "Magnus4", "Magnus6", "RKL2", "RKMK8", projected}
 
 
 # What solvers keep to their order alone: relative to the start, to 1e-3 with the steps below, of

@@ -131,6 +131,8 @@ def scene(
         update(advance=1)
 
     method = type(module.solver).__name__
+    coordinates = getattr(module.solver, "coordinates", "exponential")
+    method = method if coordinates == "exponential" else f"{method} ({coordinates})"
     title = f"{num_steps} equal steps of {method}, t = {float(arrays[0]):g} to {float(arrays[1]):g}"
     table = Table(box=box.SIMPLE_HEAD, padding=(0, 1), title=title, title_justify="left")
     table.add_column("", no_wrap=True)
