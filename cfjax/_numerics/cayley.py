@@ -19,6 +19,9 @@ from .vectors import computed_once, pack, unpack
 
 # Larger ones are written out at length: with 8 equations a step has 42 000 instructions.
 _WRITTEN_OUT = 4
+# Derivatives of so few numbers are as short as products with the inverse, and a step on single
+# numbers with these takes half as long again.
+_DIFFERENTIATED = 2
 # Above, a sweep takes longer than LU, as measured.
 _SWEPT, _SWEPT_COMPLEX = 16, 8
 
@@ -60,7 +63,7 @@ def congruence_by_inverse(
 
 def _solve(m: Array, inverse: Array | None, z: Array) -> Array:
     if inverse is None:
-        return jnp.linalg.solve(m, z)
+        return small_product(_inverse(m), z) if _is_tiny(m) else jnp.linalg.solve(m, z)
     return lax.custom_linear_solve(
         lambda z: small_product(m, z),
         z,
@@ -71,7 +74,7 @@ def _solve(m: Array, inverse: Array | None, z: Array) -> Array:
 
 def _solve_from_right(z: Array, m: Array, inverse: Array | None) -> Array:
     if inverse is None:
-        return jnp.linalg.solve(m.T, z.T).T
+        return small_product(z, _inverse(m)) if _is_tiny(m) else jnp.linalg.solve(m.T, z.T).T
     return lax.custom_linear_solve(
         lambda z: small_product(z, m),
         z,
@@ -80,12 +83,18 @@ def _solve_from_right(z: Array, m: Array, inverse: Array | None) -> Array:
     )
 
 
+def _is_tiny(m: Array) -> bool:
+    return len(m) <= _DIFFERENTIATED
+
+
 def _is_swept(m: Array) -> bool:
     return len(m) <= (_SWEPT_COMPLEX if jnp.iscomplexobj(m) else _SWEPT)
 
 
 def _constant_inverse(m: Inexact[Array, "n n"]) -> Inexact[Array, "n n"] | None:
-    """The inverse without a derivative; or None where solving by LU is faster."""
+    """The inverse without a derivative; or None where another way is faster."""
+    if _is_tiny(m):
+        return None
     m = lax.stop_gradient(m)
     if len(m) <= _WRITTEN_OUT:
         return _inverse(m)
