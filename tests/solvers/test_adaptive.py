@@ -19,7 +19,7 @@ def test_a_solver_with_an_estimate_is_adaptive(name):
     row = METHODS[name]
     solver, field, y0 = row.make(), problems.rigid_body, jnp.ones(3)
     if row.takes == "columns":
-        field, y0 = lambda t, y, args: cfjax.LowRankSkew(args[:2] * y), jnp.eye(3)[:, :2]
+        field, y0 = lambda t, y, args: cfjax.LowRankSkew(args[:2][None] * y), jnp.eye(3)[:, :2]
 
     def error(y):
         term, times = cfjax.LieTerm(field), (jnp.asarray(0.0), jnp.asarray(0.1))
