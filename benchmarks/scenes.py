@@ -6,7 +6,7 @@ velocities in plain space at the tolerance that leads to the same error, in turn
 root of the mean square over the numbers of the state, which is how diffrax measures that of a step.
 """
 
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Iterator
 from typing import Any, NamedTuple
 
 import diffrax
@@ -32,6 +32,7 @@ from cfjax.scenes import (
     wilson_flow,
     zeitlin,
 )
+from cfjax.scenes._scene import PROJECTED, by_name
 
 TOLERANCES = (1e-4, 1e-6, 1e-8, 1e-11)
 # At these tolerances times are taken as well.
@@ -39,15 +40,11 @@ TIMED = (1e-6, 1e-8, 1e-11)
 
 
 # Of fields of matrices and columns: with exponentials, and with stages in plain space.
-ON_MATRICES = {
-    "CF54": cfjax.CF54(),
-    "RKMK5, projected": cfjax.RKMK5(coordinates="projected"),
-    "RKMK8, projected": cfjax.RKMK8(coordinates="projected"),
-}
+ON_MATRICES = cfjax.CF54(), *PROJECTED
 
 
 class Scene(NamedTuple):
-    solvers: Mapping[str, diffrax.AbstractSolver]
+    solvers: tuple[diffrax.AbstractSolver, ...]
     problem: dict[str, Any]
     # The exact final state, and a bound of its error.
     reference: Callable[[], Any]
@@ -56,7 +53,7 @@ class Scene(NamedTuple):
 
 
 def scenes() -> dict[str, Scene]:
-    attitude, magnus = {"RKMK8": cfjax.RKMK8()}, {"Magnus6": cfjax.Magnus6()}
+    attitude, magnus = (cfjax.RKMK8(),), (cfjax.Magnus6(),)
     track, turning, flowing = covariance.problem(), spins.problem(), wilson_flow.problem()
     rod, fluid, tilted = heat.problem(), zeitlin.problem(), heavy_top.problem()
     return {
@@ -74,7 +71,7 @@ def scenes() -> dict[str, Scene]:
             heavy_top.velocity,
         ),
         "spins": Scene(
-            {"CF54": cfjax.CF54()},
+            (cfjax.CF54(),),
             turning,
             lambda: spins.reference(spins.t1, turning["y0"], turning["args"]),
             1e-12,
@@ -102,14 +99,14 @@ def scenes() -> dict[str, Scene]:
             zeitlin.velocity,
         ),
         "covariance": Scene(
-            {"CF4": cfjax.CF4()},
+            (cfjax.CF4(),),
             track,
             lambda: covariance.reference(covariance.t1, track["y0"], track["args"]),
             1e-13,
             covariance.velocity,
         ),
         "heat": Scene(
-            {"CF43": cfjax.CF43()},
+            (cfjax.CF43(),),
             rod,
             lambda: np.asarray(
                 heat.from_grid(jnp.asarray(heat.reference(heat.t1, rod["args"].mu)))
@@ -148,13 +145,13 @@ class Run(NamedTuple):
 class Program:
     """A method on a scene, compiled once for all tolerances."""
 
-    def __init__(self, scene: Scene, name: str | None, exact: Any):
-        """Without a name that of Tsit5 in plain space."""
+    def __init__(self, scene: Scene, solver: diffrax.AbstractSolver | None, exact: Any):
+        """Without a solver that of Tsit5 in plain space."""
         problem, self.exact = scene.problem, exact
         field = problem["term"].field
         velocity = scene.velocity or (lambda t, y, args: cfjax.tangent(field(t, y, args), y))
-        term = diffrax.ODETerm(velocity) if name is None else problem["term"]
-        solver = diffrax.Tsit5() if name is None else scene.solvers[name]
+        term = diffrax.ODETerm(velocity) if solver is None else problem["term"]
+        solver = solver or diffrax.Tsit5()
 
         def solve(y0: Any, args: Any, dt0: Any, tolerance: Any) -> tuple[Any, Any]:
             sol = diffrax.diffeqsolve(
@@ -209,8 +206,8 @@ def measure(quick: bool, only: tuple[str, ...] = ()) -> Iterator[results.Row]:
             continue
         exact = scene.reference()
         theirs = Program(scene, None, exact)
-        for method in scene.solvers:
-            ours = Program(scene, method, exact)
+        for method, solver in by_name(*scene.solvers).items():
+            ours = Program(scene, solver, exact)
             for row in _rows(scene, ours, theirs, repeats=3 if quick else 11):
                 yield {"scene": name, "method": method} | row
 

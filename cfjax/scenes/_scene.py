@@ -52,15 +52,20 @@ class Scene(Protocol):
 
 
 # Methods of a chart, with stages in plain space.
-PROJECTED = {
-    "RKMK5, projected": cfjax.RKMK5(coordinates="projected"),
-    "RKMK8, projected": cfjax.RKMK8(coordinates="projected"),
-}
+PROJECTED = cfjax.RKMK5(coordinates="projected"), cfjax.RKMK8(coordinates="projected")
 
 
 def by_name(*solvers: diffrax.AbstractSolver, term: Any = None) -> dict[str, Any]:
-    """Methods of a chart, each by the name of its class. They solve `term`, if it is given."""
-    methods = {type(solver).__name__: solver for solver in solvers}
+    """Methods of a chart, each by the name of its class, with coordinates of its steps that are not
+    exponential. They solve `term`, if it is given.
+    """
+
+    def name(solver: diffrax.AbstractSolver) -> str:
+        coordinates = getattr(solver, "coordinates", "exponential")
+        suffix = "" if coordinates == "exponential" else f", {coordinates}"
+        return type(solver).__name__ + suffix
+
+    methods = {name(solver): solver for solver in solvers}
     return methods if term is None else {name: (term, s) for name, s in methods.items()}
 
 

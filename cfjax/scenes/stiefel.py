@@ -172,7 +172,7 @@ def _chart(which: str, options: dict[str, Any]) -> cfjax.WorkPrecision:
         **problem(which, 1000),
         methods=by_name(cfjax.CF3(), cfjax.CF4(), cfjax.RKMK4())
         | {"RKR-C4": cfjax.CayleyRK4()}
-        | PROJECTED
+        | by_name(*PROJECTED)
         | in_plain_space(_velocity(field), diffrax.Tsit5()),
         reference=reference(which, 1000),
         num_steps=[4 * 2**k for k in range(7)],

@@ -117,7 +117,7 @@ def chart(**options: Any) -> cfjax.WorkPrecision:
     return cfjax.work_precision(
         **problem(),
         methods=by_name(cfjax.CF3(), cfjax.CF4(), cfjax.Luscher3(), cfjax.CK34(), cfjax.CK54())
-        | PROJECTED
+        | by_name(*PROJECTED)
         | in_plain_space(velocity, diffrax.Tsit5()),
         reference=reference(t1, y0()),
         num_steps=[5 * 2**k for k in range(5)],

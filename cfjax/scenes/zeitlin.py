@@ -233,7 +233,7 @@ def chart(**options: Any) -> cfjax.WorkPrecision:
     return cfjax.work_precision(
         **problem(),
         methods=by_name(cfjax.CF3(), cfjax.CF4(), cfjax.CF43(), cfjax.CF54())
-        | PROJECTED
+        | by_name(*PROJECTED)
         | in_plain_space(velocity, diffrax.Dopri5(), diffrax.Tsit5()),
         reference=reference(t1, y0()),
         num_steps=[10 * 2**k for k in range(6)],

@@ -52,10 +52,11 @@ def test_a_scene_follows_the_protocol(name):
 
 
 def test_methods_have_the_names_of_their_classes():
-    methods = by_name(cfjax.CF4(), cfjax.RKMK4())
+    methods = by_name(cfjax.CF4(), cfjax.RKMK5(), cfjax.RKMK5(coordinates="projected"))
     assert {name: type(solver) for name, solver in methods.items()} == {
         "CF4": cfjax.CF4,
-        "RKMK4": cfjax.RKMK4,
+        "RKMK5": cfjax.RKMK5,
+        "RKMK5, projected": cfjax.RKMK5,
     }
     ((name, (term, solver)),) = in_plain_space(rigid_body.velocity, diffrax.Tsit5()).items()
     assert (name, type(term), type(solver)) == ("Tsit5", diffrax.ODETerm, diffrax.Tsit5)
