@@ -5,7 +5,7 @@ It maps the algebra of every group of matrices with `y^H J y = J` to the group, 
 
 import functools
 import operator
-from collections.abc import Iterable
+from collections.abc import Iterable, Sequence
 from typing import Any
 
 import jax.numpy as jnp
@@ -33,30 +33,30 @@ def solve(m: Inexact[Array, "n n"], z: Inexact[Array, "n *k"]) -> Inexact[Array,
     it, and otherwise by elimination with pivots.
     """
     m, z = promoted(m, z)
-    return _solve(m, _constant_inverse(m), z)
+    (inverse,) = _constant_inverses(m)
+    return _solve(m, inverse, z)
 
 
 def solve_from_right(z: Inexact[Array, "*k n"], m: Inexact[Array, "n n"]) -> Inexact[Array, "*k n"]:
     """`z m^-1`, in the same way."""
     m, z = promoted(m, z)
-    return _solve_from_right(z, m, _constant_inverse(m))
+    (inverse,) = _constant_inverses(m)
+    return _solve_from_right(z, m, inverse)
 
 
 def solve_from_both(
     left: Inexact[Array, "n n"], z: Inexact[Array, "n n"], right: Inexact[Array, "n n"]
 ) -> Inexact[Array, "n n"]:
     """`left^-1 z right^-1`, in the same way, for matrices of one dtype."""
-    if len(left) <= _WRITTEN_OUT or not _is_swept(left):
-        return solve_from_right(solve(left, z), right)
-    inverses = _swept_or_eliminated(lax.stop_gradient([left, right]))
-    return _solve_from_right(_solve(left, inverses[0], z), right, inverses[1])
+    of_left, of_right = _constant_inverses(left, right)
+    return _solve_from_right(_solve(left, of_left, z), right, of_right)
 
 
 def congruence_by_inverse(
     m: Inexact[Array, "n n"], z: Inexact[Array, "n n"]
 ) -> Inexact[Array, "n n"]:
     """`m^-1 z m^-H`, in the same way, for matrices of one dtype."""
-    inverse = _constant_inverse(m)
+    (inverse,) = _constant_inverses(m)
     left = _solve(m, inverse, z)
     return _solve(m, inverse, left.conj().T).conj().T
 
@@ -87,27 +87,17 @@ def _is_tiny(m: Array) -> bool:
     return len(m) <= _DIFFERENTIATED
 
 
-def _is_swept(m: Array) -> bool:
-    return len(m) <= (_SWEPT_COMPLEX if jnp.iscomplexobj(m) else _SWEPT)
-
-
-def _constant_inverse(m: Inexact[Array, "n n"]) -> Inexact[Array, "n n"] | None:
-    """The inverse without a derivative; or None where another way is faster."""
-    if _is_tiny(m):
-        return None
-    m = lax.stop_gradient(m)
-    if len(m) <= _WRITTEN_OUT:
-        return _inverse(m)
-    if not _is_swept(m):
-        return None
-    return _swept_or_eliminated([m])[0]
-
-
-def _swept_or_eliminated(matrices: list[Array]) -> list[Array]:
-    """Their inverses. One branch for all keeps the program short."""
-    are_safe = functools.reduce(operator.and_, map(_is_safe_without_pivots, matrices))
+def _constant_inverses(*matrices: Inexact[Array, "n n"]) -> Sequence[Inexact[Array, "n n"] | None]:
+    """The inverses without derivatives; or None for each where another way is faster."""
+    n, swept = len(matrices[0]), _SWEPT_COMPLEX if jnp.iscomplexobj(matrices[0]) else _SWEPT
+    if n <= _DIFFERENTIATED or n > swept:
+        return [None] * len(matrices)
+    matrices = lax.stop_gradient(matrices)
+    if n <= _WRITTEN_OUT:
+        return [_inverse(m) for m in matrices]
+    # One branch for all keeps the program short.
     return lax.cond(
-        are_safe,
+        functools.reduce(operator.and_, map(_is_safe_without_pivots, matrices)),
         lambda: [_swept(m) for m in matrices],
         lambda: list(jnp.linalg.inv(jnp.stack(matrices))),
     )
