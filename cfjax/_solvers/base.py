@@ -16,6 +16,7 @@ from .._control_term import fault_of_increments, is_driven
 from .._field import AbstractFrozenField, combine, is_field
 from .._methods.order_conditions import order
 from .._numerics.checks import Fault
+from .._numerics.jumps import may_jump
 from .._term import product, velocity
 from .solver import AbstractSolver
 from .sums import Sums
@@ -54,7 +55,10 @@ class AbstractLieSolver(AbstractSolver):
 
     @property
     def first_same_as_last(self) -> bool:
-        """Whether the last evaluation of a step is the first one of the next step."""
+        """Whether the last evaluation of a step is the first one of the next step.
+
+        It is not where the field may jump between both (`first_value`).
+        """
         return False
 
     def init(self, terms, t0, t1, y0, args) -> "State":
@@ -78,7 +82,7 @@ class AbstractLieSolver(AbstractSolver):
 
         field, compensation = eqx.filter_eval_shape(field_and_compensation, y0)
         compensation = Sums(y0, compensation).zeros()
-        first = terms.vf(t0, y0, args) if self.first_same_as_last else None
+        first = first_value(terms, t0, t1, y0, args) if self.first_same_as_last else None
         fault = fault_of_start(t0, t1, (field,), y0)
         fault = fault_of_fields(fault, (field,), terms, t0, y0, args)
         fault = fault_of_increments(fault, terms, t0, t1, y0, args)
@@ -185,11 +189,41 @@ def result_of(y: PyTree) -> diffrax.RESULTS:
 
 
 def time_at(c: Any, t0: Any, t1: Any) -> Any:
-    """The time at a part c of the step, at its end exactly: the field may jump there."""
+    """The time at a part c of the step, at its end exactly."""
     if isinstance(c, float):
         return t1 if c == 1 else t0 + c * (t1 - t0)
     c = jnp.asarray(c, jnp.result_type(t0))
     return jnp.where(c == 1, t1, t0 + c * (t1 - t0))
+
+
+# How far within a step its first and last evaluations are, in units of rounding of the times: more
+# than the two roundings of a step's end, and the two of an edge with which a field compares it.
+_UNITS = 4
+
+
+def evaluation_times(t0: Any, t1: Any) -> tuple[Any, Any]:
+    """The times between which a step evaluates the field: its ends, some roundings within it.
+
+    A field may jump where a step ends, as pulses in slots do. The step then takes the limit from
+    within, at both ends, so a step backwards in time evaluates the field at the same times. At most
+    an eighth of the step on either side, for steps that are hardly longer than a rounding.
+    """
+    eps = float(jnp.finfo(jnp.result_type(t0, t1, float)).eps)
+    bound = _UNITS * eps * jnp.maximum(jnp.abs(t0), jnp.abs(t1))
+    shift = lax.stop_gradient(jnp.clip((t1 - t0) / 8, -bound, bound))
+    return t0 + shift, t1 - shift
+
+
+def first_value(terms: PyTree, t0: Any, t1: Any, y0: PyTree, args: PyTree) -> PyTree | None:
+    """The value of the field with which the first step begins, where each step hands on its last.
+
+    None where the field may jump in time: then each step evaluates both of its ends, from within.
+    """
+
+    def field(t: Any) -> PyTree:
+        return product(terms, terms.vf(t, y0, args), terms.contr(t0, t1))
+
+    return None if may_jump(field, t0) else terms.vf(evaluation_times(t0, t1)[0], y0, args)
 
 
 class State(eqx.Module):

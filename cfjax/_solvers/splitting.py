@@ -13,7 +13,15 @@ from .._control_term import fault_of_increments, is_driven
 from .._field import Rest, combine, is_field
 from .._methods.splitting import BLANES_MOAN_4, BLANES_MOAN_6, STRANG, splitting_order
 from .._term import product
-from .base import AbstractLieSolver, State, fault_of_fields, fault_of_start, time_at
+from .base import (
+    AbstractLieSolver,
+    State,
+    evaluation_times,
+    fault_of_fields,
+    fault_of_start,
+    first_value,
+    time_at,
+)
 from .compiled import control_of, scan_list
 from .dense import AbstractPath, Interpolation
 from .dependence import time_dependent, unknown_dependence
@@ -93,7 +101,7 @@ class AbstractSplitting(AbstractLieSolver, diffrax.AbstractStratonovichSolver):
 
         fields, compensation = eqx.filter_eval_shape(at_start, y0)
         compensation = Sums(y0, compensation).zeros()
-        first = terms.terms[0].vf(t0, y0, args)
+        first = first_value(terms.terms[0], t0, t1, y0, args)
         fault = fault_of_start(t0, t1, fields, y0)
         fault = fault_of_fields(fault, fields, terms, t0, y0, args)
         fault = fault_of_increments(fault, terms, t0, t1, y0, args)
@@ -101,14 +109,17 @@ class AbstractSplitting(AbstractLieSolver, diffrax.AbstractStratonovichSolver):
 
     def step(self, terms, t0, t1, y0, args, solver_state, made_jump):
         summands = terms.terms
-        t0, first = begin_step(solver_state, t0, lambda t0: summands[0].vf(t0, y0, args), made_jump)
+        t0, first = begin_step(
+            solver_state, t0, t1, lambda start: summands[0].vf(start, y0, args), made_jump
+        )
+        times = evaluation_times(t0, t1)
         controls = control_of(terms, t0, t1)
 
         def step_from(y0: PyTree) -> Step:
             sums = Sums(y0, solver_state.compensation)
 
             def value(k: int, c: Any, z: PyTree) -> PyTree:
-                return summands[k].vf(time_at(c, t0, t1), sums.state(z), args)
+                return summands[k].vf(time_at(c, *times), sums.state(z), args)
 
             def apply_flow(k: int, value: PyTree, s: Any, z: PyTree) -> tuple[PyTree, PyTree]:
                 field = product(summands[k], value, _scaled(s, controls[k]))
@@ -127,10 +138,11 @@ class AbstractSplitting(AbstractLieSolver, diffrax.AbstractStratonovichSolver):
                 field, z = apply_flow(0, next_value, x.kick, z)
                 return (z, next_value), (*fields, field)
 
-            field, z = apply_flow(0, first, self.stages[0], sums.start)
-            (z, last), later = scan_list(pair, (z, first), _stage_pairs(self.stages))
+            start = value(0, 0.0, sums.start) if first is None else first
+            field, z = apply_flow(0, start, self.stages[0], sums.start)
+            (z, last), later = scan_list(pair, (z, start), _stage_pairs(self.stages))
             end, _ = sums.materialised(z, None, is_followed=True)
-            return Step(end, _Replay(y0, field, later), last=last)
+            return Step(end, _Replay(y0, field, later), last=None if first is None else last)
 
         return finish_step(solver_state, step_from, y0)
 

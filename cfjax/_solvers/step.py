@@ -14,7 +14,14 @@ from jaxtyping import Array, Bool, PyTree, Real
 
 from .._field import dexpinv, from_chart, has_dexpinv, is_field
 from .._term import product
-from .base import AbstractLieSolver, State, finite_if_complex, result_of, time_at
+from .base import (
+    AbstractLieSolver,
+    State,
+    evaluation_times,
+    finite_if_complex,
+    result_of,
+    time_at,
+)
 from .compiled import (
     computed_again,
     control_of,
@@ -192,10 +199,13 @@ class AbstractChartSolver(AbstractLieSolver):
 
     def _step(self, terms, t0, t1, y0, args, solver_state, made_jump):
         compensation = solver_state.compensation
-        t0, first = begin_step(solver_state, t0, lambda t0: terms.vf(t0, y0, args), made_jump)
+        t0, first = begin_step(
+            solver_state, t0, t1, lambda start: terms.vf(start, y0, args), made_jump
+        )
+        times = evaluation_times(t0, t1)
 
         def value(c: Time, y: PyTree) -> PyTree:
-            return materialised_in_rows(terms.vf(time_at(c, t0, t1), y, args))
+            return materialised_in_rows(terms.vf(time_at(c, *times), y, args))
 
         def step_from(y0: PyTree) -> Step:
             control = control_of(terms, *self.interval(t0, t1))
@@ -219,7 +229,7 @@ class AbstractChartSolver(AbstractLieSolver):
 
 
 def begin_step(
-    solver_state: State, t0: Any, evaluate: Callable[[Any], PyTree], made_jump: Any
+    solver_state: State, t0: Any, t1: Any, evaluate: Callable[[Any], PyTree], made_jump: Any
 ) -> tuple[Any, PyTree]:
     """The time of a step, NaN if the start was wrong, and the value of the field there, or None."""
     first = solver_state.first
@@ -228,9 +238,10 @@ def begin_step(
         t0 = jnp.where(solver_state.zero == 0, t0, jnp.nan)
     if first is None or made_jump is False:
         return t0, first
+    start, _ = evaluation_times(t0, t1)
     if made_jump is True:
-        return t0, evaluate(t0)
-    return t0, lax.cond(made_jump, evaluate, lambda _: first, t0)
+        return t0, evaluate(start)
+    return t0, lax.cond(made_jump, evaluate, lambda _: first, start)
 
 
 def finish_step(

@@ -1,0 +1,197 @@
+"""Fields that jump where steps end: every evaluation of a step belongs to the step."""
+
+import diffrax
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+import scipy.linalg
+from solver_table import SOLVERS
+
+import cfjax
+from cfjax._numerics.jumps import may_jump
+
+# One step for each slot. The start is not zero, and users find the slot of a time in three ways: by
+# its number, and from a table of edges of either convention.
+T0, SLOT, NUM_SLOTS = 0.3, 0.07, 12
+T1 = T0 + NUM_SLOTS * SLOT
+EDGES = np.linspace(T0, T1, NUM_SLOTS + 1)
+AMPLITUDES = np.random.default_rng(0).normal(size=(NUM_SLOTS, 3)) * 8
+START = np.array([0.36, 0.48, 0.8])
+# A step is a product of some 30 flows at most, each with 10 roundings of numbers below 1.
+UNITS = NUM_SLOTS * 300
+
+
+def slots(t):
+    edges = EDGES.astype(t.dtype)
+    return jnp.stack(
+        [
+            jnp.floor((t - T0) / SLOT).astype(jnp.int32),
+            jnp.searchsorted(edges, t, side="right") - 1,
+            jnp.searchsorted(edges, t, side="left") - 1,
+        ]
+    )
+
+
+def amplitudes(t, amplitudes):
+    """Those of the slot, three times; NaN before the first slot and after the last."""
+    k = slots(t)
+    return amplitudes.at[jnp.where(k < 0, NUM_SLOTS, k)].get(mode="fill", fill_value=jnp.nan)
+
+
+def rotation(t, y, args):
+    return cfjax.Rotation(amplitudes(t, args))
+
+
+def propagators():
+    """The exact motion of START, one state for each edge."""
+    states = [START]
+    for a in AMPLITUDES:
+        states.append(scipy.linalg.expm(-np.cross(a, np.eye(3)) * SLOT) @ states[-1])
+    return np.stack(states)
+
+
+def assert_is(actual, expected):
+    eps = float(np.finfo(actual.dtype).eps)
+    np.testing.assert_allclose(actual, [expected] * 3, atol=UNITS * eps)
+
+
+def takes_any(name):
+    # A stage of CG5 is before the start of the step.
+    return SOLVERS[name].takes in ("any", "brackets", "time only") and name != "CG5"
+
+
+# One of each kind of step; the rest has the same evaluations.
+QUICK = "CF4 RKMK8 Magnus6 Richardson".split()
+EXACT = [
+    pytest.param(name, marks=() if name in QUICK else pytest.mark.slow)
+    for name in filter(takes_any, SOLVERS)
+]
+
+
+@pytest.mark.parametrize("name", EXACT)
+def test_a_field_that_is_constant_in_each_step_is_solved_exactly(name):
+    def solve(t0, t1, y0):
+        term, solver = cfjax.LieTerm(rotation), SOLVERS[name].make()
+        sol = cfjax.integrate(term, solver, t0, t1, y0, AMPLITUDES, num_steps=NUM_SLOTS)
+        return sol.ys[-1]
+
+    end = solve(T0, T1, jnp.stack([START] * 3))
+    assert_is(end, propagators()[-1])
+    assert_is(solve(T1, T0, end), START)
+
+
+def test_single_precision():
+    amplitudes, start = np.float32(AMPLITUDES), jnp.stack([np.float32(START)] * 3)
+    term = cfjax.LieTerm(rotation)
+    sol = cfjax.integrate(term, cfjax.CF4(), T0, T1, start, amplitudes, num_steps=NUM_SLOTS)
+    assert sol.ys.dtype == np.float32
+    assert_is(sol.ys[-1], propagators()[-1])
+
+
+# Those whose last evaluation is otherwise the first one of the next step.
+@pytest.mark.parametrize("solver", [cfjax.CF4(), cfjax.RKMK5(), cfjax.Magnus6(), cfjax.RKL2(5)])
+def test_the_last_evaluation_is_not_handed_on(solver):
+    sol = diffrax.diffeqsolve(
+        cfjax.LieTerm(rotation),
+        solver,
+        *(T0, T1, None, jnp.stack([START] * 3), AMPLITUDES),
+        stepsize_controller=diffrax.StepTo(EDGES),
+        saveat=diffrax.SaveAt(ts=EDGES),
+    )
+    for y, expected in zip(sol.ys, propagators(), strict=True):
+        assert_is(y, expected)
+
+
+def test_translations_and_exponential_methods():
+    sol = diffrax.diffeqsolve(
+        cfjax.LieTerm(lambda t, y, args: amplitudes(t, args)),
+        cfjax.ETD43(),
+        *(T0, T1, None, jnp.zeros((3, 3)), AMPLITUDES),
+        stepsize_controller=diffrax.StepTo(EDGES),
+    )
+    assert_is(sol.ys[-1], SLOT * AMPLITUDES.sum(axis=0))
+
+
+@pytest.mark.parametrize("solver", [cfjax.Strang(), cfjax.Composition(cfjax.Strang(), 4)])
+def test_splittings(solver):
+    # The clock advances during the last term.
+    clock = cfjax.LieTerm(lambda t, y, args: cfjax.Rotation(jnp.zeros((3, 3))))
+    term = diffrax.MultiTerm(cfjax.LieTerm(rotation), clock)
+    y0 = jnp.stack([START] * 3)
+    sol = cfjax.integrate(term, solver, T0, T1, y0, AMPLITUDES, num_steps=NUM_SLOTS)
+    assert_is(sol.ys[-1], propagators()[-1])
+
+
+def test_a_qubit_that_is_driven_and_loses_energy():
+    pauli = np.array([[[0, 1], [1, 0]], [[0, -1j], [1j, 0]], [[1, 0], [0, -1]]], complex)
+    lowering, rates = np.array([[0, 1], [0, 0]], complex), jnp.full((3, 1), 0.7)
+
+    def field_of(amplitudes):
+        def field(t, y, args):
+            h = jnp.einsum("sk,kij->sij", amplitudes(t, args).astype(complex), pauli) / 2
+            return cfjax.Lindblad(h, [lowering], rates)
+
+        return cfjax.LieTerm(field)
+
+    start = jnp.stack([np.array([[0.3, 0.4j], [-0.4j, 0.7]])] * 3)
+    # Kraus4 is not exact, so in each slot it solves a field that does not depend on time.
+    term, expected = field_of(lambda t, args: args), start
+    for a in AMPLITUDES:
+        args = np.stack([a] * 3)
+        sol = cfjax.integrate(term, cfjax.Kraus4(), 0.0, SLOT, expected, args, num_steps=1)
+        expected = sol.ys[-1]
+    term = field_of(amplitudes)
+    sol = cfjax.integrate(term, cfjax.Kraus4(), T0, T1, start, AMPLITUDES, num_steps=NUM_SLOTS)
+    # The lengths of steps differ by the rounding of times.
+    np.testing.assert_allclose(sol.ys[-1], expected, atol=UNITS * float(np.finfo(float).eps))
+
+
+def test_the_step_back_evaluates_the_same_slots():
+    def end(args, step_back):
+        y0 = jnp.stack([START] * 3)
+        term, solver = cfjax.LieTerm(rotation), cfjax.Magnus4Lobatto()
+        sol = cfjax.integrate(
+            term, solver, T0, T1, y0, args, num_steps=NUM_SLOTS, step_back=step_back
+        )
+        return jnp.sum(sol.ys[-1] * jnp.arange(9.0).reshape(3, 3))
+
+    gradients = [jax.grad(end)(jnp.asarray(AMPLITUDES), step_back) for step_back in (False, True)]
+    assert jnp.abs(gradients[0]).min() > 1e-3
+    # Numbers of size 1, of as many products as the solution itself.
+    np.testing.assert_allclose(*gradients, atol=UNITS * float(np.finfo(float).eps))
+
+
+TABLE = jnp.arange(10.0)
+JUMPS = {
+    "an index": lambda t: TABLE[jnp.floor(t * 10).astype(int)],
+    "a search": lambda t: TABLE[jnp.searchsorted(TABLE, t)],
+    "a comparison": lambda t: jnp.where(t < 0.5, TABLE, 2.0),
+    "a sign": lambda t: jnp.sign(t - 0.5),
+    "a remainder": lambda t: jnp.mod(t, 0.1),
+    "a branch": lambda t: jax.lax.cond(t < 0.5, lambda: 1.0, lambda: 2.0),
+    "within a function that is compiled": jax.jit(lambda t: jnp.heaviside(t - 0.5, 1.0)),
+    "within a loop": lambda t: jax.lax.fori_loop(0, 3, lambda k, x: jnp.floor(x), t),
+    "a derivative": jax.grad(jnp.abs),
+    "the host": lambda t: jax.pure_callback(
+        lambda t: t, jax.ShapeDtypeStruct((), t.dtype), t, vmap_method="sequential"
+    ),
+}
+CONTINUOUS = {
+    "none of t": lambda t: jnp.where(TABLE > 3, TABLE, 0),
+    "comparisons of other values": jax.jit(lambda t: jnp.exp(-t) * jnp.where(TABLE > 3, TABLE, 0)),
+    "functions of networks": lambda t: jax.nn.softplus(TABLE * t) + jax.nn.relu(t) + jnp.tanh(t),
+    "bounds": lambda t: jnp.clip(t, 0.2, 0.4),
+    "a loop": lambda t: jax.lax.scan(lambda x, a: (jnp.sin(a * x), None), t, TABLE)[0],
+    "a derivative": jax.grad(lambda t: jnp.sin(t) ** 3),
+}
+
+
+@pytest.mark.parametrize("name", JUMPS)
+def test_jumps_are_seen(name):
+    assert may_jump(JUMPS[name], 0.3)
+
+
+@pytest.mark.parametrize("name", CONTINUOUS)
+def test_what_is_continuous_hands_on_its_last_evaluation(name):
+    assert not may_jump(CONTINUOUS[name], 0.3)
