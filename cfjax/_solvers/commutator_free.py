@@ -342,7 +342,8 @@ class CG4(AbstractCommutatorFree, diffrax.AbstractStratonovichSolver):
 class CG5(AbstractCommutatorFree, diffrax.AbstractStratonovichSolver):
     """A Crouch-Grossman method of order 5: 9 evaluations, 43 flows of single fields.
 
-    Dense output of order 4, which uses the field at the end of the step.
+    Dense output of order 4, which uses the field at the end of the step. Two evaluations are before
+    the start of the step, so do not use it for fields that jump.
     Some flows go backwards in time, so do not use it for strong dissipation: see `CF54`.
 
     `estimate` and `unroll` are those of `cfjax.CommutatorFree`.

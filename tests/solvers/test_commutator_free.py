@@ -269,40 +269,6 @@ def test_a_product_of_manifolds_moves_its_parts_as_one():
     np.testing.assert_allclose(problems.flat(found), problems.flat(expected), rtol=0, atol=1e-14)
 
 
-# The end of the step
-
-
-def inexact_end() -> tuple[float, float]:
-    """Times with t0 + (t1 - t0) above t1 in floating point, as steps across zero often have."""
-    rng = np.random.default_rng(0)
-    while True:
-        t0, t1 = rng.uniform(-1, 0), rng.uniform(0, 0.1)
-        if t0 + (t1 - t0) > t1:
-            return float(t0), float(t1)
-
-
-@pytest.mark.parametrize("name, stages", [("CF4", 1), ("family A, 1", 1), ("CF2", 0)])
-def test_the_last_stage_is_at_the_end_exactly(name, stages):
-    """A field that jumps at the end of the step must not be evaluated behind the jump."""
-    t0, t1 = inexact_end()
-    times = []
-
-    def field(t, y, args):
-        times.append(float(t))
-        return y
-
-    # Not a short vector, so the step runs operation by operation and the times are numbers.
-    y0, time = jnp.ones((7, 7)), (jnp.asarray(t0), jnp.asarray(t1))
-    solver = METHODS[name].without_estimate()
-    term = cfjax.LieTerm(field)
-    state = solver.init(term, *time, y0, None)
-    times.clear()
-    solver.step(term, *time, y0, None, state, made_jump=False)
-    assert times[0] == t0
-    assert times.count(t1) == stages
-    assert max(times) <= t1
-
-
 # Cost
 
 

@@ -9,7 +9,6 @@ import scipy.linalg
 from solver_table import SOLVERS
 
 import cfjax
-from cfjax._numerics.jumps import may_jump
 
 # One step for each slot. The start is not zero, and users find the slot of a time in three ways: by
 # its number, and from a table of edges of either convention.
@@ -160,38 +159,3 @@ def test_the_step_back_evaluates_the_same_slots():
     assert jnp.abs(gradients[0]).min() > 1e-3
     # Numbers of size 1, of as many products as the solution itself.
     np.testing.assert_allclose(*gradients, atol=UNITS * float(np.finfo(float).eps))
-
-
-TABLE = jnp.arange(10.0)
-JUMPS = {
-    "an index": lambda t: TABLE[jnp.floor(t * 10).astype(int)],
-    "a search": lambda t: TABLE[jnp.searchsorted(TABLE, t)],
-    "a comparison": lambda t: jnp.where(t < 0.5, TABLE, 2.0),
-    "a sign": lambda t: jnp.sign(t - 0.5),
-    "a remainder": lambda t: jnp.mod(t, 0.1),
-    "a branch": lambda t: jax.lax.cond(t < 0.5, lambda: 1.0, lambda: 2.0),
-    "within a function that is compiled": jax.jit(lambda t: jnp.heaviside(t - 0.5, 1.0)),
-    "within a loop": lambda t: jax.lax.fori_loop(0, 3, lambda k, x: jnp.floor(x), t),
-    "a derivative": jax.grad(jnp.abs),
-    "the host": lambda t: jax.pure_callback(
-        lambda t: t, jax.ShapeDtypeStruct((), t.dtype), t, vmap_method="sequential"
-    ),
-}
-CONTINUOUS = {
-    "none of t": lambda t: jnp.where(TABLE > 3, TABLE, 0),
-    "comparisons of other values": jax.jit(lambda t: jnp.exp(-t) * jnp.where(TABLE > 3, TABLE, 0)),
-    "functions of networks": lambda t: jax.nn.softplus(TABLE * t) + jax.nn.relu(t) + jnp.tanh(t),
-    "bounds": lambda t: jnp.clip(t, 0.2, 0.4),
-    "a loop": lambda t: jax.lax.scan(lambda x, a: (jnp.sin(a * x), None), t, TABLE)[0],
-    "a derivative": jax.grad(lambda t: jnp.sin(t) ** 3),
-}
-
-
-@pytest.mark.parametrize("name", JUMPS)
-def test_jumps_are_seen(name):
-    assert may_jump(JUMPS[name], 0.3)
-
-
-@pytest.mark.parametrize("name", CONTINUOUS)
-def test_what_is_continuous_hands_on_its_last_evaluation(name):
-    assert not may_jump(CONTINUOUS[name], 0.3)

@@ -374,52 +374,6 @@ def test_a_constant_field_is_followed_exactly(name):
         np.testing.assert_allclose(found, scipy.linalg.expm(h * a), rtol=0, atol=atol)
 
 
-# The end of the step
-
-
-def inexact_end() -> tuple[float, float]:
-    """Times with t0 + (t1 - t0) above t1 in floating point, as steps across zero often have."""
-    rng = np.random.default_rng(0)
-    while True:
-        t0, t1 = rng.uniform(-1, 0), rng.uniform(0, 0.1)
-        if t0 + (t1 - t0) > t1:
-            return float(t0), float(t1)
-
-
-@pytest.mark.representatives(2)
-@pytest.mark.parametrize(
-    "name, stages",
-    [
-        *[("RKMK3", 1), ("RKMK4", 1), ("Heun", 1), ("Bosh3", 0)],
-        # Of Dopri8's one is for output within the step, which runs here as all else does.
-        *[("Dopri5", 1), ("Tsit5", 1), ("Dopri8", 3)],
-    ],
-)
-def test_the_last_stage_is_at_the_end_exactly(name, stages):
-    """A field that jumps at the end of the step must not be evaluated behind the jump.
-
-    The rows of a tableau in floating point sum to their stage time up to rounding only.
-    """
-    solver = METHODS[name]
-    solver = solver.without_estimate()
-    t0, t1 = inexact_end()
-    times = []
-
-    def field(t, y, args):
-        times.append(float(t))
-        return y
-
-    # Not a short vector, so the step runs operation by operation and the times are numbers.
-    y0, time = jnp.ones((7, 7)), (jnp.asarray(t0), jnp.asarray(t1))
-    term = cfjax.LieTerm(field)
-    state = solver.init(term, *time, y0, None)
-    times.clear()
-    solver.step(term, *time, y0, None, state, made_jump=False)
-    assert times[0] == t0
-    assert max(times) <= t1
-    assert times.count(t1) == stages
-
-
 # Cost
 
 
