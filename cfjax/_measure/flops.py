@@ -15,7 +15,7 @@ import numpy as np
 from jax.extend.core import ClosedJaxpr, Jaxpr, JaxprEqn, Literal, jaxprs_in_params
 from jaxtyping import PyTree
 
-from .._xla.jaxprs import parameters
+from .._xla.jaxprs import evaluate, parameters, structs
 from .._xla.step import step_p, whole
 from .lowered import arithmetic_of
 
@@ -219,7 +219,8 @@ def _cost(eqn: JaxprEqn) -> int:
 def _check_free(eqn: JaxprEqn) -> None:
     """Raises unless the operation, which has no rule, computes nothing."""
     try:
-        computing = arithmetic_of(eqn)
+        operands = structs([v.aval for v in eqn.invars])
+        computing = arithmetic_of(lambda *operands: evaluate(eqn, operands), *operands)
     except Exception as error:
         raise _without_rule(eqn.primitive.name, eqn) from error
     if computing:

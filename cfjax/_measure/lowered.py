@@ -1,16 +1,14 @@
-"""What an operation of JAX computes, as told by the operations of StableHLO that it is lowered to.
+"""Whether a program computes, as told by the operations of StableHLO that it is lowered to.
 
 So an operation that a newer version of JAX has is known without its name.
 """
 
 import re
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from typing import Any
 
 import jax
-from jax.extend.core import JaxprEqn
-
-from .._xla.jaxprs import evaluate, structs
+from jaxtyping import PyTree
 
 # Operations of StableHLO that move, compare, select, round or convert entries, or change their
 # sign. Programs within them, such as that of a reduction, are looked at by themselves.
@@ -29,18 +27,15 @@ _STRUCTURE = frozenset(("func.call", "func.func", "func.return"))
 _INTEGERS = re.compile(r"tensor<(\d+x)*u?i\d+>")
 
 
-def arithmetic_of(eqn: JaxprEqn) -> set[str]:
-    """The operations in what `eqn` is lowered to that may compute with floating-point numbers.
+def arithmetic_of(fun: Callable[..., PyTree], *args: PyTree) -> set[str]:
+    """The operations in what `fun(*args)` is lowered to that may compute with floats.
 
     Operations of other dialects and calls of compiled functions are among them, as these may
-    compute anything.
+    compute anything. The arguments may be `jax.ShapeDtypeStruct`s.
 
-    **Raises** what JAX raises where `eqn` cannot be lowered by itself.
+    **Raises** what JAX raises where `fun` cannot be lowered.
     """
-    lowered = jax.jit(lambda *operands: evaluate(eqn, operands)).lower(
-        *structs([v.aval for v in eqn.invars])
-    )
-    module: Any = lowered.compiler_ir("stablehlo")
+    module: Any = jax.jit(fun).lower(*args).compiler_ir("stablehlo")
     return {op.name for op in _inside(module.operation) if not _is_free(op)}
 
 
