@@ -39,6 +39,8 @@ _PAPER_TIME = "Takes some minutes."
 _CHART_TIME = "Compiles for some seconds."
 _SCENE_TIME = "Takes up to some minutes."
 
+_YOUR_OWN = 'Your own inertia and step sizes: docs/methods.md, section "Measure your own".'
+
 
 class _Parser(argparse.ArgumentParser):
     def error(self, message: str) -> NoReturn:
@@ -126,6 +128,8 @@ def main(argv: Sequence[str] | None = None) -> int:
         _report.run(arguments.output, experiments, patience)
     except OSError as error:
         command.error(f"cannot write to {arguments.output}: {error.strerror or error}")
+    if command is paper:
+        print(_YOUR_OWN)
     return 0
 
 

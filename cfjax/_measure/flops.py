@@ -15,8 +15,9 @@ import numpy as np
 from jax.extend.core import ClosedJaxpr, Jaxpr, JaxprEqn, Literal, jaxprs_in_params
 from jaxtyping import PyTree
 
-from .._xla.jaxprs import parameters
+from .._xla.jaxprs import evaluate, parameters, structs
 from .._xla.step import step_p, whole
+from .lowered import arithmetic_of
 
 
 def count_flops(fun: Callable[..., PyTree], *args: PyTree) -> int:
@@ -37,14 +38,15 @@ def count_flops(fun: Callable[..., PyTree], *args: PyTree) -> int:
     - A scan counts its body as often as it runs. A conditional counts the branch taken, if that
       follows from `args`, which may be `jax.ShapeDtypeStruct`s; otherwise its most expensive
       branch.
+    - An update of some entries counts what it applies to each.
     - Changes of sign, comparisons, selections, roundings, conversions, moves of data and integer
-      arithmetic count nothing.
+      arithmetic count nothing. An operation that is lowered to nothing else needs no rule.
 
     Operations that do not reach the result count nothing, and the same operation on the same
     operands counts once, as compilers drop both.
 
     **Raises** `NotImplementedError` for floating-point operations without a rule, and for loops
-    whose length is not known when the program is traced.
+    of them whose length is not known when the program is traced.
     """
     jaxpr = jax.make_jaxpr(fun)(*args)
     leaves = jtu.tree_leaves(args)
@@ -196,20 +198,41 @@ def _open(jaxpr: Jaxpr | ClosedJaxpr) -> Jaxpr:
 
 def _cost(eqn: JaxprEqn) -> int:
     name = eqn.primitive.name
-    dtypes = [_dtype(v) for v in (*eqn.invars, *eqn.outvars)]
-    is_inexact = any(d is not None and jnp.issubdtype(d, jnp.inexact) for d in dtypes)
-    if name not in _CONTROL and not is_inexact:
-        return 0
+    if name in _CONTROL:
+        return _CONTROL[name](eqn)
+    if "update_jaxpr" in eqn.params:
+        return _scatter(eqn)
     if name not in _COSTS:
-        raise NotImplementedError(
-            f"count_flops has no rule for the floating-point operation {name}: {eqn}"
-        )
+        _check_free(eqn)
+        return 0
+    dtypes = [_dtype(v) for v in (*eqn.invars, *eqn.outvars)]
+    if not any(d is not None and jnp.issubdtype(d, jnp.inexact) for d in dtypes):
+        return 0
     cost = _COSTS[name](eqn)
-    if cost and name not in _CONTROL and name != "fft" and any(map(_is_complex, dtypes)):
+    if cost and name != "fft" and any(map(_is_complex, dtypes)):
         if name not in _COMPLEX:
-            raise NotImplementedError(f"count_flops has no rule for {name} of complex numbers.")
+            raise _without_rule(f"{name} of complex numbers", eqn)
         return _COMPLEX[name] * cost
     return cost
+
+
+def _check_free(eqn: JaxprEqn) -> None:
+    """Raises unless the operation, which has no rule, computes nothing."""
+    try:
+        operands = structs([v.aval for v in eqn.invars])
+        computing = arithmetic_of(lambda *operands: evaluate(eqn, operands), *operands)
+    except Exception as error:
+        raise _without_rule(eqn.primitive.name, eqn) from error
+    if computing:
+        what = f"{eqn.primitive.name}, which consists of {', '.join(sorted(computing))}"
+        raise _without_rule(what, eqn)
+
+
+def _without_rule(what: str, eqn: JaxprEqn) -> NotImplementedError:
+    return NotImplementedError(
+        f"count_flops has no rule for {what}, in `{eqn}`. Use operations that have one (`_COSTS` "
+        "in cfjax/_measure/flops.py), or add a rule there."
+    )
 
 
 def _is_complex(dtype: Any) -> bool:
@@ -311,10 +334,19 @@ def _branches(eqn: JaxprEqn) -> int:
     return max(_count(branch) for branch in eqn.params["branches"])
 
 
+def _scatter(eqn: JaxprEqn) -> int:
+    """What is applied to each of the updates, such as a sum."""
+    applied = eqn.params["update_jaxpr"]
+    return _size(eqn.invars[2]) * _count(applied) if applied is not None else 0
+
+
 def _unknown_length(eqn: JaxprEqn) -> int:
-    raise NotImplementedError(
-        "count_flops cannot count a while loop: its length is not known when it is traced."
-    )
+    if any(map(_count, jaxprs_in_params(eqn.params))):
+        raise NotImplementedError(
+            "count_flops cannot count a while loop: its length is not known when it is traced. "
+            "Use jax.lax.scan, or jax.lax.fori_loop between numbers of Python."
+        )
+    return 0
 
 
 def _check(eqn: JaxprEqn) -> int:
@@ -338,8 +370,10 @@ _CALLS = {
     "remat2": "jaxpr",
 }
 
+# What these compute is not told by the types of their operands.
 _CONTROL: dict[str, Callable[[JaxprEqn], int]] = {
     "cond": _branches,
+    "pure_callback": _check,
     "scan": _scan,
     "while": _unknown_length,
 }
@@ -356,19 +390,16 @@ _ARITHMETIC = (
     "acos acosh add add_any asin asinh atan atan2 atanh cbrt cos cosh div erf exp exp2 expm1 log "
     "log1p logistic mul pow rem rsqrt sin sinh sqrt square sub tan tanh"
 )
+# The most frequent ones that compute nothing, as looking at what they are lowered to takes some
+# milliseconds; and ours, which are lowered to sums that only keep XLA from fusing.
 _FREE = (
-    "argmax argmin bitcast_convert_type broadcast_in_dim ceil cfjax_materialised "
-    "cfjax_pack cfjax_unpack clamp complex concatenate conj convert_element_type copy copy_p "
-    "dynamic_slice dynamic_update_slice eq expand_dims floor gather ge gt imag iota is_finite le "
-    "lt max min ne neg optimization_barrier pad real reduce_max reduce_min reshape rev round "
-    "scatter select_n sign slice split squeeze stack stop_gradient transpose"
+    "broadcast_in_dim cfjax_materialised cfjax_pack cfjax_unpack concatenate convert_element_type "
+    "eq ge gt le lt max min ne neg pad reshape select_n slice squeeze stop_gradient transpose"
 )
 _COSTS: dict[str, Callable[[JaxprEqn], int]] = {
     **dict.fromkeys(_ARITHMETIC.split(), _elementwise),
     **dict.fromkeys(_FREE.split(), lambda eqn: 0),
-    **_CONTROL,
     "abs": _modulus,
-    "pure_callback": _check,
     "cholesky": _cholesky,
     "cumsum": _cumulative,
     "cumprod": _cumulative,
@@ -380,5 +411,6 @@ _COSTS: dict[str, Callable[[JaxprEqn], int]] = {
     "qr": _qr,
     "reduce_prod": _reduction,
     "reduce_sum": _reduction,
+    "sign": _modulus,
     "triangular_solve": _triangular_solve,
 }

@@ -3,7 +3,7 @@
 import csv
 import os
 import textwrap
-from typing import TYPE_CHECKING, NamedTuple
+from typing import TYPE_CHECKING, Literal, NamedTuple
 
 import numpy as np
 from jaxtyping import Float
@@ -65,15 +65,46 @@ class WorkPrecision(NamedTuple):
             columns[name] = column[rows] if is_array else tuple(column[i] for i in rows)
         return WorkPrecision(**columns)
 
-    def plot(self, figure: "matplotlib.figure.Figure | None" = None) -> "matplotlib.figure.Figure":
-        """The chart: error against time, and beside it against flops. Needs `cfjax[paper]`.
+    def slopes(self) -> Float[np.ndarray, " rows"]:
+        """The observed orders: how fast the error falls, from the row before to each row.
 
-        A mark is the fastest run; its bar reaches to the upper quartile. If the flops of no method
-        are known, the second panel shows evaluations of the field. Draws into `figure` if it is
-        given.
+        `log(e_1 / e_2) / log(n_2 / n_1)` of the errors e and the steps taken n, without rejected
+        ones, of one method. NaN in the first row of a method, and where an error is zero or not
+        known. Also where a method takes about as many adaptive steps for a smaller tolerance, so
+        that something else limits them, such as stability.
+        """
+        is_same = np.array(self.method[1:]) == np.array(self.method[:-1])
+        columns = self.error, self._steps_taken(), self.tolerance
+        with np.errstate(divide="ignore", invalid="ignore"):
+            errors, steps, tolerances = (np.diff(np.log(column)) for column in columns)
+            slopes = -errors / steps
+            # Accuracy takes tolerance^(-1 / (p + 1)) steps, and no method has an order p above 10.
+            is_limited = -steps / tolerances < 1 / 12
+        slopes[~is_same | is_limited | ~np.isfinite(slopes)] = np.nan
+        return np.concatenate([[np.nan], slopes])
 
-        **Raises** `ModuleNotFoundError` without matplotlib and rich, and `TypeError` if `figure` is
-        not a matplotlib figure.
+    def _steps_taken(self) -> Float[np.ndarray, " rows"]:
+        return self.num_steps - np.nan_to_num(self.num_rejected)
+
+    def plot(
+        self,
+        figure: "matplotlib.figure.Figure | None" = None,
+        *,
+        against: Literal["work", "steps"] = "work",
+    ) -> "matplotlib.figure.Figure":
+        """The chart of the error. Needs `cfjax[paper]`.
+
+        Against `"work"`: against time, and beside it against flops. A mark is the fastest run; its
+        bar reaches to the upper quartile. If the flops of no method are known, the second panel
+        shows evaluations of the field.
+
+        Against `"steps"`: against the number of steps taken, without rejected ones. The lines fall
+        with the orders of the methods (`slopes`).
+
+        Draws into `figure` if it is given.
+
+        **Raises** `ModuleNotFoundError` without matplotlib and rich, `TypeError` if `figure` is not
+        a matplotlib figure, and `ValueError` if `against` is neither of the two.
         """
         with paper_extra():
             from matplotlib.figure import FigureBase
@@ -81,13 +112,31 @@ class WorkPrecision(NamedTuple):
             from . import style as _style
         if figure is not None and not isinstance(figure, FigureBase):
             raise TypeError(f"figure must be a matplotlib figure, got {figure!r}.")
+        if against not in ("work", "steps"):
+            raise ValueError(f"against must be 'work' or 'steps', got {against!r}.")
         figure = _style.new_figure((7.0, 4.2)) if figure is None else figure
+        (self._draw_steps if against == "steps" else self._draw_work)(figure)
+        _style.finish(figure, 4)
+        return figure
+
+    def _draw_steps(self, figure: "matplotlib.figure.Figure") -> None:
+        from . import style as _style
+
+        axes, steps = figure.subplots(), self._steps_taken()
+        for name, style in _style.styles(dict.fromkeys(self.method)).items():
+            rows = np.array(self.method) == name
+            axes.plot(steps[rows], self.error[rows], label=name, **style)
+        axes.set(yscale="log", ylabel="error of the final state")
+        _style.logarithmic(axes, "steps taken")
+
+    def _draw_work(self, figure: "matplotlib.figure.Figure") -> None:
+        from . import style as _style
+
         time_axes, work_axes = figure.subplots(1, 2, sharey=True)
         counts_flops = bool(np.any(np.isfinite(self.flops)))
         work = self.flops if counts_flops else self.num_evaluations
-        names = dict.fromkeys(self.method)
         unknown = []
-        for name, style in _style.styles(names).items():
+        for name, style in _style.styles(dict.fromkeys(self.method)).items():
             rows = np.array(self.method) == name
             _style.times(time_axes, self.seconds[rows], self.error[rows], label=name, **style)
             work_axes.plot(work[rows], self.error[rows], **style)
@@ -99,14 +148,13 @@ class WorkPrecision(NamedTuple):
         label += f" (not known: {', '.join(unknown)})" * bool(unknown)
         _style.logarithmic(work_axes, textwrap.fill(label, 50))
         figure.align_xlabels()
-        _style.finish(figure, 4)
-        return figure
 
     def table(self) -> "rich.table.Table":
         """The table for a terminal, with the notes below. Needs `cfjax[paper]`.
 
-        The table shows the fastest run, and beside it how much longer the upper quartile took. A
-        count that is not known is an empty cell, and one that is known for no row has no column.
+        The table shows the fastest run, and beside it how much longer the upper quartile took. The
+        slope is the observed order, from the row before (`slopes`). A number that is not known is
+        an empty cell, and one that is known for no row has no column.
 
         **Raises** `ModuleNotFoundError` without rich.
         """
@@ -121,6 +169,7 @@ class WorkPrecision(NamedTuple):
         columns = {
             "tol": [f"{x:.0e}" for x in self.tolerance],
             "error": [f"{x:.1e}" for x in self.error],
+            "slope": [f"{x:.2f}" for x in self.slopes()],
             "steps": [f"{x:.0f}" for x in self.num_steps],
             "rejected": [f"{x:.0f}" for x in self.num_rejected] if is_adaptive else [],
             "evals": [f"{x:.6g}" for x in self.num_evaluations],

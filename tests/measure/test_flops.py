@@ -4,6 +4,8 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 from jax import lax
+from jax.extend.core import Primitive
+from jax.interpreters import mlir
 
 import cfjax
 from cfjax._measure.flops import count_flops
@@ -74,6 +76,10 @@ own_derivative.defjvp(lambda primals, tangents: (own_derivative(*primals), tange
         (jax.checkpoint(horner), (X,), 60),
         (jax.jit(horner), (X,), 60),
         (lambda x: horner(x)[0], (X,), 60),
+        (lambda x: x.at[jnp.arange(3)].add(2.0), (X,), 3),
+        (lambda x: x.at[jnp.arange(3)].apply(horner), (X,), 18),
+        (lambda x: x.at[jnp.arange(3)].set(2.0), (X,), 0),
+        (lambda x: x.at[jnp.arange(3)].max(2.0), (X,), 0),
     ],
 )
 def test_flops_of_known_programs(fun, arguments, flops):
@@ -86,11 +92,63 @@ def test_moves_signs_and_comparisons_are_free():
         y = jnp.concatenate([y[3:], jnp.round(abs(y[:3]))]).reshape(5, 2).T
         return y, jnp.max(y), y.astype(jnp.float32), jnp.arange(5.0)
 
+    def rarer(x):
+        first, *others = jnp.unstack(x.reshape(5, 2))
+        return jnp.sort(x), jnp.argmax(x), jnp.tile(first, 3), lax.stop_gradient(others)
+
     assert count_flops(fun, X) == 0
+    assert count_flops(rarer, X) == 0
 
 
 def test_integer_arithmetic_is_free():
     assert count_flops(lambda n: n * n + 1, jnp.arange(3)) == 0
+    assert count_flops(lambda n: lax.while_loop(lambda n: n < 9, lambda n: n + 1, n), 3) == 0
+
+
+# Operations whose names are not known
+
+
+def unnamed(fun, name="new_name"):
+    """`fun` of one array as an operation of JAX."""
+    new_p = Primitive(name)
+    new_p.def_abstract_eval(lambda x: x)
+    mlir.register_lowering(new_p, mlir.lower_fun(fun, multiple_results=False))
+    return new_p.bind
+
+
+def swaps(x):
+    """Moves entries by indices that are computed, and compares."""
+    index = (3 * jnp.arange(x.size) + 1) % x.size
+    return jnp.where(x > 0, x[index], -jnp.sort(x))
+
+
+def test_an_operation_that_moves_entries_is_free_whatever_its_name():
+    assert count_flops(unnamed(swaps), X) == 0
+    # One that is not floating-point by its operands.
+    assert count_flops(unnamed(lambda n: n * n + 1), jnp.arange(3)) == 0
+
+
+@pytest.mark.parametrize(
+    "fun, argument, operation",
+    [
+        (lambda x: 2.0 * x, X, "stablehlo.multiply"),
+        (lambda x: jnp.flip(x) + jnp.sum(x), X, "stablehlo.add"),
+        (jax.jit(jnp.sin), X, "stablehlo.sine"),
+        (lambda n: jnp.sqrt(n.astype(float)).astype(int), jnp.arange(3), "stablehlo.sqrt"),
+        (lambda x: jnp.linalg.eigh(x)[1], jnp.eye(3), "stablehlo.custom_call"),
+    ],
+)
+def test_one_that_computes_is_refused_whatever_its_operands(fun, argument, operation):
+    message = rf"no rule for new_name, which consists of .*{operation}[\s\S]*Use operations"
+    with pytest.raises(NotImplementedError, match=message):
+        count_flops(unnamed(fun), argument)
+
+
+def test_one_that_cannot_be_lowered_is_refused():
+    new_p = Primitive("not_lowered")
+    new_p.def_abstract_eval(lambda x: x)
+    with pytest.raises(NotImplementedError, match=r"no rule for not_lowered, in .*Use operations"):
+        count_flops(new_p.bind, X)
 
 
 def test_what_is_not_needed_is_not_counted():
@@ -204,6 +262,7 @@ def test_fourier_transforms(fun, argument, flops):
         (lambda x, y: abs(x), 4),
         (lambda x, y: -x.conj().real, 0),
         (lambda x, y: x**3, 12),
+        (lambda x, y: x.at[:].add(y), 2),
     ],
 )
 def test_complex_numbers(fun, flops):
@@ -225,6 +284,7 @@ def test_complex_products_of_matrices():
         (lambda x: jnp.linalg.svd(x)[1], "svd"),
         (lax.lgamma, "lgamma"),
         (lambda x: jnp.sin(lax.complex(x, x)), "sin of complex"),
+        (lambda x: lax.sign(lax.complex(x, x)), "sign of complex"),
         (lambda x: lax.while_loop(lambda y: y[0, 0] < 9.0, lambda y: y + 1.0, x), "while loop"),
     ],
 )
@@ -236,9 +296,10 @@ def test_what_has_no_rule_raises(fun, message):
 def test_a_check_counts_nothing_and_a_function_of_the_host_is_refused():
     checked = lambda x: eqx.error_if(2 * x, x > 3, "too large")  # noqa: E731
     assert count_flops(checked, 1.0) == 1
-    host = lambda x: jax.pure_callback(np.sin, jax.ShapeDtypeStruct((), float), x)  # noqa: E731
-    with pytest.raises(NotImplementedError, match="function of the host"):
-        count_flops(host, 1.0)
+    for x in (1.0, 1):
+        host = lambda x: jax.pure_callback(np.square, jnp.asarray(x), x)  # noqa: E731
+        with pytest.raises(NotImplementedError, match="function of the host"):
+            count_flops(host, x)
 
 
 class Product(cfjax.AbstractTransform):

@@ -3,6 +3,7 @@
 import csv
 import io
 import sys
+from typing import Any
 
 import diffrax
 import equinox as eqx
@@ -82,8 +83,75 @@ def test_rows_are_methods_by_settings(equal, adaptive):
 
 def test_errors_fall_by_the_order(equal):
     for name, order in [("CF4", 4), ("CG3", 3), ("RKMK4", 4)]:
-        observed = problems.slope([16, 32], equal.select(name).error[1:])
-        assert abs(observed - order) < 0.15
+        first, _, last = equal.select(name).slopes()
+        assert np.isnan(first)
+        # The term of the next order is some h = 1/32 of the first.
+        assert abs(last - order) < 0.15
+
+
+def made_up(method, error, num_steps, num_rejected=0.0, tolerance=np.nan):
+    """A result with these errors and steps."""
+    rows = len(method)
+    columns = {name: np.full(rows, np.nan) for name in cfjax.WorkPrecision._fields[1:9]}
+    columns |= dict(error=np.array(error), num_steps=np.array(num_steps, float))
+    columns |= dict(
+        num_rejected=np.zeros(rows) + num_rejected, tolerance=tolerance + np.zeros(rows)
+    )
+    return cfjax.WorkPrecision(
+        method=tuple(method), **columns, seconds=np.ones((rows, 2)), note=("",) * rows
+    )
+
+
+def test_slopes_are_between_rows_of_one_method():
+    n = np.array([10, 20, 50])
+    work = made_up("aaabbb", [*(3.0 * n**-2.0), *(7.0 * n**-5.0)], [*n, *n])
+    # Rounding of logarithms.
+    np.testing.assert_allclose(work.slopes(), [np.nan, 2, 2, np.nan, 5, 5], rtol=1e-13)
+    # In any order of the rows.
+    np.testing.assert_allclose(
+        made_up("aaa", 3.0 / n[::-1] ** 2.0, n[::-1]).slopes(), [np.nan, 2, 2], rtol=1e-13
+    )
+
+
+def test_a_slope_is_not_known_without_two_errors():
+    work = made_up("aaaaa", [1e-2, np.nan, 1e-4, 0.0, 1e-6], [10, 20, 40, 80, 160])
+    assert np.all(np.isnan(work.slopes()))
+    assert np.all(np.isnan(made_up("aa", [1e-2, 1e-3], [10, 10]).slopes()))
+    # What does not fall is seen, as at rounding.
+    np.testing.assert_allclose(made_up("aa", [1e-9, 2e-9], [10, 20]).slopes()[1], -1, rtol=1e-13)
+
+
+def test_slopes_of_adaptive_runs_are_of_the_steps_taken():
+    tolerances = np.array([1e-2, 1e-4, 1e-6])
+    # The first two limited by stability, as RKMK4 is in the paper's Table 4.
+    errors, steps = [2e-1, 2.9e-3, 2.9e-3 / 4**4], [240, 241, 4 * 240 + 4]
+    work = made_up("aaa", errors, np.array(steps) + 7, 7.0, tolerances)
+    np.testing.assert_allclose(work.slopes(), [np.nan, np.nan, 4], rtol=1e-13)
+    backwards = made_up("aaa", errors[::-1], np.array(steps[::-1]) + 7, 7.0, tolerances[::-1])
+    np.testing.assert_allclose(backwards.slopes(), [np.nan, 4, np.nan], rtol=1e-13)
+
+
+def test_the_body_of_the_guide_has_the_slopes_that_it_says():
+    """The term of order 4 nearly cancels at t = 7, and not at t = 3 (docs/methods.md)."""
+    y0, inertia = jnp.array([8 / 9, 4 / 9, 1 / 9]), jnp.array([1.0, 2.5, 0.5])
+
+    def momentum(t, y):
+        return np.cross(y, y / np.asarray(inertia))
+
+    for t1, slope in [(3.0, 3.9), (7.0, 5.0)]:
+        work = cfjax.work_precision(
+            cfjax.LieTerm(lambda t, y, inertia: cfjax.Rotation(-y / inertia)),
+            0.0,
+            t1,
+            y0,
+            inertia,
+            methods={"CF4": cfjax.CF4()},
+            reference=problems.reference(momentum, 0.0, t1, np.asarray(y0)),
+            num_steps=[round(t1 / h) for h in (0.2, 0.1, 0.05)],
+            repeats=1,
+        )
+        # As many digits as the guide gives.
+        np.testing.assert_allclose(work.slopes()[1:], slope, rtol=0, atol=0.05)
 
 
 def test_errors_are_those_of_a_loop_of_its_own(equal, answer):
@@ -449,6 +517,32 @@ def test_the_chart_shows_every_method_in_both_panels(equal):
     assert right.get_xlabel() == "flops (not known: Tsit5)"
 
 
+def test_the_order_plot_shows_every_method_against_its_steps(equal, adaptive):
+    for work in (equal, adaptive):
+        figure = work.plot(against="steps")
+        FigureCanvasAgg(figure).draw()
+        (axes,) = figure.axes
+        names = list(dict.fromkeys(work.method))
+        assert [line.get_label() for line in axes.lines] == names
+        for name, line in zip(names, axes.lines, strict=True):
+            rows = work.select(name)
+            np.testing.assert_array_equal(line.get_xdata(), rows.num_steps - rows.num_rejected)
+            np.testing.assert_array_equal(line.get_ydata(), rows.error)
+        assert (axes.get_xscale(), axes.get_yscale()) == ("log", "log")
+        assert axes.get_xlabel() == "steps taken"
+
+
+def test_the_table_has_the_slopes():
+    n = np.array([10, 20])
+    text = rendered(made_up("aabb", [*n**-2.0, *n**-5.0], [*n, *n]).table())
+    assert "slope" in text
+    rows = [line.split() for line in text.splitlines() if line.split()[:1] in (["a"], ["b"])]
+    # Method, error, slope where there is one, and steps.
+    assert [row[2] for row in rows] == ["10", "2.00", "10", "5.00"]
+    # No row has one.
+    assert "slope" not in rendered(made_up("a", [1e-2], [10]).table())
+
+
 def test_evaluations_where_no_flops_are_known(equal):
     figure = equal.select("Tsit5").plot()
     assert figure.axes[1].get_xlabel() == "evaluations of the field"
@@ -591,6 +685,12 @@ def test_what_is_traced_is_not_measured(is_captured):
 def test_plot_refuses_what_is_no_figure(equal):
     with pytest.raises(TypeError, match=r"figure must be a matplotlib figure, got 'work\.png'"):
         equal.plot("work.png")
+
+
+def test_plot_refuses_what_is_no_axis(no_shape_hook):
+    other: Any = "flops"
+    with pytest.raises(ValueError, match=r"against must be 'work' or 'steps', got 'flops'"):
+        made_up("a", [1e-2], [10]).plot(against=other)
 
 
 def test_a_mistake_names_its_method():

@@ -1,11 +1,14 @@
 """The command `cfjax paper`: its files, what it prints, and bad arguments."""
 
 import os
+import re
 import subprocess
 import sys
+from pathlib import Path
 
 import pytest
 
+from cfjax import _paper
 from cfjax.__main__ import main
 
 FILES = sorted(
@@ -41,6 +44,19 @@ def test_command_as_a_user(tmp_path):
     check_files(tmp_path / "figures")
     assert "Table 3" in done.stdout
     check_text(done.stdout)
+    check_page(done.stdout.splitlines()[-1])
+
+
+def check_page(line):
+    """The section that a line names is there."""
+    page, heading = re.search(r'(docs/\S+\.md), section "(.+)"', line).groups()
+    assert f"\n## {heading}\n" in (Path(__file__).parents[2] / page).read_text()
+
+
+def test_the_end_says_where_to_measure_your_own(tmp_path, capsys, monkeypatch):
+    monkeypatch.setattr(_paper, "EXPERIMENTS", ())
+    assert main(["paper", "--output", str(tmp_path)]) == 0
+    check_page(capsys.readouterr().out.splitlines()[-1])
 
 
 def check_text(printed):

@@ -391,6 +391,20 @@ def test_table_has_every_number(runs):
                 assert f"{row[0]:.1e} {row[1]:>5} {f'({row[2]})':>4}" in text
 
 
+def test_table_says_which_errors_are_not_those_printed():
+    def caption(ratio):
+        error = ratio * heat.PRINTED["CF4"][1][0]
+        run = heat.Run(t=np.ones(1), num_steps=17, num_rejected=0, error=error)
+        methods = {(name, 1e-3): run for name in heat.METHODS}
+        for name in ("RKMK4", "RK4"):
+            methods[name, 1e-3] = run._replace(error=heat.PRINTED[name][1][0])
+        return str(heat.table_4(methods).caption)
+
+    assert not caption(1.9) and not caption(0.55)
+    assert "CF4 2.1 at 1e-03. " in caption(2.1)
+    assert "CF4 0.45 at 1e-03. " in caption(0.45)
+
+
 @pytest.mark.slow
 def test_steps_needed_against_the_number_of_intervals():
     for name in ("RKMK4", "RK4"):
