@@ -154,8 +154,11 @@ class Tangent(AbstractCoordinates):
 
 
 def skew_defect(a: Inexact[Array, "n n"]) -> Real[Array, ""]:
-    """0 if a matrix is skew-Hermitian but for rounding, otherwise NaN."""
+    """0 if a matrix is skew-Hermitian but for rounding, otherwise NaN.
+
+    It is 0 too if an entry is NaN, which says nothing of a matrix: the step then ends in NaN.
+    """
     a = lax.stop_gradient(a)
     size, defect = (jnp.max(magnitude(x)) for x in (a, a + a.conj().T))
     zero = jnp.zeros((), size.dtype)
-    return jnp.where(defect <= 1e3 * jnp.finfo(size.dtype).eps * size, zero, jnp.nan)
+    return jnp.where(defect > 1e3 * jnp.finfo(size.dtype).eps * size, jnp.nan, zero)
