@@ -244,6 +244,28 @@ def test_one_step_has_its_own_numbers(kind, tableau):
     np.testing.assert_allclose(found, expected, rtol=0, atol=4e-15)
 
 
+@pytest.mark.parametrize(
+    "solver, tableau, errors",
+    [
+        (RKMK5, diffrax.Tsit5.tableau, {2: 1e-3, 3: 0.2, 4: 1}),
+        (RKMK8, diffrax.Dopri8.tableau, {2: 1e-4, 3: 1e-2, 4: 0.1, 6: 1}),
+    ],
+    ids=SOLVERS,
+)
+def test_growth_costs_the_digits_that_the_pages_say(solver, tableau, errors):
+    """Of a step that multiplies by e^w: the rational function of its own number, nothing worse."""
+    w = np.array(list(errors))
+    v = scalar_step(tableau, lambda v: w * (1 - v * v / 4))
+    a = w[:, None, None] * np.diag([1.0, 0.0, 0.0])
+    y0 = np.ones((len(w), 3))
+    given = Problem(lambda t, y, a: cfjax.LeftMatrix(a), y0, a, None)
+    found = np.asarray(given.end(solver, 1.0, 1))[:, 0]
+    np.testing.assert_allclose(found, (1 + v / 2) / (1 - v / 2), rtol=1e-13, atol=0)
+    off = np.abs(found / np.exp(w) - 1)
+    # To one digit.
+    np.testing.assert_allclose(off, list(errors.values()), rtol=0.3, atol=0)
+
+
 # Means of three angles, whose sum is half a turn at a third of one. There the angles of the step
 # may be on the other side.
 MEANS = np.array([0.3, 1.0, np.pi / 3 - 1e-4, np.pi / 3 + 1e-4, 1.06, 1.5, 2.0, 2.35])
