@@ -11,7 +11,12 @@ from jax import lax
 from jaxtyping import Array, Bool, Inexact, Real
 
 from .._field import AbstractCoordinates
-from .._numerics.cayley import TangentCoordinates, is_within_half_a_turn, log_determinant
+from .._numerics.cayley import (
+    TangentCoordinates,
+    is_within_half_a_turn,
+    log_determinant,
+    without_turns,
+)
 from .._numerics.polar import polar_correction
 from .._numerics.squaring import magnitude
 
@@ -113,8 +118,9 @@ class Cayley(AbstractCoordinates):
     def landing(self, start: Array) -> tuple[Array, Bool[Array, ""]]:
         increment = self.increment(start)
         if self.trace is not None:
-            # The logarithm of the determinant has moved by the trace.
-            missing = (self.trace - log_determinant(self.u.a)) / len(self.u.a)
+            # The logarithm of the determinant has moved by the trace. Both differ by the error of
+            # the step, and by whole turns.
+            missing = without_turns(self.trace - log_determinant(self.u.a)) / len(self.u.a)
             increment = increment + jnp.expm1(missing) * (start + increment)
         return increment, is_within_half_a_turn(self.u.a)
 
@@ -148,8 +154,11 @@ class Tangent(AbstractCoordinates):
 
 
 def skew_defect(a: Inexact[Array, "n n"]) -> Real[Array, ""]:
-    """0 if a matrix is skew-Hermitian but for rounding, otherwise NaN."""
+    """0 if a matrix is skew-Hermitian but for rounding, otherwise NaN.
+
+    It is 0 too if an entry is NaN, which says nothing of a matrix: the step then ends in NaN.
+    """
     a = lax.stop_gradient(a)
     size, defect = (jnp.max(magnitude(x)) for x in (a, a + a.conj().T))
     zero = jnp.zeros((), size.dtype)
-    return jnp.where(defect <= 1e3 * jnp.finfo(size.dtype).eps * size, zero, jnp.nan)
+    return jnp.where(defect > 1e3 * jnp.finfo(size.dtype).eps * size, jnp.nan, zero)

@@ -11,7 +11,7 @@ from typing import Any
 import jax.numpy as jnp
 import numpy as np
 from jax import lax
-from jaxtyping import Array, Bool, Inexact, Real
+from jaxtyping import Array, Bool, Complex, Inexact, Real
 
 from .matmul import matmul, plus_identity, promoted, small_product
 from .squaring import magnitude, max_over_batch
@@ -192,7 +192,8 @@ def log_determinant(u: Inexact[Array, "3 3"]) -> Inexact[Array, ""]:
     """`log det cay(u)` of a complex 3 x 3 matrix u, with a rounding error as small as the result.
 
     With the characteristic numbers t, m and d of u/2, trace, minors and determinant, it is
-    `2 artanh((t + d) / (1 + m))`. The imaginary part is between -pi and pi.
+    `log((p + q) / (p - q))` for `p = 1 + m` and `q = t + d`. The imaginary part is between -pi and
+    pi, where that of eigenvalues adds up to 3 pi: it says the logarithm up to whole turns.
     """
     x = unpack((u / 2).reshape(9))
     trace = x[0] + x[4] + x[8]
@@ -202,10 +203,19 @@ def log_determinant(u: Inexact[Array, "3 3"]) -> Inexact[Array, ""]:
         x[i] * (x[3 + j] * x[6 + k] - x[3 + k] * x[6 + j])
         for i, j, k in [(0, 1, 2), (1, 2, 0), (2, 0, 1)]
     )
-    z = (trace + det) / (1 + minors)
-    a, b = z.real, z.imag
-    real = jnp.log1p(4 * a / ((1 - a) * (1 - a) + b * b)) / 2
-    return lax.complex(real, jnp.arctan2(2 * b, 1 - a * a - b * b))
+    p, q = 1 + minors, trace + det
+    # Not q / p: p is zero where the determinant is -1. Steps that fail have large numbers.
+    scale = (1 / lax.stop_gradient(magnitude(p) + magnitude(q))).astype(p.dtype)
+    p, q = scale * p, scale * q
+    product = q * p.conj()
+    real = jnp.log1p(4 * product.real / _square(p - q)) / 2
+    return lax.complex(real, jnp.arctan2(2 * product.imag, _square(p) - _square(q)))
+
+
+def without_turns(x: Complex[Array, "*shape"]) -> Complex[Array, "*shape"]:
+    """x less the multiples of 2 pi i that leave imaginary parts between -pi and pi."""
+    turns = jnp.round(lax.stop_gradient(x.imag) / (2 * np.pi))
+    return lax.complex(x.real, x.imag - 2 * np.pi * turns)
 
 
 def is_within_half_a_turn(u: Inexact[Array, "n n"]) -> Bool[Array, ""]:
@@ -226,6 +236,11 @@ def _bound(num_angles: int) -> float:
 
 def _sum(terms: Iterable[Array]) -> Array:
     return functools.reduce(operator.add, terms)
+
+
+def _square(x: Array) -> Array:
+    """`|x|^2`, without a root."""
+    return x.real * x.real + x.imag * x.imag
 
 
 class TangentCoordinates:

@@ -17,6 +17,7 @@ from cfjax._numerics.cayley import (
     solve,
     solve_from_both,
     solve_from_right,
+    without_turns,
 )
 
 solve, solve_from_right = jax.jit(solve), jax.jit(solve_from_right)
@@ -196,6 +197,30 @@ def test_logarithms_of_determinants(kind, size):
     found = complex(jax.jit(log_determinant)(u))
     # As small as the sizes that it is a sum of.
     np.testing.assert_allclose(found, expected, rtol=0, atol=4e-16 * size)
+
+
+def test_logarithms_of_determinants_of_any_phase():
+    """Also of -1, for which `1 + m` is zero; the phases of three eigenvalues go round twice."""
+    angles = np.linspace(-2.4, 2.4, 13)[:, None] + np.array([[0.1, 0.2, -0.4]])
+    u = [1j * np.diag(x) for x in (*(2 * np.tan(angles / 2)), np.array([2.0, 2.0, 0.0]))]
+    v = np.linalg.qr(matrices.random((3, 3), 4, complex))[0]
+    u = np.stack([*u, *(v @ x @ v.conj().T for x in u)])
+    found = np.asarray(jax.jit(jax.vmap(log_determinant))(u))
+    assert np.abs(found.imag).max() <= np.pi
+    expected = [np.linalg.det(cay(x)) for x in u]
+    # Some roundings of products of entries up to 5.
+    np.testing.assert_allclose(np.exp(found), expected, rtol=0, atol=1e-14)
+
+
+def test_whole_turns_are_left_out():
+    turns, angles = np.arange(-3, 4)[:, None], np.array([-3.14, -1.0, 0.0, 2.0, 3.14])
+    given = 0.5 + 1j * (angles + 2 * np.pi * turns)
+    found, slopes = jax.jvp(jax.jit(without_turns), (given,), (np.full_like(given, 1 - 2j),))
+    # A rounding of three turns.
+    expected = np.broadcast_to(0.5 + 1j * angles, given.shape)
+    np.testing.assert_allclose(found, expected, rtol=0, atol=4e-15)
+    np.testing.assert_array_equal(slopes, 1 - 2j)
+    assert without_turns(jnp.asarray(1e-20j)) == 1e-20j
 
 
 @pytest.mark.parametrize("n", [2, 3, 8, 20, 100])

@@ -244,6 +244,117 @@ def test_one_step_has_its_own_numbers(kind, tableau):
     np.testing.assert_allclose(found, expected, rtol=0, atol=4e-15)
 
 
+@pytest.mark.parametrize(
+    "solver, tableau, errors",
+    [
+        (RKMK5, diffrax.Tsit5.tableau, {2: 1e-3, 3: 0.2, 4: 1}),
+        (RKMK8, diffrax.Dopri8.tableau, {2: 1e-4, 3: 1e-2, 4: 0.1, 6: 1}),
+    ],
+    ids=SOLVERS,
+)
+def test_growth_costs_the_digits_that_the_pages_say(solver, tableau, errors):
+    """Of a step that multiplies by e^w: the rational function of its own number, nothing worse."""
+    w = np.array(list(errors))
+    v = scalar_step(tableau, lambda v: w * (1 - v * v / 4))
+    a = w[:, None, None] * np.diag([1.0, 0.0, 0.0])
+    y0 = np.ones((len(w), 3))
+    given = Problem(lambda t, y, a: cfjax.LeftMatrix(a), y0, a, None)
+    found = np.asarray(given.end(solver, 1.0, 1))[:, 0]
+    np.testing.assert_allclose(found, (1 + v / 2) / (1 - v / 2), rtol=1e-13, atol=0)
+    off = np.abs(found / np.exp(w) - 1)
+    # To one digit.
+    np.testing.assert_allclose(off, list(errors.values()), rtol=0.3, atol=0)
+
+
+# Means of three angles, whose sum is half a turn at a third of one. There the angles of the step
+# may be on the other side.
+MEANS = np.array([0.3, 1.0, np.pi / 3 - 1e-4, np.pi / 3 + 1e-4, 1.06, 1.5, 2.0, 2.35])
+MEANS = np.concatenate([MEANS, -MEANS])
+
+
+def turns(means, tableau, h):
+    """A step along `i (mean + h)`: by the angles of the step, with the mean of the trace."""
+    w, v = np.linalg.eigh(h)
+    w = means[:, None] + w
+    angles = 2 * np.arctan(scalar_step(tableau, lambda x: w * (1 + x * x / 4)) / 2)
+    angles = angles + np.mean(w - angles, axis=1, keepdims=True)
+    return (v * np.exp(1j * angles)[:, None]) @ v.conj().T
+
+
+@pytest.mark.parametrize(
+    "parts, dtype",
+    [(("left", "row"), np.complex128), (("right", "column"), np.complex64)],
+    ids=["double", "single"],
+)
+def test_a_trace_beyond_half_a_turn(parts, dtype):
+    """A determinant gives its logarithm up to whole turns, and a third of one is no rounding."""
+    rng = np.random.default_rng(7)
+    h, start = (rng.normal(size=(3, 3)) + 1j * rng.normal(size=(3, 3)) for _ in range(2))
+    h = h + h.conj().T
+    h = 0.2 * (h - np.trace(h) / 3 * np.eye(3)) / np.linalg.norm(h, 2)
+    points = {"left": start, "right": start, "column": start[:, 0], "row": start[0]}
+    y0 = {x: jnp.asarray(np.stack([points[x]] * len(MEANS)), dtype) for x in parts}
+
+    def field(t, y, a):
+        classes = {"left": cfjax.LeftMatrix, "column": cfjax.LeftMatrix}
+        return {x: classes.get(x, cfjax.RightMatrix)(a) for x in y}
+
+    def end(shift):
+        a = jax.vmap(lambda k: 1j * (k * jnp.eye(3, dtype=dtype) + jnp.asarray(h, dtype)))(
+            MEANS.astype(dtype) + shift.astype(dtype)
+        )
+        ys = cfjax.integrate(cfjax.LieTerm(field), SHORT, 0.0, 1.0, y0, a, num_steps=1).ys
+        return {x: y[-1] for x, y in ys.items()}
+
+    def expected(shift):
+        turn = turns(MEANS + shift, diffrax.Bosh3.tableau, h)
+        exact = np.stack([expm(1j * ((x + shift) * np.eye(3) + h)) for x in MEANS])
+        # Of order 3, and a sixth of the way to another root.
+        np.testing.assert_allclose(turn, exact, rtol=0, atol=0.3)
+        left, right = turn @ start, start @ turn
+        return {"left": left, "right": right, "column": left[..., 0], "row": right[:, 0]}
+
+    slope = jax.jit(
+        lambda x: jax.jvp(end, (x,), (jnp.ones_like(x),)), compiler_options=problems.QUICK
+    )
+    found, slopes = slope(jnp.zeros((), jnp.finfo(dtype).dtype))
+    values = [expected(k * 1e-3) for k in (0, 1, -1, 2, -2)]
+    # Some tens of roundings of angles up to 7; the quotients have order 4.
+    atol = 40 * float(jnp.finfo(dtype).eps)
+    for x in parts:
+        y, *ys = (value[x] for value in values)
+        np.testing.assert_allclose(found[x], y, rtol=0, atol=atol)
+        quotient = (8 * (ys[0] - ys[1]) - (ys[2] - ys[3])) / 12e-3
+        np.testing.assert_allclose(slopes[x], quotient, rtol=0, atol=4 * atol + 1e-10)
+
+
+@pytest.mark.filterwarnings("ignore:Complex dtype support in Diffrax")
+def test_a_trace_that_depends_on_the_state():
+    """Of a vector whose entries turn by their sizes, in steps up to a trace of 5."""
+    mixing = 0.3 * np.array([[0.2, 1.0, 0.5j], [0.4, -0.3j, 1.0], [-1.0j, 0.5, 0.1]])
+    y0 = np.array([0.6, 0.5j, 0.4 - 0.4j])
+
+    def matrix(xp, t, y):
+        sizes, t = y * xp.conj(y), xp.asarray(t, complex)
+        return mixing + xp.diag(1j * (1.5 + 0.3 * xp.sin(t) + sizes) - 0.5 * xp.sum(sizes))
+
+    t1, exactly = 6.0, {"rtol": 1e-12, "atol": 1e-12}
+    exact = solve_ivp(lambda t, y: y @ matrix(np, t, y), (0, t1), y0, "DOP853", **exactly).y[:, -1]
+
+    @jax.jit
+    def controlled(tolerance):
+        control = diffrax.PIDController(rtol=0.0, atol=tolerance)
+        term = cfjax.LieTerm(lambda t, y, args: cfjax.RightMatrix(matrix(jnp, t, y)))
+        start = jnp.asarray(y0)
+        return diffrax.diffeqsolve(
+            term, RKMK5, 0.0, t1, 0.8, start, stepsize_controller=control
+        ).ys[-1]
+
+    off = [np.abs(controlled(x) - exact).max() / x for x in (1e-2, 1e-4)]
+    # The estimate is of a step, and errors of steps add up. Another root is off by 100 tolerances.
+    assert max(off) < 10
+
+
 A, B = _RNG.standard_normal((7, 7)) / 3, _RNG.standard_normal((7, 2)) / 3
 Q = np.linalg.qr(_RNG.standard_normal((7, 2)))[0]
 

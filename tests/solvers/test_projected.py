@@ -287,6 +287,28 @@ def test_a_matrix_that_is_not_skew_is_an_error(cls, is_batch):
         diffrax.diffeqsolve(term, RKMK5, 0.0, 1.0, 0.1, y0, stepsize_controller=control)
 
 
+def test_a_matrix_of_nan_fails_alone():
+    """It is no matrix that is not skew: such an error would end the batch."""
+    solver = cfjax.RKMK(diffrax.Bosh3.tableau, **PROJECTED)
+    term, y0 = cfjax.LieTerm(lambda t, y, a: cfjax.LeftMatrix(a)), jnp.eye(3)
+
+    @jax.jit
+    @jax.vmap
+    def solve(a):
+        sol = diffrax.diffeqsolve(term, solver, 0.0, 1.0, 0.1, y0, a, throw=False)
+        return sol.ys[-1], sol.result == diffrax.RESULTS.successful
+
+    good = skew(3)
+    bad = good * np.array([[1, np.nan, 1], [1, 1, 1], [1, 1, 1]])
+    ys, are_successful = solve(np.stack([good, bad]))
+    np.testing.assert_array_equal(are_successful, [True, False])
+    # Ten steps of order 3, of angles of 0.1.
+    np.testing.assert_allclose(ys[0], expm(good), rtol=0, atol=1e-4)
+    assert np.isnan(ys[1]).all()
+    with pytest.raises(RuntimeError, match="without bound, or the steps"):
+        cfjax.integrate(term, solver, 0.0, 1.0, y0, jnp.asarray(bad), num_steps=2)
+
+
 @pytest.mark.parametrize("y0", [np.zeros(3), np.ones((3, 2))], ids=["zero", "equal columns"])
 def test_columns_without_full_rank_are_an_error(y0):
     a = jnp.asarray(skew(3))
