@@ -2,7 +2,7 @@
 
 from collections.abc import Sequence
 from operator import itemgetter
-from typing import Any
+from typing import Any, NamedTuple
 
 import diffrax
 import equinox as eqx
@@ -40,9 +40,11 @@ def check_field(fields: Sequence[AbstractFrozenField], point: PyTree) -> None:
     Use it in a test of the class. It compares, at one point:
 
     - `flow` and `tangent` return values shaped like the point;
+    - `flow` is finite for each field, for sums and differences of two of them, for the negatives,
+      and for multiples of all these from 4^-6 to 4, except where it overflows;
     - the flow of the zero field is the identity, the flow of 0.6 of a field followed by that of 0.4
-      of it is the flow of the whole field, and `tangent` is the derivative of the flow at time
-      zero;
+      of it is the flow of the whole field, that of -0.4 of it leads back, and `tangent` is the
+      derivative of the flow at time zero. So it is for negatives, sums and differences too;
     - `combine` is linear: the tangent of a sum is the sum of the tangents;
     - `increment`, if defined, is `flow(point) - point`; `to_chart` and `from_chart` lead back to
       the point and to the same flow; and if `defect` says how far a point is off the manifold, the
@@ -77,6 +79,7 @@ def check_field(fields: Sequence[AbstractFrozenField], point: PyTree) -> None:
         checked_part("point", field, point)
         eqx.filter_eval_shape(flow, field, point)
 
+    rays = _rays(name, fields, point)
     charted, start = [], point
     for field in fields:
         field, start = field.to_chart(start, charted)
@@ -85,8 +88,17 @@ def check_field(fields: Sequence[AbstractFrozenField], point: PyTree) -> None:
 
     _compare(name, _of_chart(fields[0], charted[0], start, point), rtol)
     _compare(name, _of_drift(fields[0], point), rtol)
-    for field, in_chart in zip(fields, charted, strict=True):
-        _compare(name, _of_flow(field, in_chart, charted[0], start, point), rtol)
+    for k, ray in enumerate(rays):
+        if k < len(fields):
+            label, field, in_chart = "", fields[k], charted[k]
+        elif ray.is_near:
+            label = _label(ray.weights)
+            field, in_chart = (type(x[0]).combine(ray.weights, x) for x in (fields, charted))
+        else:
+            continue
+        *comparisons, leads_back = _of_flow(field, in_chart, charted[0], start, point)
+        comparisons += [leads_back] * (ray.is_near and ray.is_negative_near)
+        _compare(name, comparisons, rtol, label)
     _compare(name, _of_combine(fields, charted, start), rtol)
     if type(fields[0]).framed is not AbstractFrozenField.framed:
         _check_framed(name, fields, point)
@@ -182,6 +194,61 @@ def _check_arguments(fields: Any, point: PyTree) -> None:
         raise ValueError(f"point must have {defect[1]}, and is off by {float(defect[0]):.1g}.")
 
 
+class _Ray(NamedTuple):
+    """A linear combination of fields, and whether it and its negative flow to near the point."""
+
+    weights: list[float]
+    is_near: bool
+    is_negative_near: bool
+
+
+def _rays(name: str, fields: Sequence[Any], point: PyTree) -> list[_Ray]:
+    """The fields, their sums and differences, and the negatives of all these.
+
+    Raises `ValueError` for a flow that is not finite, of one of these or of their multiples, unless
+    that of a smaller multiple leads far away, as this one may then overflow.
+    """
+    own = np.eye(len(fields))
+    half = np.concatenate([own, own[:-1] + own[1:], own[:-1] - own[1:]])
+    rays = np.concatenate([half, -half])
+    scales = 4.0 ** np.arange(-6, 2)
+    weights = scales[:, None, None] * rays
+    sizes = np.asarray(_sizes_of_ends(fields, point, weights))
+    is_near = sizes <= 1e3 * (float(_scale(point)) or 1.0)
+    may_overflow = np.logical_or.accumulate(np.isfinite(sizes) & ~is_near)
+    # Those of the given fields come first.
+    for j in np.argsort(np.abs(np.log(scales)), kind="stable"):
+        for k in np.flatnonzero(~np.isfinite(sizes[j]) & ~may_overflow[j]):
+            what = "NaN" if np.isnan(sizes[j, k]) else "infinite"
+            raise ValueError(
+                f"{name}.flow must be finite, but it is {what} for {_label(weights[j, k])}."
+            )
+    near = is_near[scales == 1][0]
+    return list(map(_Ray, rays.tolist(), near.tolist(), np.roll(near, len(half)).tolist()))
+
+
+@eqx.filter_jit
+def _sizes_of_ends(fields: Sequence[Any], point: PyTree, weights: Any) -> Any:
+    dtype = jnp.finfo(jtu.tree_leaves(point)[0].dtype).dtype
+
+    def size(weights: Any) -> Any:
+        return _scale(type(fields[0]).combine(tuple(weights), fields).flow(point))
+
+    # In a loop, so that the flow is compiled once.
+    rows = jnp.asarray(weights.reshape(-1, len(fields)), dtype)
+    return lax.map(size, rows).reshape(weights.shape[:-1])
+
+
+def _label(weights: Sequence[float] | np.ndarray) -> str:
+    """The combination of the fields with these weights, such as `fields[0] - 4 fields[1]`."""
+    terms = [
+        f"{'-' if w < 0 else '+'} {'' if abs(w) == 1 else f'{abs(w):g} '}fields[{k}]"
+        for k, w in enumerate(weights)
+        if w != 0
+    ]
+    return " ".join(terms).removeprefix("+ ")
+
+
 @eqx.filter_jit
 def _of_chart(field: Any, in_chart: Any, start: Any, point: PyTree) -> _Comparisons:
     returned, end = in_chart.from_chart(start), field.flow(point)
@@ -234,6 +301,9 @@ def _of_flow(field: Any, in_chart: Any, first: Any, start: Any, point: PyTree) -
     # In a loop, so that the flow is compiled once.
     ends = lax.map(lambda t: flow_to(t, start), times)
     at_zero, between, end = (jtu.tree_map(itemgetter(k), ends) for k in range(3))
+    parts = jnp.asarray([0.4, -0.4], times.dtype)
+    later_ends = lax.map(lambda x: flow_to(*x), (parts, jtu.tree_map(lambda x: x[1:], ends)))
+    later, back = (first.from_chart(jtu.tree_map(itemgetter(k), later_ends)) for k in range(2))
     end = first.from_chart(end)
     path = lambda t: first.from_chart(flow_to(t, start))  # noqa: E731
     velocity = jax.jvp(path, (0 * times[0],), (times[2],))[1]
@@ -254,7 +324,7 @@ def _of_flow(field: Any, in_chart: Any, first: Any, start: Any, point: PyTree) -
         ),
         (
             "flow of 0.4 of a field after 0.6 of it must be that of the whole field",
-            first.from_chart(flow_to(0.4, between)),
+            later,
             end,
             _scale((y, end)),
         ),
@@ -275,6 +345,9 @@ def _of_flow(field: Any, in_chart: Any, first: Any, start: Any, point: PyTree) -
         expected = jtu.tree_map(jnp.subtract, field.flow(point), point)
         requirement = "increment must be flow(point) - point"
         comparisons.append((requirement, increment, expected, _scale((point, expected))))
+    requirement = "flow of -0.4 of a field must lead back along that of the field"
+    between = first.from_chart(between)
+    comparisons.append((requirement, back, between, _scale((y, between, end))))
     return comparisons
 
 
@@ -375,7 +448,7 @@ def _scale(x: PyTree) -> Any:
     return sum(jnp.max(jnp.abs(leaf), initial=0) for leaf in jtu.tree_leaves(x))
 
 
-def _compare(name: str, comparisons: _Comparisons, rtol: float) -> None:
+def _compare(name: str, comparisons: _Comparisons, rtol: float, label: str = "") -> None:
     for requirement, actual, expected, scale in comparisons:
         a, b = (
             np.concatenate([np.ravel(leaf) for leaf in jtu.tree_leaves(x)])
@@ -385,7 +458,8 @@ def _compare(name: str, comparisons: _Comparisons, rtol: float) -> None:
         # False for NaN.
         if np.all(np.abs(a - b) <= tol):
             continue
-        raise ValueError(f"{name}.{requirement}, but {_difference(a, b, tol)}")
+        place = f", here of {label}" if label else ""
+        raise ValueError(f"{name}.{requirement}{place}, but {_difference(a, b, tol)}")
 
 
 def _difference(actual: np.ndarray, expected: np.ndarray, tol: float) -> str:

@@ -10,6 +10,9 @@ from fractions import Fraction
 from typing import Any, Literal, NamedTuple
 
 import diffrax
+import jax
+import jax.numpy as jnp
+import numpy as np
 
 import cfjax
 
@@ -170,3 +173,68 @@ def solvers(*kinds: Kind) -> dict[str, Row]:
 def named(*kinds: Kind) -> dict[str, Row]:
     """The rows of some kinds whose class is one method."""
     return {name: row for name, row in solvers(*kinds).items() if row.is_named}
+
+
+# A problem for each solver.
+
+ON_SPHERE = np.array([0.6, 0.0, 0.8])
+FRAME = np.linalg.qr(np.array([[1.0, 0.2], [0.5, 1.0], [0.3, -0.4]]))[0]
+
+
+def unit(t, y, args):
+    """The rotation of a vector, or of a frame that is moved by its own span."""
+    if y.ndim == 2:
+        return cfjax.LowRankSkew(args[:, None] * jnp.sin(y))
+    return cfjax.Rotation(args * y + t)
+
+
+def of_time(t, y, args):
+    """What does not depend on the state."""
+    return cfjax.Rotation(args * jnp.asarray(ON_SPHERE) + t)
+
+
+def decay(t, y, args):
+    """The decay of density matrices, which does not depend on the state."""
+    return cfjax.Lindblad(jnp.diag(args * t), [args[:, None] * np.eye(3, k=1)])
+
+
+def linear(t, y, args):
+    """The rotation of a vector, as a linear part and no rest."""
+    return cfjax.LinearAffine(jnp.cross(args * y + t, jnp.eye(3), axisb=1, axisc=1).T, 0 * y)
+
+
+def about(axis):
+    """A part of `unit` that is constant along its own flow, about one axis."""
+
+    def field(t, y, args):
+        # The time passes while the last term acts, which does not depend on it.
+        passed = 0.0 if axis == 2 else t
+        return cfjax.Rotation(jnp.eye(3)[axis] * (args * y + passed))
+
+    return field
+
+
+def noise(t, y, args, increment):
+    """So weak that it moves the end by some 1e-3."""
+    return cfjax.Rotation(1e-3 * args * increment)
+
+
+def problem_for(takes: Takes) -> tuple[Any, np.ndarray]:
+    """The rotation `unit` with its start, or what a solver takes in its place. `args` has 3 rates.
+
+    Noise has its times from 0 to 1.
+    """
+    if takes == "columns":
+        return cfjax.LieTerm(unit), FRAME
+    if takes == "density matrices":
+        return cfjax.LieTerm(decay), np.full((3, 3), 1 / 3 + 0j)
+    if takes == "noise":
+        path = diffrax.VirtualBrownianTree(
+            0.0, 1.0, 0.05, (3,), jax.random.key(0), levy_area=diffrax.SpaceTimeLevyArea
+        )
+        term = diffrax.MultiTerm(cfjax.LieTerm(unit), cfjax.LieControlTerm(noise, path))
+    elif takes == "terms":
+        term = diffrax.MultiTerm(*(cfjax.LieTerm(about(axis)) for axis in range(3)))
+    else:
+        term = cfjax.LieTerm({"linear part": linear, "time only": of_time}.get(takes, unit))
+    return term, ON_SPHERE

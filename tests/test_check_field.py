@@ -251,6 +251,72 @@ def test_a_transposed_tangent_is_found():
         cfjax.check_field(fields, random(F64, 3))
 
 
+# Mistakes that some fields show only.
+
+
+class Turn(AbstractFrozenField):
+    """The Lorentz group of a plane and time, by sines only: of boosts it is NaN."""
+
+    w: jax.Array
+
+    def flow(self, point):
+        x = jnp.sqrt(self.w @ (jnp.array([1.0, -1.0, -1.0]) * self.w))
+        return point + jnp.sin(x) / x * self.tangent(point)
+
+    def tangent(self, point):
+        return jnp.array([-1.0, 1.0, 1.0]) * jnp.cross(self.w, point)
+
+
+@pytest.mark.parametrize(
+    "a, b, label",
+    [
+        ([0.3, 1.0, 0.2], [1.0, 0.2, -0.3], r"fields\[0\]"),
+        ([1.0, 0.3, 0.2], [0.2, 1.0, -0.3], r"fields\[1\]"),
+        ([1.0, 0.1, 0.2], [1.0, 0.5, -0.3], r"fields\[0\] - fields\[1\]"),
+    ],
+)
+def test_a_flow_that_is_nan_for_some_fields_is_named(a, b, label):
+    with pytest.raises(
+        ValueError, match=rf"Turn\.flow must be finite, but it is NaN for {label}\."
+    ):
+        cfjax.check_field([Turn(jnp.asarray(a)), Turn(jnp.asarray(b))], random(F64, 3))
+
+
+class Growth(AbstractFrozenField):
+    rate: jax.Array
+
+    def flow(self, point):
+        return point * jnp.exp(jnp.abs(self.rate))
+
+    def tangent(self, point):
+        return point * self.rate
+
+
+class ShortGrowth(Growth):
+    def flow(self, point):
+        return point * jnp.exp(jnp.where(jnp.abs(self.rate) > 1, jnp.nan, self.rate))
+
+
+@pytest.mark.parametrize(
+    "cls, message",
+    [
+        (Growth, r"flow of -0\.4 of a field must lead back along that of the field, but"),
+        (ShortGrowth, r"flow must be finite, but it is NaN for 4 fields\[0\]\."),
+    ],
+)
+def test_a_flow_that_is_wrong_for_some_signs_or_sizes_is_named(cls, message):
+    rates = jnp.array([[0.4, 0.1], [0.3, 0.2]])
+    with pytest.raises(ValueError, match=message):
+        cfjax.check_field([cls(rate) for rate in rates], POINT)
+
+
+def test_a_stiff_field_may_overflow_backwards():
+    spectrum, transform = -1e4 * np.arange(1.0, 5), cfjax.SineTransform()
+    fields = [cfjax.Affine(random(F64, 4), spectrum, transform, alpha=a) for a in (0.7, 1.2)]
+    assert np.isnan(cfjax.combine((-1.0,), fields[:1]).flow(random(F64, 4))).any()
+    cfjax.check_field(fields, random(F64, 4))
+
+
 # A class that acts on a subtree.
 
 

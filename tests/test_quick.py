@@ -11,66 +11,11 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from solver_table import SOLVERS
+from solver_table import FRAME, ON_SPHERE, SOLVERS, problem_for, unit
 
 import cfjax
 
-ON_SPHERE = np.array([0.6, 0.0, 0.8])
 SQUARE = np.array([[0.4, -0.2], [0.1, 0.3]])
-FRAME = np.linalg.qr(np.array([[1.0, 0.2], [0.5, 1.0], [0.3, -0.4]]))[0]
-
-
-def unit(t, y, args):
-    """The rotation of a vector, or of a frame that is moved by its own span."""
-    if y.ndim == 2:
-        return cfjax.LowRankSkew(args[:, None] * jnp.sin(y))
-    return cfjax.Rotation(args * y + t)
-
-
-def of_time(t, y, args):
-    """What does not depend on the state."""
-    return cfjax.Rotation(args * jnp.asarray(ON_SPHERE) + t)
-
-
-def decay(t, y, args):
-    """The decay of density matrices, which does not depend on the state."""
-    return cfjax.Lindblad(jnp.diag(args * t), [args[:, None] * np.eye(3, k=1)])
-
-
-def linear(t, y, args):
-    """The rotation of a vector, as a linear part and no rest."""
-    return cfjax.LinearAffine(jnp.cross(args * y + t, jnp.eye(3), axisb=1, axisc=1).T, 0 * y)
-
-
-def about(axis):
-    """A part of `unit` that is constant along its own flow, about one axis."""
-
-    def field(t, y, args):
-        # The time passes while the last term acts, which does not depend on it.
-        passed = 0.0 if axis == 2 else t
-        return cfjax.Rotation(jnp.eye(3)[axis] * (args * y + passed))
-
-    return field
-
-
-def noise(t, y, args, increment):
-    """So weak that it moves the end by some 1e-3."""
-    return cfjax.Rotation(1e-3 * args * increment)
-
-
-def term_for(takes):
-    """The rotation `unit`, or what a solver takes in its place."""
-    if takes == "noise":
-        path = diffrax.VirtualBrownianTree(
-            0.0, 1.0, 0.05, (3,), jax.random.key(0), levy_area=diffrax.SpaceTimeLevyArea
-        )
-        return diffrax.MultiTerm(cfjax.LieTerm(unit), cfjax.LieControlTerm(noise, path))
-    if takes == "terms":
-        return diffrax.MultiTerm(*(cfjax.LieTerm(about(axis)) for axis in range(3)))
-    return cfjax.LieTerm(
-        {"linear part": linear, "time only": of_time, "density matrices": decay}.get(takes, unit)
-    )
-
 
 FIELDS = {
     "array": (lambda t, y, args: args * jnp.sin(y), ON_SPHERE),
@@ -173,9 +118,7 @@ def check(solver, term, y0, has_gradient):
 @pytest.mark.parametrize("name", SOLVERS)
 def test_every_solver(name):
     row = SOLVERS[name]
-    starts = {"columns": FRAME, "density matrices": np.full((3, 3), 1 / 3 + 0j)}
-    y0 = starts.get(row.takes, ON_SPHERE)
-    check(row.make(), term_for(row.takes), y0, has_gradient=False)
+    check(row.make(), *problem_for(row.takes), has_gradient=False)
 
 
 @pytest.mark.slow

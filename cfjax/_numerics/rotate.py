@@ -3,7 +3,7 @@
 import jax
 from jaxtyping import Array, Bool, Float
 
-from .stumpff import dexpinv_times, is_below_full_turn, stumpff, stumpff_1_to_3_apart
+from .stumpff import dexpinv_times, is_below_full_turn, stumpff_1_to_3_apart
 from .vectors import cross, dot, entries, pack
 
 
@@ -36,7 +36,8 @@ def mean(a: Float[Array, "3"], x: Float[Array, "3 *k"]) -> Float[Array, "3 *k"]:
     """The mean of `rotate(s a, x)` over s from 0 to 1, `x + c_2 a*x + c_3 a*(a*x)`."""
     axis, xs = entries(a), entries(x)
     velocity = cross(axis, xs)
-    c2, c3 = (stumpff(n, dot(axis, axis)) for n in (2, 3))
+    near, _, d2, c3 = stumpff_1_to_3_apart(dot(axis, axis))
+    c2 = near / 2 + d2
     terms = zip(xs, velocity, cross(axis, velocity), strict=True)
     return pack([x + (c2 * v + c3 * w) for x, v, w in terms], sums=True)
 

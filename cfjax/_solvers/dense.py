@@ -15,7 +15,6 @@ from jaxtyping import Array, Float, PyTree, Real
 
 from .._field import combine, from_chart
 from .._methods.tableau import ContinuousExtension
-from .base import time_at
 from .compiled import scalarised
 from .stacked import can_roll, rolled_flows
 from .sums import flow_once
@@ -81,7 +80,9 @@ class Substeps(AbstractPath):
         is_current, c = index == current, theta - index
         # The others are evaluated at a time of their own, as another may be an error there.
         c = jnp.where(is_current, c, jnp.clip(c, 0, 1))
-        return interpolation.evaluate(time_at(c, interpolation.t0, interpolation.t1)), is_current
+        # Not `time_at`, which jumps to the end of a step, so its derivative is zero there.
+        time = interpolation.t0 + c * (interpolation.t1 - interpolation.t0)
+        return interpolation.evaluate(time), is_current
 
 
 class Path(AbstractPath):

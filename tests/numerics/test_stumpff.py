@@ -13,6 +13,15 @@ from cfjax import Rotation, stumpff
 from cfjax._numerics.stumpff import cotangent_excess, stumpff_1_to_3_apart
 
 ORDERS = 3
+# About zero, about the limits of formulas, x = 2 and 4, and half powers of two.
+NEGATIVE = [
+    *(-1e-300, -1e-30, -1e-8, -1e-3, -1.0),
+    *(-((k * np.log(2)) ** 2) * (1 + d) for k in (3.5, 10.5) for d in (-1e-6, 0.0, 1e-6)),
+    *(-4 * (1 + d) for d in (-1e-6, 0.0, 1e-6)),
+    *(-16 * (1 + d) for d in (-1e-6, 0.0, 1e-6)),
+    *(-40.0, -110.0, -1e3, -7e3),
+]
+ARGUMENTS = [*SQUARES_OF_ANGLES, *NEGATIVE]
 DTYPES = pytest.mark.parametrize("dtype", [np.float32, np.float64])
 
 
@@ -21,7 +30,7 @@ def reference(n, s):
 
     The largest term is below exp(x), which costs x / log(10) digits of those carried.
     """
-    with mp.workdps(40 + int(math.sqrt(s) / 2)):
+    with mp.workdps(40 + int(math.sqrt(abs(s)) / 2)):
         s = mp.mpf(float(s))
         sums = [mp.mpf(0)] * (ORDERS + 1)
         term = 1 / mp.factorial(n)  # s^j / (n + 2j)! with its sign
@@ -44,18 +53,20 @@ def reference(n, s):
 
 
 def bound(n, s, value, unit):
-    """What the docstring promises, in units of rounding of x = sqrt(s).
+    """What the docstring promises, in units of rounding of x = sqrt(|s|).
 
-    Absolute in x c_1 and x^2 c_2. So c_0 = 1 - x^2 c_2 has the error of x itself. From c_3 on the
-    function is (1 / (n - 2)! - c_{n-2}) / s where s is large: its error is that of the numerator.
-    For small s the series has a relative error.
+    Absolute in x c_1 and x^2 c_2 for s > 0. So c_0 = 1 - x^2 c_2 has the error of x itself. From
+    c_3 on the function is (1 / (n - 2)! - c_{n-2}) / s where s is large: its error is that of the
+    numerator. For small s the series has a relative error, and up to c_3 for all negative s.
     """
-    x = math.sqrt(s)
+    x = math.sqrt(abs(s))
+    if s < 0 and n <= 3:
+        return unit * max(1, x) * value[n]
     if n == 0:
         return unit * max(1, x)
-    if n <= 2 or s < 15.9:
-        return unit * (abs(value[n]) if s < 1 else (1 / x ** (n - 1) if n <= 2 else value[n]))
-    return (unit / math.factorial(n - 2) + bound(n - 2, s, value, unit)) / s
+    if n <= 2 or x * x < 15.9:
+        return unit * (abs(value[n]) if x < 1 else (1 / x ** (n - 1) if n <= 2 else value[n]))
+    return (unit / math.factorial(n - 2) + bound(n - 2, s, value, unit)) / (x * x)
 
 
 def derivative_bound(n, k, s, value, unit):
@@ -70,7 +81,7 @@ def derivative_bound(n, k, s, value, unit):
 def exact():
     """All references, for the arguments rounded to each precision: `[dtype][i][n][k]`."""
     return {
-        dtype: [[reference(n, s) for n in range(12)] for s in np.array(SQUARES_OF_ANGLES, dtype)]
+        dtype: [[reference(n, s) for n in range(12)] for s in np.array(ARGUMENTS, dtype)]
         for dtype in (np.float32, np.float64)
     }
 
@@ -93,7 +104,7 @@ def derivatives(n):
 @DTYPES
 @pytest.mark.parametrize("n", range(6))
 def test_values_and_three_derivatives(n, dtype, exact):
-    arguments = np.array(SQUARES_OF_ANGLES, dtype)
+    arguments = np.array(ARGUMENTS, dtype)
     got = derivatives(n)(arguments)
     assert got.dtype == dtype
     # A few units: the reduced angle, a square, a polynomial and a product round once each.
@@ -208,12 +219,16 @@ def test_stumpff_takes_arrays_of_numpy_and_a_batch(n):
     np.testing.assert_allclose(batch, found, rtol=0, atol=8 * 2.0**-24)
 
 
-def test_stumpff_of_a_negative_number_is_nan():
-    s = jnp.array([-1.0, -1e-300, 0.0])
-    np.testing.assert_array_equal(np.isnan(stumpff(1, s)), [True, True, False])
-    # And it does not spread: the derivatives at zero are those of the series.
-    slope = jax.grad(lambda s: jnp.nansum(stumpff(1, s)))(s)
-    np.testing.assert_allclose(slope[2], -1 / 6, rtol=2.0**-50)
+@DTYPES
+def test_what_overflows_does_not_spread(dtype):
+    """In reverse mode: what one sign makes of the arguments of the other is nowhere."""
+    large = np.sqrt(np.finfo(dtype).max).astype(dtype)
+    s = jnp.asarray([0.0, -0.0, large, 2.0**32, -7e3, -4.9e5, -large], dtype)
+    values, slopes = jax.jit(jax.vmap(jax.value_and_grad(lambda s: stumpff(1, s))))(s)
+    np.testing.assert_allclose(slopes[:2], -1 / 6, rtol=4 * np.finfo(dtype).eps)
+    is_known = np.array([True, True, False, True, True, dtype == np.float64, False])
+    np.testing.assert_array_equal(is_known, np.isfinite(slopes))
+    np.testing.assert_array_equal(is_known, np.isfinite(values))
 
 
 @pytest.mark.parametrize(

@@ -14,7 +14,7 @@ import optimistix as optx
 import problems
 import pytest
 from scipy.integrate import solve_ivp
-from solver_table import COMMUTATOR_FREE, MUNTHE_KAAS, SOLVERS, named
+from solver_table import COMMUTATOR_FREE, MUNTHE_KAAS, SOLVERS, named, problem_for
 
 import cfjax
 
@@ -146,6 +146,40 @@ def test_derivatives_in_time(name, direction):
             change = [sol.evaluate(t + k * h) for k in (-2, -1, 1, 2)]
             slope = ((change[0] - change[3]) - 8 * (change[1] - change[2])) / (12 * h)
             np.testing.assert_allclose(found, slope, rtol=0, atol=1e-9)
+
+
+# Quick tests of those whose output is that of their substeps.
+SUBSTEPS = "Richardson", "Composition", "WeakOrder2"
+
+
+@pytest.mark.parametrize(
+    "name",
+    [pytest.param(name, marks=[pytest.mark.slow] * (name not in SUBSTEPS)) for name in SOLVERS],
+)
+def test_derivatives_in_time_within_a_step_and_at_both_ends(name):
+    """Against differences of the output, of times before, and at the start of times after it."""
+    row, h = SOLVERS[name], 0.25
+    solver, (term, y0) = row.make(), problem_for(row.takes)
+    y0, args = jnp.asarray(y0), jnp.asarray([0.5, -0.4, 0.9])
+    # The derivative of a polynomial through five points.
+    d, weights = h / 1000, np.array([25, -48, 36, -16, 3]) / 12
+    times = h * np.array([0.0, 0.3, 0.5, 1.0])
+    steps = d * np.array([1, -1, -1, -1])
+    near = times + np.arange(5)[:, None] * steps
+
+    @jax.jit
+    def output(h):
+        info = problems.first_step(solver, term, 0 * h, h, y0, args)[2]
+        path = solver.interpolation_cls(t0=0 * h, t1=h, **info)
+        return jax.vmap(path.derivative)(times), jax.vmap(jax.vmap(path.evaluate))(near)
+
+    found, values = map(np.asarray, output(jnp.asarray(h)))
+    slopes = -np.tensordot(weights, values, 1) / steps.reshape(-1, *[1] * y0.ndim)
+    # Rounding: weights of 3e4 cancel in the output of Magnus10, so values have it of 2e-13, times
+    # the 10 of all weights here, over d. The difference itself is off by d^4 / 5 times a fifth
+    # derivative, of flows that turn at rates of 1.
+    np.testing.assert_allclose(found, slopes, rtol=0, atol=1e-8)
+    assert np.abs(slopes).max(axis=tuple(range(1, slopes.ndim))).min() > 1e-4
 
 
 @pytest.mark.slow
