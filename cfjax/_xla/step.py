@@ -21,6 +21,7 @@ from jax import lax
 from jax.core import ShapedArray
 from jax.extend.core import ClosedJaxpr, Jaxpr, JaxprEqn, Primitive, jaxpr_as_fun
 from jax.interpreters import ad, batching, mlir
+from jax.interpreters import partial_eval as pe
 from jaxtyping import PyTree
 
 from .in_two import in_two
@@ -133,6 +134,8 @@ class Kind(NamedTuple):
     is_once: bool = False
     # What a derivative is derived from.
     of: Of | None = None
+    # Whether these are values beside their derivative, in one loop.
+    is_beside: bool = False
 
     @property
     def is_batch(self) -> bool:
@@ -143,7 +146,19 @@ class Kind(NamedTuple):
         """How long a program may be, to be scalarised as a whole."""
         if self.is_batch and (self.is_first or not self.linear):
             return FLAT_MANY
+        if self.is_forward:
+            # Longer ones gain nothing, and take several times as long to compile.
+            return min(self.max_derivatives, FLAT_DERIVATIVES)
+        if self.is_beside:
+            # XLA may compile such a loop as many functions, and compute a long program in them
+            # exponentially often: `RKMK8` on one body took 4 ms a step.
+            return min(self.max_values, CUT_IN_BATCHES)
         return self.max_derivatives if self.linear else self.max_values
+
+    @property
+    def is_forward(self) -> bool:
+        """Whether it is a derivative of values, in forward mode."""
+        return self.of is not None and self.of.of is None and self.of.derive is _tangents
 
     @property
     def is_first(self) -> bool:
@@ -239,7 +254,7 @@ def _jvp(primals, tangents, *, program, kind):
     if kind.linear:
         # Several derivatives in one loop take long to compile.
         kind = kind._replace(max_derivatives=min(kind.max_derivatives, FLAT_SECOND))
-    outs = step_p.bind(*primals, program=program, kind=kind)
+    outs = step_p.bind(*primals, program=program, kind=kind._replace(is_beside=not kind.linear))
     ways: list[Any] = [ad.Zero(jax.typeof(x).to_tangent_aval()) for x in outs]
     pairs = enumerate(zip(primals, tangents, strict=True))
     moving = tuple(k for k, (x, way) in pairs if type(way) is not ad.Zero and is_inexact(x))
@@ -261,8 +276,15 @@ def _jvp(primals, tangents, *, program, kind):
     return outs, replaced(ways, results, new)
 
 
+def _partly_known(trace, *operands, program, kind):
+    """Reverse mode computes values in a loop of their own, before their derivatives."""
+    params = {"program": program, "kind": kind._replace(is_beside=False)}
+    return trace.default_process_primitive(step_p, operands, params)
+
+
 def _derivative(kind: Kind, of: Of, operands: Sequence[Any]) -> list[Any]:
-    return step_p.bind(*operands, program=of.derived(), kind=kind._replace(is_once=True, of=of))
+    kind = kind._replace(is_once=True, of=of, is_beside=False)
+    return step_p.bind(*operands, program=of.derived(), kind=kind)
 
 
 def _transpose(cotangents, *operands, program, kind):
@@ -326,6 +348,9 @@ def _one_of(xs):
 def _run(*operands, program, kind):
     num_operations, few = length(program.jaxpr), _few_directions(operands, kind)
     if few is not None:
+        if kind.is_forward and len(kind.levels) == 1 and not kind.rows:
+            # The Jacobian of one system. On numbers it gains nothing.
+            return _whole(operands, not_materialised(program), kind)
         level, size = few
         is_flat = num_operations <= min(kind.limit(), FLAT_DERIVATIVES)
         if is_flat or (kind.is_first and size <= FEW_DIRECTIONS):
@@ -439,9 +464,13 @@ def _as_traced(operands, program, kind) -> list[Any]:
         of_turn = Kind(tuple(fixed), len(turn.out_avals), kind.rows, *lengths, is_once=True)
         return step_p.bind(*operands, program=turn, kind=of_turn)
 
-    fun = jaxpr_as_fun(by_turns(not_materialised(program), kind.fixed, run))
+    return _whole(operands, by_turns(not_materialised(program), kind.fixed, run), kind)
+
+
+def _whole(operands, program, kind) -> list[Any]:
+    fun = _in_batches(jaxpr_as_fun(program), kind.levels)
     # A literal comes out as NumPy's.
-    return list(map(jnp.asarray, _in_batches(fun, kind.levels)(*operands)))
+    return list(map(jnp.asarray, fun(*operands)))
 
 
 def _in_batches(fun: Callable[..., Any], levels: Sequence[Any]) -> Callable[..., Any]:
@@ -452,6 +481,7 @@ def _in_batches(fun: Callable[..., Any], levels: Sequence[Any]) -> Callable[...,
 
 ad.primitive_jvps[step_p] = _jvp
 ad.primitive_transposes[step_p] = _transpose
+pe.custom_partial_eval_rules[step_p] = _partly_known
 batching.primitive_batchers[step_p] = _batch
 mlir.register_lowering(step_p, mlir.lower_fun(_run, multiple_results=True))
 # Where newer versions of JAX put types of their own within, they take them out first.

@@ -332,3 +332,43 @@ def test_results_of_all_turns_along_leading_axes():
     with cfjax.rewriting(False):
         expected = jax.jit(solve)(y0)
     np.testing.assert_allclose(new, expected, rtol=0, atol=1e-14)
+
+
+@pytest.mark.parametrize(("solver", "argument"), [(cfjax.CF4(), 0), (cfjax.RKMK8(), 1)])
+def test_the_jacobian_of_one_system_is_as_traced(solver, argument):
+    """On numbers it gained nothing."""
+    step, *given = step_of(rigid_body, solver)
+    given = jax.tree.map(jnp.asarray, given)
+
+    def end(x):
+        return step(*given[:argument], x, *given[argument + 1 :])[0]
+
+    def num_instructions():
+        # Without the values, which are on their own.
+        along = lambda v: jax.jvp(end, (given[argument],), (v,))[1]  # noqa: E731
+        jacobian = jax.jit(jax.vmap(along))
+        return jacobian.lower(jnp.eye(3)).compile().as_text().count(" = ")
+
+    found = num_instructions()
+    with cfjax.rewriting(False):
+        assert found == num_instructions()
+
+
+def test_long_values_beside_a_derivative_keep_their_loop():
+    """jax 0.10 computed ten million operations a step for them: a Jacobian took 4 ms a step."""
+    given = rigid_body.problem()
+
+    def end(y):
+        solver, options = cfjax.RKMK8(), {"num_steps": 20, "throw": False}
+        return cfjax.integrate(given["term"], solver, 0.0, 1.0, y, given["args"], **options).ys
+
+    def num_loops(fun):
+        return sum("stablehlo.while" in line for line in lines_of(fun, given["y0"]))
+
+    assert num_loops(end) == 2
+    # The stages of the values, and those of the derivative.
+    assert num_loops(lambda y: jax.jvp(end, (y,), (y,))) == 4
+    # Reverse mode has the values in a loop of their own, and they stay one function.
+    gradient = jax.make_jaxpr(jax.grad(lambda y: jnp.sum(end(y))))(given["y0"])
+    assert "is_beside=False" in str(gradient)
+    assert "is_beside=True" not in str(gradient)
