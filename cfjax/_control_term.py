@@ -10,6 +10,7 @@ import jax.tree_util as jtu
 import numpy as np
 from jaxtyping import Array, PyTree
 
+from ._arrays import describe
 from ._field import flow, has_default_combine, is_field, tangent
 from ._numerics.checks import Fault
 from ._numerics.linearity import Linearity, linearity
@@ -106,9 +107,11 @@ class LieControlTerm(diffrax.AbstractTerm):
         The values are at a state to which the field leads, as a start is often special. `control`
         is an increment, or its shapes and dtypes.
 
-        **Raises** `ValueError` if the program says that it is not linear.
+        **Raises** `ValueError` if the program says that it is not linear, or reads an entry that
+        the increment does not have.
         """
         dependences = self._linearity(_Unevaluated.of(t, y, args), control)
+        self._check_indices(t, y, args, control)
         if all(d.power <= 1 and d.constant == "zero" for d in dependences):
             return fault
         rng = np.random.default_rng(0)
@@ -150,6 +153,20 @@ class LieControlTerm(diffrax.AbstractTerm):
             is_nonlinear |= max_abs(x - (xa + 0.3 * xb)) > np.sqrt(eps) * size
             has_drift |= max_abs(x0) > 100 * eps * size
         return fault.with_case(is_nonlinear, _IS_NOT_LINEAR).with_case(has_drift, _HAS_DRIFT)
+
+    def _check_indices(self, t: Any, y: PyTree, args: PyTree, control: PyTree) -> None:
+        """JAX would clamp an index that is out of bounds. NumPy raises an error."""
+        zeros = jtu.tree_map(lambda x: np.broadcast_to(np.zeros((), x.dtype), x.shape), control)
+        try:
+            eqx.filter_eval_shape(lambda: self.field(t, y, args, zeros))
+        except IndexError as error:
+            raise ValueError(
+                "The field reads an entry that its increment does not have, which is "
+                f"{describe(control)}: {error}."
+            ) from error
+        except Exception:
+            # What JAX traces above need not take arrays of NumPy.
+            return
 
     def _linearity(self, vf: "_Unevaluated", control: PyTree) -> list[Linearity]:
         """How the arrays of the field depend on the increment, as far as its program shows."""

@@ -221,6 +221,8 @@ def equal_steps(
         f"many steps coincide in {t0.dtype}. Take fewer steps, shift the times towards zero, or "
         "make y0 float64.",
     )
+    is_infinite = jnp.isinf(t0) | jnp.isinf(t1)
+    fault = fault.with_case(is_infinite, "t0 and t1 must be finite, got infinity.")
     is_static = isinstance(num_steps, int)
     valid_num_steps = num_steps if is_static else jnp.where(fault.number == 0, num_steps, 0)
     zero = (fault.error if throw else fault.nan)(jnp.zeros((), t0.dtype))

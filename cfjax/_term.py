@@ -31,8 +31,8 @@ class LieTerm(diffrax.AbstractTerm):
     term = cfjax.LieTerm(field)
     ```
 
-    A step of cfjax calls it at times within the step, by a few units of rounding at its ends, so the
-    field may jump where steps end.
+    A step of cfjax calls it at times within the step, at its ends by a few units of rounding, so
+    the field may jump where steps end.
 
     What the field returns is checked against the state once, when the program is traced. A part of
     wrong structure, shape or dtype raises a `TypeError` or `ValueError` that names its place in the

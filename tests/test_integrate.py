@@ -856,6 +856,12 @@ def turning(y0, rate=1.0, **options):
     return cfjax.integrate(term, cfjax.CF4(), 0.0, 1.0, y0, num_steps=12, **options)
 
 
+@pytest.mark.parametrize("times", [(0.0, np.inf), (-np.inf, 0.0)])
+def test_times_must_be_finite(times):
+    with pytest.raises(eqx.EquinoxRuntimeError, match=r"^t0 and t1 must be finite, got infinity"):
+        cfjax.integrate(cfjax.LieTerm(lambda t, y, args: -y), cfjax.CF2(), *times, Y0, num_steps=3)
+
+
 FAR, NEAR = jnp.array([1.1, 0.0, 0.0, 0.0]), jnp.array([1.0, 0.0, 0.0, 0.0])
 OFF = r"y must start on the manifold that QuaternionRotation acts on: y0 must have length 1 "
 

@@ -92,6 +92,10 @@ def map_batch(
     size = _batch_size(members)
     if not isinstance(mesh, Mesh | None):
         raise TypeError(f"mesh must be a jax.sharding.Mesh, got {mesh!r}.")
+    if not isinstance(folder, str | os.PathLike | None) or folder == "":
+        raise TypeError(
+            f'folder must be a path or None, got {folder!r}. The working folder is ".".'
+        )
     devices = 1 if mesh is None else mesh.size
     chunk_size = -(-min(count("chunk_size", chunk_size), size) // devices) * devices
     program = Program(solve, members, chunk_size, mesh)

@@ -10,6 +10,7 @@ import jax.numpy as jnp
 import jax.tree_util as jtu
 import numpy as np
 from jax import lax
+from jax.core import Tracer
 from jax.extend.core import Primitive
 from jax.interpreters import ad, batching, mlir
 from jax.sharding import use_abstract_mesh
@@ -34,8 +35,15 @@ class Fault(eqx.Module):
         return Fault(jnp.where(holds, jnp.int32(len(messages)), self.number), messages)
 
     def error(self, zero: Real[Array, ""]) -> Real[Array, ""]:
-        """The zero, or the error, if there is one: in a batch the one with the largest number."""
+        """The zero, or the error, if there is one: in a batch the one with the largest number.
+
+        It is raised at once where it is known, without a program that calls the host.
+        """
         if not self.messages:
+            return zero
+        if not isinstance(self.number, Tracer):
+            if number := int(self.number):
+                raise eqx.EquinoxRuntimeError(self.messages[number - 1])
             return zero
         index = max_over_batch(jnp.maximum(self.number - 1, 0))
         return eqxi.branched_error_if(zero, self.number > 0, index, self.messages)

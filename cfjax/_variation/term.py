@@ -13,13 +13,13 @@ import numpy as np
 from jax.flatten_util import ravel_pytree
 from jaxtyping import Array, PyTree, Real
 
-from .._arguments import as_state, time_dtype
+from .._arguments import as_state, time_dtype, time_scalar
 from .._arrays import describe
 from .._control_term import LieControlTerm, is_driven
 from .._field import Rest, combine, is_field, tangent
 from .._fields.conjugation import Congruence
 from .._fields.matrix import LeftMatrix
-from .._numerics.checks import Fault, error_if, needing
+from .._numerics.checks import Fault, needing
 from .._numerics.matmul import matmul
 from .._term import checked, product
 from .basis import Basis
@@ -203,7 +203,7 @@ class VariationTerm(diffrax.AbstractTerm):
             raise TypeError("y0 must be the state alone, got a Variation: start from its .state.")
         y0 = as_state(y0)
         dtype = time_dtype(y0)
-        here = _Evaluation(self, t0, y0, args)
+        here = _Evaluation(self, time_scalar("t0", t0, dtype), y0, args)
         n, m = here.frame.size, here.num_parameters
 
         def matrix(name: str, value: Any, default: Callable[[], Array], shape: Any) -> Any:
@@ -214,6 +214,8 @@ class VariationTerm(diffrax.AbstractTerm):
             value = jnp.asarray(value)
             if value.shape != shape or not jnp.issubdtype(value.dtype, jnp.number):
                 raise ValueError(f"{name} must have shape {shape}, got {describe(value)}.")
+            if jnp.iscomplexobj(value):
+                raise TypeError(f"{name} must be real, got {describe(value)}.")
             return value.astype(dtype)
 
         if sensitivity is not None and sensitivity is not False and self.parameters is None:
@@ -228,12 +230,16 @@ class VariationTerm(diffrax.AbstractTerm):
             matrix("log_density", log_density, lambda: jnp.zeros((), dtype), ()),
         )
         here.check(start)
+        fault = here.fault(start)
         if start.covariance is not None:
-            p = error_if(start.covariance, _is_not_symmetric, "covariance must be symmetric.")
-            p = (p + p.T) / 2
-            p = error_if(p, _is_not_semidefinite, "covariance must be positive semidefinite.")
-            start = eqx.tree_at(lambda v: v._covariance, start, p)
-        zero = here.fault(start).error(jnp.zeros((), dtype))
+            p = start.covariance
+            symmetric = (p + p.T) / 2
+            start = eqx.tree_at(lambda v: v._covariance, start, symmetric)
+            fault = fault.with_case(
+                _is_not_semidefinite(symmetric), "covariance must be positive semidefinite."
+            )
+            fault = fault.with_case(_is_not_symmetric(p), "covariance must be symmetric.")
+        zero = fault.error(jnp.zeros((), dtype))
         start = eqx.tree_at(lambda v: v.state, start, needing(zero, y0))
         return start if self.definite else start.by_rows()
 
@@ -283,7 +289,7 @@ class _Evaluation:
         self.frame = Frame.of(self.field, y, term.basis)
         self.points = self.frame.treedef.flatten_up_to(y)
         self.framed = self.frame.framed(self.field, y)
-        self.theta, self.unravel = _parameters(term, args)
+        self.theta, self.unravel = _parameters(term, args, self.dtype)
 
     @property
     def num_parameters(self) -> int:
@@ -514,16 +520,33 @@ class _Evaluation:
         return values
 
 
-def _parameters(term: VariationTerm, args: PyTree) -> tuple[Any, Any]:
+def _parameters(term: VariationTerm, args: PyTree, dtype: Any) -> tuple[Any, Any]:
     if term.parameters is None:
         return None, None
-    nodes = jtu.tree_map(jnp.asarray, term.parameters(args))
-    leaves = jtu.tree_leaves(nodes)
+    nodes = term.parameters(args)
+    try:
+        # A Python number takes the precision of the state.
+        arrays = jtu.tree_map(
+            lambda x: jnp.asarray(x, dtype if isinstance(x, float) else None), nodes
+        )
+        eqx.tree_at(term.parameters, args, arrays)
+    except (TypeError, ValueError) as error:
+        raise TypeError(
+            "parameters must be a place in args, as for equinox.tree_at, such as "
+            f'lambda args: args["bias"], got a function that returns {describe(nodes)}: {error}'
+        ) from error
+    leaves = jtu.tree_leaves(arrays)
     if not leaves or not all(jnp.issubdtype(x.dtype, jnp.floating) for x in leaves):
         raise TypeError(
-            f"parameters must be a place in args with real floating numbers, got {describe(nodes)}."
+            "parameters must be a place in args with real floating numbers, got "
+            f"{describe(arrays)}."
         )
-    return ravel_pytree(nodes)
+    if any(x.dtype != dtype and not x.weak_type for x in leaves):
+        raise TypeError(
+            f"parameters must have the precision of the state, {dtype}, got {describe(arrays)}: "
+            "convert what args has there with jnp.asarray(x, y0.dtype)."
+        )
+    return ravel_pytree(jtu.tree_map(lambda x: x.astype(dtype), arrays))
 
 
 def _are_alike(a: PyTree, b: PyTree) -> bool:

@@ -973,6 +973,14 @@ def test_a_chunk_size_of_numpy(no_shape_hook):
     np.testing.assert_array_equal(values, [0, 2, 4])
 
 
+def test_an_empty_path_is_not_the_working_folder(tmp_path, monkeypatch, no_shape_hook):
+    monkeypatch.chdir(tmp_path)
+    for folder in ("", 3):
+        with pytest.raises(TypeError, match=f"folder must be a path or None, got {folder!r}"):
+            cfjax.map_batch(solve, members(), folder=folder)
+    assert not list(tmp_path.iterdir())
+
+
 def test_what_is_no_folder_or_no_file(tmp_path):
     path = tmp_path / "file"
     path.write_text("mine")

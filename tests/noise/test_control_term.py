@@ -583,8 +583,13 @@ def test_wrong_arguments_of_the_control_term(no_shape_hook):
         (lambda dw: dw, r"translation of type f64\[2\] for y"),
         (lambda dw: cfjax.LeftMatrix(1j * jnp.eye(3, dtype=complex)), "make y0 complex"),
         (lambda dw: cfjax.LeftMatrix(jnp.zeros((2, 2))), "does not act there"),
+        # JAX reads the second entry in the place of a third one.
+        (
+            lambda dw: cfjax.Rotation(jnp.stack([dw[0], dw[1], dw[2]])),
+            r"reads an entry that its increment does not have, .* f64\[2\]: index 2 is out of",
+        ),
     ],
-    ids=["structure", "None", "shape", "complex", "field"],
+    ids=["structure", "None", "shape", "complex", "field", "index"],
 )
 def test_fields_that_do_not_fit_the_state(field, message, no_shape_hook):
     term = terms(cfjax.LieControlTerm(lambda t, y, args, dw: field(dw), GIVEN))
