@@ -166,16 +166,17 @@ class WorkPrecision(NamedTuple):
         best, upper = np.percentile(self.seconds, (0, 75), axis=-1)
         spread = [f" +{excess:.0%}" for excess in upper / best - 1]
         times = [f"{1e3 * x:.3g}{excess}" for x, excess in zip(best, spread, strict=True)]
+        # Short headings, so that adaptive runs with all columns fit into 80 characters.
         columns = {
             "tol": [f"{x:.0e}" for x in self.tolerance],
             "error": [f"{x:.1e}" for x in self.error],
             "slope": [f"{x:.2f}" for x in self.slopes()],
             "steps": [f"{x:.0f}" for x in self.num_steps],
-            "rejected": [f"{x:.0f}" for x in self.num_rejected] if is_adaptive else [],
+            "re-\njected": [f"{x:.0f}" for x in self.num_rejected] if is_adaptive else [],
             "evals": [f"{x:.6g}" for x in self.num_evaluations],
             "flows": [f"{x:.6g}" for x in self.num_flows],
             "flops": [f"{x:.2e}" for x in self.flops],
-            "compile\n(s)": [f"{x:.2f}" for x in self.compile_seconds],
+            "com-\npile\n(s)": [f"{x:.1f}" for x in self.compile_seconds],
             "time\n(ms)": times,
         }
         for heading, cells in columns.items():

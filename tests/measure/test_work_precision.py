@@ -473,7 +473,22 @@ def test_the_table_has_every_row(equal, adaptive):
     text = rendered(equal.table())
     assert [text.count(name) for name in ("CF4", "CG3", "RKMK4", "Tsit5")] == [3] * 4
     text = rendered(adaptive.table())
-    assert "rejected" in text and text.count("Tsit5") == 2
+    assert "jected" in text and text.count("Tsit5") == 2
+
+
+def test_a_table_of_every_column_is_not_cut():
+    """On a terminal of 80 columns, with numbers as long as those of heat conduction."""
+    work = made_up(["Kvaerno5"] * 2, [1e-7, 1e-8], [1317, 1803], 390.0, np.array([1e-6, 1e-7]))
+    work = work._replace(
+        num_evaluations=np.full(2, 158004.0),
+        num_flows=np.full(2, 23706.0),
+        flops=np.full(2, 6.17e7),
+        compile_seconds=np.full(2, 19.76),
+        seconds=np.array([[0.0141, 0.023]] * 2),
+    )
+    text = io.StringIO()
+    Console(width=80, file=text).print(work.table())
+    assert "slope" in text.getvalue() and "…" not in text.getvalue()
 
 
 def test_the_table_leaves_out_what_is_not_known(equal):
