@@ -1,7 +1,9 @@
 """The spectral radius of a field on a manifold, by power iteration."""
 
+import functools
 import math
-from typing import Any
+from collections.abc import Callable
+from typing import Any, NamedTuple
 
 import diffrax
 import jax
@@ -12,9 +14,16 @@ from jax import lax
 from jaxtyping import Array, PyTree, Real
 
 from .._term import velocity
+from .base import size
 
 # An iteration from a random start reaches some 9 tenths of the radius in so many rounds.
-FIRST_ITERATIONS = 30
+_FIRST_ITERATIONS = 30
+# A growth that rises by less has settled. A mode beside the vector that is twice as stiff shows in
+# it from some 5 % on.
+_RISE = 1.001
+# How much of other directions is mixed into the vector. With 0.1 the growth settles at 0.97 of the
+# radius, as far as 30 iterations lead from a random start.
+_OTHERS = 0.1
 
 
 def spectral_radius(
@@ -32,7 +41,7 @@ def spectral_radius(
 
     **Cost:** 30 evaluations of the field and its derivative in one direction.
     """
-    return iterated(term, t, y, args, start_vector(y), FIRST_ITERATIONS)[0]
+    return first_iteration(term, t, y, args).growth
 
 
 def start_vector(y: PyTree) -> PyTree:
@@ -57,10 +66,56 @@ def _noise(shape: tuple[int, ...], dtype: Any, seed: int) -> Array:
     return x.astype(dtype) / 2.0**31 - 1
 
 
-def iterated(
-    term: diffrax.AbstractTerm, t: Any, y: PyTree, args: PyTree, vector: PyTree, number: int
-) -> tuple[Real[Array, ""], PyTree]:
-    """The growth in the last of so many iterations, and the vector after it."""
+class Iteration(NamedTuple):
+    """The growth in a power iteration, and the vector of length one after it."""
+
+    growth: Real[Array, ""]
+    vector: PyTree
+
+
+def first_iteration(term: diffrax.AbstractTerm, t: Any, y: PyTree, args: PyTree) -> Iteration:
+    """The last of 30 from a random start."""
+    iterate = _iteration(term, t, y, args)
+    vector = start_vector(y)
+    start = Iteration(jnp.zeros((), _dtype(vector)), vector)
+    return lax.scan(lambda x, _: (iterate(x.vector), None), start, length=_FIRST_ITERATIONS)[0]
+
+
+def next_iteration(
+    term: diffrax.AbstractTerm, t: Any, y: PyTree, args: PyTree, last: Iteration, direction: PyTree
+) -> Iteration:
+    """One at another time and state, or as many as the growth rises for.
+
+    A vector has no part in modes that were not there in the iterations before, such as those of a
+    diffusion that is switched on. So the random start is mixed into it, and a direction.
+    """
+    iterate = _iteration(term, t, y, args)
+    others = jtu.tree_map(jnp.add, start_vector(y), _normalised(lax.stop_gradient(direction))[1])
+
+    def rises(carry: tuple[Any, Any, Iteration]) -> Any:
+        k, before, now = carry
+        return (k == 0) | ((now.growth > _RISE * before) & (k < _FIRST_ITERATIONS))
+
+    def again(carry: tuple[Any, Any, Iteration]) -> tuple[Any, Any, Iteration]:
+        k, _, now = carry
+        mixed = jtu.tree_map(lambda a, b: a + _OTHERS * b, now.vector, others)
+        return k + 1, now.growth, iterate(_normalised(mixed)[1])
+
+    # A batch takes as many as the member that needs most, and no more where none needs more.
+    return lax.while_loop(rises, again, (jnp.zeros((), jnp.int32), last.growth, last))[2]
+
+
+def rate_along(
+    term: diffrax.AbstractTerm, t: Any, y: PyTree, args: PyTree, direction: PyTree
+) -> Real[Array, ""]:
+    """How fast the velocity changes in a direction: a mean of the rates of the modes in it."""
+    return _iteration(term, t, y, args)(_normalised(direction)[1]).growth
+
+
+def _iteration(
+    term: diffrax.AbstractTerm, t: Any, y: PyTree, args: PyTree
+) -> Callable[[PyTree], Iteration]:
+    """An iteration at a point, of a vector of length one."""
 
     def velocity_at(z: PyTree) -> PyTree:
         # Along the frame of the point y: that is DF T, with the eigenvalues of T DF.
@@ -70,22 +125,34 @@ def iterated(
     velocity_at, constants = jax.closure_convert(velocity_at, y)
     y, constants = lax.stop_gradient((y, constants))
 
-    def iteration(vector: PyTree) -> tuple[Real[Array, ""], PyTree]:
-        return _normalised(jax.jvp(lambda z: velocity_at(z, *constants), (y,), (vector,))[1])
+    def iterate(vector: PyTree) -> Iteration:
+        image = jax.jvp(lambda z: velocity_at(z, *constants), (y,), (vector,))[1]
+        growth, new = _normalised(image)
+        # Zero has no direction, and would stay zero.
+        new = jtu.tree_map(lambda a, b: jnp.where(growth == 0, b, a), new, vector)
+        return Iteration(growth, new)
 
-    if number == 1:
-        return iteration(vector)
-    zero = jnp.zeros((), _dtype(vector))
-    return lax.scan(lambda carry, _: (iteration(carry[1]), None), (zero, vector), length=number)[0]
+    return iterate
+
+
+def largest(x: PyTree) -> Real[Array, ""]:
+    """The largest modulus of an entry."""
+    dtype = _dtype(x)
+    sizes = [size(a).astype(dtype) for a in jtu.tree_leaves(x)]
+    return functools.reduce(jnp.maximum, sizes, jnp.zeros((), dtype))
 
 
 def _normalised(x: PyTree) -> tuple[Real[Array, ""], PyTree]:
     """The length, and the vector of length one in its direction, or zero."""
-    dtype = _dtype(x)
+    dtype, most = _dtype(x), largest(x)
+    # Squares of entries above 1e-19 alone are not zero in single precision.
+    is_zero = most < jnp.finfo(dtype).tiny
+    scale = jnp.where(is_zero, 1, most)
+    x = jtu.tree_map(lambda a: jnp.where(is_zero, 0, a / scale.astype(a.dtype)), x)
     squares = [jnp.sum(jnp.real(a * jnp.conj(a))).astype(dtype) for a in jtu.tree_leaves(x)]
     length = jnp.sqrt(sum(squares, start=jnp.zeros((), dtype)))
-    factor = 1 / jnp.where(length > 0, length, 1)
-    return length, jtu.tree_map(lambda a: a * factor.astype(a.dtype), x)
+    factor = 1 / jnp.where(is_zero, 1, length)
+    return scale * length, jtu.tree_map(lambda a: a * factor.astype(a.dtype), x)
 
 
 def _dtype(x: PyTree) -> Any:

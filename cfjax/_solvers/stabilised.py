@@ -14,17 +14,19 @@ import numpy as np
 from jax import lax
 from jax.extend.core import Primitive
 from jax.interpreters import ad, batching, mlir
-from jaxtyping import Array, PyTree, Real
+from jaxtyping import Array, Bool, PyTree, Real
 
 from .._control_term import is_driven
 from .._field import combine, is_field, tangent
 from .._fields.semilinear import AbstractSemilinearField
 from .._methods.tableau import ContinuousExtension
 from .._numerics.checks import Fault
-from .base import State
+from .._numerics.squaring import max_over_batch
+from .._term import velocity
+from .base import State, evaluation_times, finite_if_complex, result_of
 from .compiled import chosen, over_stages, scalarised, scan_list
 from .dense import Path
-from .spectral_radius import FIRST_ITERATIONS, iterated, start_vector
+from .spectral_radius import Iteration, first_iteration, largest, next_iteration, rate_along
 from .stacked import cast_like
 from .stages import is_uniform
 from .step import AbstractChartSolver, Chart, Step
@@ -36,18 +38,21 @@ _SAFETY = 1.1
 _LEAST_RATIO = 0.9
 
 
-class _Iteration(NamedTuple):
-    """The spectral radius, and the vector that the next power iteration begins with."""
-
-    radius: Real[Array, ""]
-    vector: PyTree
+# How many times the mean velocity of a step that at its end must be for a look at its modes. Of a
+# mode at the end of the range it is half the rate or more, and of smooth motion about one.
+_MUCH_FASTER = 3
+# By how much the rate of the modes in it may be beyond the range, over the step: there a step
+# multiplies them by 4 to 7.
+_BEYOND = 2
 
 
 class _State(State):
     # None where the radius is not estimated.
-    iteration: _Iteration | None
+    iteration: Iteration | None
     # The most stages that a step needed, or None where they are given.
     most: Real[Array, ""] | None
+    # Whether a step was unstable, or None where nothing tells.
+    is_unstable: Bool[Array, ""] | None
 
 
 class AbstractStabilised(AbstractChartSolver, diffrax.AbstractAdaptiveSolver):
@@ -132,6 +137,13 @@ class AbstractStabilised(AbstractChartSolver, diffrax.AbstractAdaptiveSolver):
     def ended(self, solver_state, fault):
         if self.stages is not None:
             return fault
+        if solver_state.is_unstable is not None:
+            fault = fault.with_case(
+                solver_state.is_unstable,
+                "A step was unstable, as the spectral radius grew within it or faster than its "
+                "estimate follows. Take more steps, or give a bound on it (spectral_radius) or "
+                "the number of stages (stages).",
+            )
         for level in (1, 2, 5, 10, 100, 1000):
             limit = level * self.max_stages
             fault = fault.with_case(
@@ -144,45 +156,64 @@ class AbstractStabilised(AbstractChartSolver, diffrax.AbstractAdaptiveSolver):
     def start(self, terms, t0, t1, y0, args) -> tuple[_State, Fault]:
         state, fault = super().start(terms, t0, t1, y0, args)
         if self.spectral_radius is not None:
-            radius = self._radius(terms, t0, y0, args, None)
+            radius = self._radius(t0, y0, args, None)
             fault = fault.with_case(
                 ~(radius >= 0),
                 "spectral_radius must not be negative, got a negative number or NaN at the start.",
             )
         iteration = None
         if self.stages is None and self.spectral_radius is None:
-            vector = start_vector(y0)
-            iteration = _Iteration(*iterated(terms, t0, y0, args, vector, FIRST_ITERATIONS))
+            iteration = first_iteration(terms, t0, y0, args)
         most = None
         if self.stages is None:
-            z = jnp.abs(t1 - t0) * self._radius(terms, t0, y0, args, iteration)
+            z = jnp.abs(t1 - t0) * self._radius(t0, y0, args, iteration)
             most = jnp.zeros((), z.dtype)
-        return _State(state.compensation, state.first, None, iteration, most), fault
+        is_unstable = None if iteration is None else jnp.zeros((), bool)
+        return _State(state.compensation, state.first, None, iteration, most, is_unstable), fault
 
-    def _radius(self, terms, t0, y0, args, iteration: _Iteration | None) -> Real[Array, ""]:
+    def _radius(self, t, y, args, iteration: Iteration | None) -> Real[Array, ""]:
         if iteration is not None:
-            return _SAFETY * iteration.radius
+            return _SAFETY * iteration.growth
         radius = self.spectral_radius
-        return lax.stop_gradient(jnp.asarray(radius(t0, y0, args) if callable(radius) else radius))
+        return lax.stop_gradient(jnp.asarray(radius(t, y, args) if callable(radius) else radius))
 
     def step(self, terms, t0, t1, y0, args, solver_state, made_jump):
         self.for_terms(terms)
-        solver, iteration, most = self, solver_state.iteration, solver_state.most
+        solver: Any = self
+        number: Any = self.stages
+        iteration, most = solver_state.iteration, solver_state.most
+        start, end = evaluation_times(t0, t1)
         if iteration is not None:
-            radius, vector = iterated(terms, t0, y0, args, iteration.vector, 1)
-            radius = jnp.maximum(radius, _LEAST_RATIO * iteration.radius)
-            iteration = _Iteration(radius, vector)
+            # At the end of the step, as it may grow with time.
+            first = velocity(terms, _first(solver_state, terms, start, y0, args), y0)
+            now = next_iteration(terms, end, y0, args, iteration, first)
+            iteration = now._replace(
+                growth=jnp.maximum(now.growth, _LEAST_RATIO * iteration.growth)
+            )
         if self.stages is None:
-            z = jnp.abs(t1 - t0) * self._radius(terms, t0, y0, args, iteration)
+            radius = self._radius(end, y0, args, iteration)
+            if callable(self.spectral_radius):
+                radius = jnp.maximum(self._radius(start, y0, args, None), radius)
+            z = jnp.abs(t1 - t0) * radius
             number = _stages_for(z, self.twice_index)
             # Not NaN, of states after a step that failed.
             most = jnp.where(number > most, number, most)
             is_possible = number <= self.max_stages
-            solver: Any = self._with(stiffness=jnp.where(is_possible, z, jnp.nan))
+            solver = self._with(stiffness=jnp.where(is_possible, z, jnp.nan))
         y1, error, dense_info, state, result = AbstractChartSolver.step(
             solver, terms, t0, t1, y0, args, solver_state, made_jump
         )
-        state = _State(state.compensation, state.first, state.zero, iteration, most)
+        is_unstable = solver_state.is_unstable
+        if iteration is not None:
+            range_ = _reach(number, self.twice_index)
+            last = _first(state, terms, end, y1, args)
+            now_unstable = _is_unstable(range_, terms, t0, t1, y0, y1, args, last)
+            # As above the estimate of an impossible step.
+            zero = jnp.where(now_unstable, jnp.nan, 0.0)
+            y1, error = jtu.tree_map(lambda x: x + zero.astype(x.dtype), (y1, error))
+            error, result = finite_if_complex(error), result_of(y1)
+            is_unstable = is_unstable | now_unstable
+        state = _State(state.compensation, state.first, state.zero, iteration, most, is_unstable)
         return y1, error, dense_info, state, result
 
     def step_in(self, chart):
@@ -425,6 +456,33 @@ class RKL3(AbstractStabilised):
         p, q, e = a / 2 + 2 / 3, a / 2 - 2 / 3, (1 - a) / 2
         error = combine((a - 1, a - 1, 1 - a), (v1, v2, u))
         return _Elements((v1, v2, u), [(p, q, e), (q, p, e)], lambda last: error)
+
+
+def _first(state: State, terms: Any, t: Any, y: PyTree, args: PyTree) -> PyTree:
+    """The value of the field where a step begins, which the last step has unless it may jump."""
+    return terms.vf(t, y, args) if state.first is None else state.first
+
+
+def _is_unstable(
+    range_: Any, terms: Any, t0: Any, t1: Any, y0: PyTree, y1: PyTree, args: PyTree, last: PyTree
+) -> Bool[Array, ""]:
+    """Whether a step with this range has made modes beyond it large; `last` is the field at y1.
+
+    They are fast, so they stand out in the velocity at the end, and its mean rate is theirs.
+    """
+    h, y0, y1, last = lax.stop_gradient((jnp.abs(t1 - t0), y0, y1, last))
+    direction = velocity(terms, last, y1)
+    fast, moved = h * largest(direction), largest(jtu.tree_map(jnp.subtract, y1, y0))
+    # Rounding of a state at rest is fast too.
+    rounding = jnp.sqrt(jnp.finfo(fast.dtype).eps) * largest(y1)
+    is_fast = fast > jnp.maximum(_MUCH_FASTER * moved, rounding)
+    # In the middle, as the field may be another one from the end on. Seldom: in a batch too.
+    rate = lax.cond(
+        max_over_batch(is_fast.astype(jnp.int32)) > 0,
+        lambda: h * rate_along(terms, t0 + (t1 - t0) / 2, y1, args, direction),
+        lambda: jnp.zeros_like(fast),
+    )
+    return is_fast & (rate > range_ + _BEYOND)
 
 
 def _check_fields(solver: AbstractStabilised, chart: Chart) -> None:

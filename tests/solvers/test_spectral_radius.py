@@ -103,6 +103,15 @@ def test_spectral_radius_in_single_precision_and_of_nothing():
     assert value == found(lambda t, y, args: -jnp.arange(8, dtype=np.float32) * y, y)
 
 
+@pytest.mark.parametrize("scale", [1e-30, 1e30])
+def test_a_radius_whose_square_is_no_number_in_single_precision(scale):
+    """Which is zero or infinite."""
+    rates = scale * np.arange(1, 9, dtype=np.float32)
+    y = jnp.zeros(8, np.float32)
+    value = found(lambda t, y, args: -rates * y, y, t=jnp.zeros((), "f4"))
+    np.testing.assert_allclose(value, 8 * scale, rtol=1e-3)
+
+
 def test_spectral_radius_without_x64():
     """In JAX's default settings, in which integers have 32 bits."""
     term = cfjax.LieTerm(lambda t, y, args: -jnp.arange(1, 5, dtype=y.dtype) * y)

@@ -12,6 +12,7 @@ import numpy as np
 import optimistix as optx
 import problems
 import pytest
+import scipy.integrate
 from solver_table import solvers
 
 import cfjax
@@ -647,6 +648,205 @@ def test_the_estimated_radius_follows_the_state():
     np.testing.assert_allclose(sol.ys["rate"][-1], 1000, rtol=1e-3)
     np.testing.assert_allclose(sol.ys["y"][-1], 1, rtol=1e-3)
     assert sol.stats["num_rejected_steps"] < 0.2 * sol.stats["num_steps"]
+
+
+# A spectral radius that grows
+
+N_CELLS = 64
+
+
+def pulse(t):
+    """On for a fifth of the time at both ends."""
+    is_on = (t < 0.2) | (t > 0.8)
+    return jnp.where(is_on, jnp.sin(np.pi * t / 0.2) ** 2, 0.0)
+
+
+def switched(t, y, p):
+    """Diffusion that is switched on, in three ways, and nonlinear diffusion with a source."""
+    kappa = p[0] * jnp.sin(10 * t) ** 2 + p[1] * t + p[2] * pulse(t)
+    w = jnp.pad(p[3] * y**2, 1)
+    source = 10 * p[3] * jnp.sin(np.pi * np.arange(1, N_CELLS + 1) / (N_CELLS + 1))
+    of_square = (N_CELLS + 1) ** 2 * (w[2:] - 2 * w[1:-1] + w[:-2])
+    return kappa * diffusion(N_CELLS)(t, y, None) + of_square + source.astype(y.dtype)
+
+
+def exact_radius(t, y, p):
+    """Or a bound, for the nonlinear one."""
+    kappa = p[0] * jnp.sin(10 * t) ** 2 + p[1] * t + p[2] * pulse(t)
+    of_square = 8 * (N_CELLS + 1) ** 2 * p[3] * jnp.max(jnp.abs(y))
+    return N_CELLS * (N_CELLS - 1) * kappa + of_square
+
+
+def matrix_of_diffusion(n):
+    k = np.arange(1, n) * (n - np.arange(1, n))
+    gradient = np.diff(np.eye(n), axis=0)
+    return -gradient.T @ np.diag(k) @ gradient
+
+
+def diffused(n, y0, integral):
+    """By the modes, from the integral of the diffusivity."""
+    rates, modes = np.linalg.eigh(matrix_of_diffusion(n))
+    return modes @ (np.exp(rates * integral) * (modes.T @ y0))
+
+
+@functools.lru_cache
+def switched_problems():
+    """The weights, the start and the exact end at t = 1, of each."""
+    rough = np.random.default_rng(0).normal(size=N_CELLS)
+
+    def nonlinear(t, y):
+        w = np.pad(y**2, 1)
+        source = 10 * np.sin(np.pi * np.arange(1, N_CELLS + 1) / (N_CELLS + 1))
+        return (N_CELLS + 1) ** 2 * (w[2:] - 2 * w[1:-1] + w[:-2]) + source
+
+    zero = np.zeros(N_CELLS)
+    steady = scipy.integrate.solve_ivp(
+        nonlinear, (0, 1), zero, method="LSODA", rtol=1e-9, atol=1e-10
+    ).y[:, -1]
+    return {
+        "sine": ([1.0, 0, 0, 0], rough, diffused(N_CELLS, rough, 0.5 - np.sin(20) / 40)),
+        "ramp": ([0, 1.0, 0, 0], rough, diffused(N_CELLS, rough, 0.5)),
+        "pulses": ([0, 0, 1.0, 0], rough, diffused(N_CELLS, rough, 0.2)),
+        "from zero": ([0, 0, 0, 1.0], zero, steady),
+    }
+
+
+@pytest.mark.parametrize(
+    "name, dtype", [(name, float) for name in SOLVERS] + [("RKL2", np.float32)]
+)
+def test_equal_steps_of_a_diffusion_that_is_switched_on(name, dtype):
+    """The radius is zero at the start: of a state at zero, or of a diffusivity that is."""
+
+    @jax.jit
+    def end(y0, p):
+        term = cfjax.LieTerm(switched)
+        return cfjax.integrate(term, SOLVERS[name](), 0.0, 1.0, y0, p, num_steps=80).ys[-1]
+
+    for p, y0, exact in switched_problems().values():
+        found = end(jnp.asarray(y0, dtype), jnp.asarray(p, dtype))
+        # The error of the methods, of second order: some (1/80)^2 times 2. An unstable step leaves
+        # 1e20.
+        np.testing.assert_allclose(found, exact, rtol=0, atol=3e-4)
+
+
+def test_controlled_steps_of_a_diffusion_that_is_switched_on_are_as_with_the_radius():
+    def counts(solver):
+        @jax.jit
+        def run(y0, p):
+            sol = solve(switched, solver, 1.0, y0, p, 1e-3, max_steps=2000)
+            return sol.ys[-1], sol.stats["num_steps"]
+
+        for name in ("sine", "ramp", "from zero"):
+            p, y0, exact = switched_problems()[name]
+            y, number = run(jnp.asarray(y0), jnp.asarray(p))
+            # A few times the tolerance, as errors of steps add up.
+            np.testing.assert_allclose(y, exact, rtol=0, atol=1e-2)
+            yield int(number)
+
+    estimated, given = counts(cfjax.RKL2()), counts(cfjax.RKL2(spectral_radius=exact_radius))
+    for found, expected in zip(estimated, given, strict=True):
+        assert found < 1.25 * expected
+
+
+def test_a_radius_of_a_function_is_that_of_both_ends_of_a_step():
+    """At t = 0 it is zero, and 20 steps of a sine with a period of 0.3 are few."""
+    p, y0, exact = switched_problems()["sine"]
+    solver = cfjax.RKL2(spectral_radius=exact_radius)
+    found = cfjax.integrate(
+        cfjax.LieTerm(switched), solver, 0.0, 1.0, jnp.asarray(y0), jnp.asarray(p), num_steps=20
+    ).ys[-1]
+    # Of second order: some 16 times that of 80 steps.
+    np.testing.assert_allclose(found, exact, rtol=0, atol=5e-3)
+
+
+def beside(t, y, p):
+    """A diffusion, and one beside it that is switched on at a time."""
+    slow, fast, start = p
+    by = diffusion(N_CELLS)
+    is_on = jnp.where(t >= start, 1.0, 0.0)
+    return {"a": slow * by(t, y["a"], None), "b": fast * is_on * by(t, y["b"], None)}
+
+
+def test_a_batch_in_which_parts_are_switched_on_later_is_as_its_members():
+    """2 and 10 times as stiff as what is on from the start, within a step and at its end."""
+    rough = np.random.default_rng(1).normal(size=(2, N_CELLS))
+    y0 = {"a": jnp.asarray(rough[0]), "b": jnp.asarray(rough[1])}
+    # Slow, fast, start.
+    members = jnp.array([[0.5, 1.0, 0.5], [0.1, 1.0, 0.613], [0.1, 1.0, 2.0], [0.1, 0.0, 0.0]])
+
+    @jax.jit
+    def end(p):
+        sol = cfjax.integrate(cfjax.LieTerm(beside), cfjax.RKL2(), 0.0, 1.0, y0, p, num_steps=100)
+        return sol.ys["a"][-1], sol.ys["b"][-1]
+
+    found = jax.jit(jax.vmap(end))(members)
+    for k, (slow, fast, start) in enumerate(np.asarray(members)):
+        a, b = (leaf[k] for leaf in found)
+        np.testing.assert_allclose(a, end(members[k])[0], rtol=0, atol=1e-12)
+        np.testing.assert_allclose(b, end(members[k])[1], rtol=0, atol=1e-12)
+        np.testing.assert_allclose(a, diffused(N_CELLS, rough[0], slow), rtol=0, atol=1e-3)
+        exact = diffused(N_CELLS, rough[1], fast * max(1 - start, 0))
+        # A start within a step is off by part of a step, with rates of 2 of what is left.
+        np.testing.assert_allclose(b, exact, rtol=0, atol=1e-3 if start != 0.613 else 2e-2)
+
+
+def test_reverse_mode_of_a_diffusion_that_is_switched_on():
+    rough = np.random.default_rng(2).normal(size=(2, N_CELLS))
+
+    def value(rate):
+        term = cfjax.LieTerm(lambda t, y, rate: rate * t * diffusion(N_CELLS)(t, y, None))
+        y0 = jnp.asarray(rough[0])
+        y = cfjax.integrate(term, cfjax.RKL2(), 0.0, 1.0, y0, rate, num_steps=60).ys[-1]
+        return jnp.vdot(rough[1], y)
+
+    slope = matrix_of_diffusion(N_CELLS) @ diffused(N_CELLS, rough[0], 0.5) / 2
+    expected = np.vdot(rough[1], slope)
+    # As accurate as the solution.
+    np.testing.assert_allclose(jax.jit(jax.grad(value))(1.0), expected, rtol=1e-2)
+
+
+def with_rate(t, y, args):
+    """The diffusivity is part of the state, and grows from zero: a step does not foresee it."""
+    by = diffusion(N_CELLS)
+    return {"rate": args + 0 * y["rate"], "y": y["rate"] * by(t, y["y"], None)}
+
+
+@names
+def test_a_step_that_is_unstable_as_the_radius_grew_is_an_error(name):
+    rough = np.random.default_rng(3).normal(size=N_CELLS)
+    start = {"rate": jnp.zeros(()), "y": jnp.asarray(rough)}
+
+    def run(rate, throw):
+        return cfjax.integrate(
+            cfjax.LieTerm(with_rate), SOLVERS[name](), 0.0, 1.0, start, rate, num_steps=20,
+            throw=throw,
+        )  # fmt: skip
+
+    with pytest.raises(RuntimeError, match=r"unstable.*more steps.*spectral_radius.*stages"):
+        run(jnp.asarray(20.0), True)
+    sol = run(jnp.asarray(20.0), False)
+    assert sol.result != diffrax.RESULTS.successful
+    assert np.isnan(sol.ys["y"]).all()
+    # What so many steps do resolve.
+    y = run(jnp.asarray(0.5), True).ys["y"][-1]
+    np.testing.assert_allclose(y, diffused(N_CELLS, rough, 0.25), rtol=0, atol=1e-2)
+
+
+@pytest.mark.parametrize("tolerance", [1e-3, 1e30])
+def test_a_step_that_is_unstable_as_the_radius_grew_is_taken_again(tolerance):
+    """Whatever the tolerance says of it."""
+    rough = np.random.default_rng(3).normal(size=N_CELLS)
+    start = {"rate": jnp.zeros(()), "y": jnp.asarray(rough)}
+    sol = diffrax.diffeqsolve(
+        cfjax.LieTerm(with_rate), cfjax.RKL2(), 0.0, 1.0, 0.25, start, jnp.asarray(5.0),
+        stepsize_controller=diffrax.PIDController(rtol=0.0, atol=tolerance),
+    )  # fmt: skip
+    assert sol.stats["num_rejected_steps"] > 0
+    # Nothing grows in a stable step.
+    assert np.abs(sol.ys["y"]).max() < np.abs(rough).max()
+    exact = diffused(N_CELLS, rough, 2.5)
+    if tolerance < 1:
+        np.testing.assert_allclose(sol.ys["y"][-1], exact, rtol=0, atol=10 * tolerance)
 
 
 # More stages than there may be
