@@ -97,9 +97,9 @@ def integrate(
 
     **Raises:** `TypeError` or `ValueError` for arguments of wrong type or value. A runtime error if
     `y0` or a saved state has an entry that is not finite, if `y0` is off the manifold that a field
-    acts on, if a time is NaN, if a step is shorter than the rounding of a time, if the solver
-    reports a failure, or if the steps back miss an array of the start by more than half of its
-    digits.
+    acts on, if a time is NaN or infinite, if a step is shorter than the rounding of a time, if the
+    solver reports a failure, or if the steps back miss an array of the start by more than half of
+    its digits.
     """
     check_term_and_solver(term, solver)
     check_own_tolerances(solver)
@@ -113,6 +113,8 @@ def integrate(
         raise TypeError(f"save_initial must be a bool, got {save_initial!r}.")
     if checkpoint_every is not None:
         checkpoint_every = count("checkpoint_every", checkpoint_every)
+    if not isinstance(throw, bool):
+        raise TypeError(f"throw must be a bool, got {throw!r}.")
     if not isinstance(step_back, bool):
         raise TypeError(f"step_back must be a bool, got {step_back!r}.")
     if step_back and checkpoint_every is not None:
@@ -221,8 +223,10 @@ def equal_steps(
         f"many steps coincide in {t0.dtype}. Take fewer steps, shift the times towards zero, or "
         "make y0 float64.",
     )
-    is_infinite = jnp.isinf(t0) | jnp.isinf(t1)
-    fault = fault.with_case(is_infinite, "t0 and t1 must be finite, got infinity.")
+    for name, t in (("t0", t0), ("t1", t1)):
+        fault = fault.with_case(
+            jnp.isinf(t), f"{name} must be finite, got infinity (in {t.dtype}, that of y0)."
+        )
     is_static = isinstance(num_steps, int)
     valid_num_steps = num_steps if is_static else jnp.where(fault.number == 0, num_steps, 0)
     zero = (fault.error if throw else fault.nan)(jnp.zeros((), t0.dtype))

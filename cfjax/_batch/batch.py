@@ -83,19 +83,22 @@ def map_batch(
 
     **Raises** `TypeError` or `ValueError` if members are not arrays or differ in length, if the
     batch is empty, if members or what `solve` captures are traced, if `chunk_size < 1`, if `mesh`
-    is not a `Mesh`, if `folder` has another batch, or if there is a `folder` and `solve` calls a
-    function of the host, as `jax.pure_callback` and progress meters do; `OSError` if the folder
-    cannot be made or written to, or has a folder in place of a file;
+    is not a `Mesh`, if `folder` is no path, empty or has another batch, or if there is a `folder`
+    and `solve` calls a function of the host, as `jax.pure_callback` and progress meters do;
+    `OSError` if the folder cannot be made or written to, or has a folder in place of a file;
     `equinox.EquinoxRuntimeError`, with the number of the member, for an error raised within
     `solve`.
     """
     size = _batch_size(members)
     if not isinstance(mesh, Mesh | None):
         raise TypeError(f"mesh must be a jax.sharding.Mesh, got {mesh!r}.")
-    if not isinstance(folder, str | os.PathLike | None) or folder == "":
-        raise TypeError(
-            f'folder must be a path or None, got {folder!r}. The working folder is ".".'
-        )
+    if not isinstance(progress, bool):
+        raise TypeError(f"progress must be a bool, got {progress!r}.")
+    if folder is not None and not isinstance(folder, str | os.PathLike):
+        raise TypeError(f"folder must be a path or None, got {folder!r}.")
+    if folder == "":
+        # `Path` takes it as the working folder.
+        raise ValueError("folder must not be empty, got ''. The working folder is '.'.")
     devices = 1 if mesh is None else mesh.size
     chunk_size = -(-min(count("chunk_size", chunk_size), size) // devices) * devices
     program = Program(solve, members, chunk_size, mesh)

@@ -30,7 +30,7 @@ class ErrorNorm(eqx.Module):
 
     **Raises** `ValueError` for a scale that is not a scalar, or a structure that is not a prefix of
     the state's; `TypeError` for a scale that is not real; a runtime error for a scale that is not
-    positive.
+    positive and finite.
     """
 
     scales: PyTree
@@ -41,7 +41,10 @@ class ErrorNorm(eqx.Module):
                 raise ValueError(
                     f"scales{jtu.keystr(path)} must be a scalar, got shape {jnp.shape(scale)}."
                 )
-            if not eqx.is_array_like(scale) or jnp.iscomplexobj(scale):
+            is_real = eqx.is_array_like(scale) and jnp.issubdtype(
+                jnp.result_type(scale), jnp.number
+            )
+            if not is_real or jnp.iscomplexobj(scale):
                 raise TypeError(
                     f"scales{jtu.keystr(path)} must be a real number, got {describe(scale)}."
                 )
@@ -59,7 +62,8 @@ class ErrorNorm(eqx.Module):
 
 def _positive(scale: Any) -> Real[Array, ""]:
     scale = jnp.asarray(scale)
-    return eqx.error_if(scale, ~(scale > 0), "scales must be positive.")
+    is_positive = (scale > 0) & jnp.isfinite(scale)
+    return eqx.error_if(scale, ~is_positive, "scales must be positive and finite.")
 
 
 def _mean_square(y: PyTree) -> Real[Array, ""]:
@@ -97,7 +101,8 @@ def starting_step(
 
     **Raises** `TypeError` if the term is not a `cfjax.LieTerm` or `diffrax.ODETerm`, if the solver
     is not an instance of a diffrax solver, or if `t0`, `t1` or `atol` is not a real scalar; a
-    runtime error if `atol` is not positive.
+    runtime error if `atol` is not positive and finite, if `t0` is not finite, if `t1` is NaN, or if
+    it is infinite and the state stays at rest.
 
     Source: the algorithm of Hairer, Norsett & Wanner, Solving Ordinary Differential Equations I,
     Section II.4, with an error and a small flow that scale with the unit of time.
@@ -112,7 +117,10 @@ def starting_step(
     dtype = time_dtype(y0)
     times = {"t0": t0, "t1": t1, "atol": atol}
     t0, t1, tolerance = (time_scalar(name, x, dtype) for name, x in times.items())
-    tolerance = eqx.error_if(tolerance, ~(tolerance > 0), "atol must be positive.")
+    is_tolerance = (tolerance > 0) & jnp.isfinite(tolerance)
+    tolerance = eqx.error_if(tolerance, ~is_tolerance, "atol must be positive and finite.")
+    t0 = eqx.error_if(t0, ~jnp.isfinite(t0), "t0 must be finite.")
+    t1 = eqx.error_if(t1, jnp.isnan(t1), "t1 must be a number, got NaN.")
     length = jnp.abs(t1 - t0)
     sign = jnp.sign(t1 - t0)
 
@@ -137,4 +145,6 @@ def starting_step(
     error = speed * rate**order
     h1 = jnp.where(error > 0, (0.01 / jnp.where(error > 0, error, 1)) ** (1 / (order + 1)), length)
     step = jnp.minimum(jnp.where(speed > 0, jnp.minimum(100 * h0, h1), length), length)
+    # Only the interval limits the step from a state that stays at rest.
+    step = eqx.error_if(step, jnp.isinf(step), "t1 must be finite, as y0 is at rest.")
     return lax.stop_gradient((sign * step).astype(dtype))

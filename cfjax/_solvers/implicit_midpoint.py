@@ -1,5 +1,6 @@
 """The implicit midpoint rule at the mean of a flow: an exact Poisson map where nothing splits."""
 
+import math
 from typing import Any
 
 import diffrax
@@ -51,9 +52,12 @@ class ImplicitMidpoint(AbstractLieSolver):
     interpolation_cls = Interpolation
 
     def __check_init__(self):
-        if self.rtol is not None and not self.rtol > 0:
-            raise ValueError(f"rtol must be positive or None, got {self.rtol!r}.")
-        if not isinstance(self.max_steps, int) or self.max_steps < 1:
+        rtol = self.rtol
+        is_number = eqx.is_array_like(rtol) and not isinstance(rtol, bool)
+        if rtol is not None and not (is_number and 0 < rtol < math.inf):
+            raise ValueError(f"rtol must be positive and finite, or None, got {rtol!r}.")
+        is_int = isinstance(self.max_steps, int) and not isinstance(self.max_steps, bool)
+        if not is_int or self.max_steps < 1:
             raise ValueError(f"max_steps must be an integer from 1 on, got {self.max_steps!r}.")
 
     @property

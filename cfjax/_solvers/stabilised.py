@@ -1,6 +1,7 @@
 """Stabilised methods: explicit, with as many stages as large diffusion or relaxation takes."""
 
 import abc
+import math
 from collections.abc import Callable
 from typing import Any, ClassVar, NamedTuple
 
@@ -101,14 +102,15 @@ class AbstractStabilised(AbstractChartSolver, diffrax.AbstractAdaptiveSolver):
                 f"how many stages a step has: got {self.stages} and {radius!r}."
             )
         is_array = isinstance(radius, jax.Array) and not radius.shape
-        is_number = is_array or isinstance(radius, int | float | np.generic)
+        is_number = is_array or isinstance(radius, int | float | np.number)
+        is_number = is_number and not isinstance(radius, bool)
         if radius is not None and not is_number and not callable(radius):
             raise TypeError(
                 "spectral_radius must be a number, a function (t, y, args) or None, got "
                 f"{radius!r}."
             )
-        if isinstance(radius, int | float | np.generic) and not float(radius) >= 0:
-            raise ValueError(f"spectral_radius must not be negative, got {radius}.")
+        if isinstance(radius, int | float | np.number) and not 0 <= float(radius) < math.inf:
+            raise ValueError(f"spectral_radius must not be negative or infinite, got {radius}.")
 
     @abc.abstractmethod
     def elements(self, chart: Chart) -> "_Elements":

@@ -968,17 +968,24 @@ def test_wrong_mesh(no_shape_hook):
         cfjax.map_batch(solve, members(), mesh=4)
 
 
+@pytest.mark.parametrize(
+    ("kind", "message", "options"),
+    [
+        (ValueError, r"folder must not be empty, got ''\.", {"folder": ""}),
+        (TypeError, "folder must be a path or None, got 3", {"folder": 3}),
+        (TypeError, "progress must be a bool, got 'no'", {"progress": "no"}),
+    ],
+)
+def test_wrong_options(kind, message, options, tmp_path, monkeypatch, no_shape_hook):
+    monkeypatch.chdir(tmp_path)
+    with pytest.raises(kind, match=message):
+        cfjax.map_batch(solve, members(), **options)
+    assert not any(tmp_path.iterdir())
+
+
 def test_a_chunk_size_of_numpy(no_shape_hook):
     values, _ = cfjax.map_batch(lambda x: 2 * x, np.arange(3), chunk_size=np.int64(2))
     np.testing.assert_array_equal(values, [0, 2, 4])
-
-
-def test_an_empty_path_is_not_the_working_folder(tmp_path, monkeypatch, no_shape_hook):
-    monkeypatch.chdir(tmp_path)
-    for folder in ("", 3):
-        with pytest.raises(TypeError, match=f"folder must be a path or None, got {folder!r}"):
-            cfjax.map_batch(solve, members(), folder=folder)
-    assert not list(tmp_path.iterdir())
 
 
 def test_what_is_no_folder_or_no_file(tmp_path):

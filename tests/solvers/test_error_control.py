@@ -95,9 +95,11 @@ def test_a_part_of_small_scale_is_controlled_at_its_scale():
 def test_mistaken_scales():
     with pytest.raises(ValueError, match=r"scales\['a'\] must be a scalar, got shape \(3,\)"):
         cfjax.ErrorNorm({"a": jnp.ones(3)})
-    with pytest.raises(Exception, match="scales must be positive"):
-        cfjax.ErrorNorm(-1.0)
-    for scale in (2j, jnp.asarray(1 + 0j), "1"):
+    # An infinite scale would accept every step.
+    for scale in (-1.0, np.inf):
+        with pytest.raises(Exception, match="scales must be positive and finite"):
+            cfjax.ErrorNorm(scale)
+    for scale in (2j, jnp.asarray(1 + 0j), "1", True):
         with pytest.raises(TypeError, match=r"scales\['a'\] must be a real number, got"):
             cfjax.ErrorNorm({"a": scale, "b": 1.0})
     with pytest.raises(TypeError, match=r"scales must be a real number, got 2j"):
@@ -208,11 +210,26 @@ def test_a_first_step_of_an_endless_solve():
         assert 0.9e-6 < float(step) < 0.1
 
 
-@pytest.mark.parametrize("atol", [0.0, -1e-6, np.nan, jnp.asarray(-1.0)])
+@pytest.mark.parametrize("atol", [0.0, -1e-6, np.nan, np.inf, jnp.asarray(-1.0)])
 def test_a_first_step_needs_a_positive_tolerance(atol):
     term = cfjax.LieTerm(problems.rigid_body)
     with pytest.raises(Exception, match="atol must be positive"):
         cfjax.starting_step(term, cfjax.CF4(), 0.0, 1.0, Y0, INERTIA, atol=atol)
+
+
+@pytest.mark.parametrize(
+    ("t0", "t1", "rate", "message"),
+    [
+        (-np.inf, 0.0, 1.0, "t0 must be finite"),
+        (np.nan, 1.0, 1.0, "t0 must be finite"),
+        (0.0, np.nan, 1.0, "t1 must be a number, got NaN"),
+        (0.0, np.inf, 0.0, "t1 must be finite, as y0 is at rest"),
+    ],
+)
+def test_a_first_step_is_a_finite_number(t0, t1, rate, message):
+    term = cfjax.LieTerm(lambda t, y, args: rate * y)
+    with pytest.raises(Exception, match=message):
+        cfjax.starting_step(term, cfjax.CF4(), t0, t1, jnp.ones(1), atol=1e-6)
 
 
 def test_a_first_step_needs_a_solver_and_real_scalars(no_shape_hook):

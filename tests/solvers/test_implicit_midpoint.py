@@ -124,7 +124,12 @@ def test_batches_and_float32():
 @pytest.mark.parametrize(
     "options, text",
     [
-        ({"rtol": 0.0}, "rtol must be positive or None"),
+        ({"rtol": 0.0}, "rtol must be positive and finite, or None, got 0.0"),
+        # Any first guess would be close enough.
+        ({"rtol": np.inf}, "rtol must be positive and finite, or None, got inf"),
+        ({"rtol": True}, "rtol must be positive and finite, or None, got True"),
+        ({"rtol": "1"}, "rtol must be positive and finite, or None, got '1'"),
+        ({"max_steps": True}, "max_steps must be an integer from 1 on, got True"),
         ({"max_steps": 0}, "max_steps must be an integer"),
     ],
 )

@@ -1192,6 +1192,12 @@ def test_forward_mode_through_chosen_stages_names_what_has_it(radius):
         (TypeError, "max_stages must be an int", dict(max_stages=None)),
         (ValueError, "spectral_radius must not be negative", dict(spectral_radius=-1.0)),
         (ValueError, "spectral_radius must not be negative", dict(spectral_radius=np.nan)),
+        (
+            ValueError,
+            "spectral_radius must not be .* infinite, got inf",
+            dict(spectral_radius=np.inf),
+        ),
+        (TypeError, "spectral_radius must be .*, got True", dict(spectral_radius=True)),
         (ValueError, "not be given together", dict(stages=5, spectral_radius=1.0)),
         (TypeError, "spectral_radius must be", dict(spectral_radius="large")),
     ],
