@@ -64,6 +64,7 @@ PRIVATE_IN_TESTS = {
     "methods/test_derive.py": "what is stored, and what is derived",
     "methods/test_order_conditions.py": "words, trees and their weights",
     "numerics/test_expm_source.py": "the norms that another exponential has polynomials for",
+    "paper/test_command.py": "the command without its experiments, which take minutes",
     "paper/test_experiments.py": "numbers and figures that the command shows as text and pictures",
     "solvers/test_step.py": "coefficients within a step, for an interpreter of them",
     "test_canary.py": "tables of the names that other libraries have",

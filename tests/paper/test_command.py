@@ -8,7 +8,6 @@ from pathlib import Path
 
 import pytest
 
-from cfjax import _paper
 from cfjax.__main__ import main
 
 FILES = sorted(
@@ -54,7 +53,7 @@ def check_page(line):
 
 
 def test_the_end_says_where_to_measure_your_own(tmp_path, capsys, monkeypatch):
-    monkeypatch.setattr(_paper, "EXPERIMENTS", ())
+    monkeypatch.setattr("cfjax._paper.EXPERIMENTS", ())
     assert main(["paper", "--output", str(tmp_path)]) == 0
     check_page(capsys.readouterr().out.splitlines()[-1])
 
