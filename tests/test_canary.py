@@ -328,7 +328,7 @@ WITHOUT_ARITHMETIC = frozenset(
 )
 
 
-@pytest.mark.parametrize("name", EXAMPLES.keys() - {"abs", "sign"})
+@pytest.mark.parametrize("name", sorted(EXAMPLES.keys() - {"abs", "sign"}))
 def test_what_an_operation_is_lowered_to_tells_whether_it_computes(name):
     fun, args, _ = EXAMPLES[name]
     found = lowered.arithmetic_of(fun, *args)

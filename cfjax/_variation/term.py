@@ -222,6 +222,8 @@ class VariationTerm(diffrax.AbstractTerm):
             raise ValueError("sensitivity needs parameters, a place in args, of the VariationTerm.")
         if covariance is True:
             raise TypeError(f"covariance must be that of the start, shape {(n, n)}, got True.")
+        if log_density is True:
+            raise TypeError("log_density must be that of the start, a number, got True.")
         start = Variation(
             y0,
             matrix("transition", transition, lambda: jnp.eye(n, dtype=dtype), (n, n)),

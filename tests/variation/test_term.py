@@ -890,6 +890,7 @@ U0 = np.eye(2, dtype=complex)
         (lambda: term_of().start(0.0, Q0, ARGS, covariance=1j * np.eye(3)), "covariance must be r"),
         (lambda: term_of().start(0.0, Q0, ARGS, transition=1j * np.eye(3)), "transition must be r"),
         (lambda: term_of().start(0.0, Q0, ARGS, log_density=1j), "log_density must be real"),
+        (lambda: term_of().start(0.0, Q0, ARGS, log_density=True), "a number, got True"),
         (lambda: term_of().start("0", Q0, ARGS, transition=True), "t0 must be a real scalar"),
         (
             lambda: term_of(
