@@ -50,7 +50,8 @@ def _jumps(eqn: JaxprEqn) -> bool:
     if name in ("eq", "ne") and eqn.invars[0] is eqn.invars[1]:
         # Whether it is NaN.
         return False
-    are_inexact = (jax.dtypes.issubdtype(v.aval.dtype, np.inexact) for v in eqn.outvars)
+    avals: list[Any] = [v.aval for v in eqn.outvars]
+    are_inexact = (jax.dtypes.issubdtype(aval.dtype, np.inexact) for aval in avals)
     if name in _JUMPS or "call" in name or not all(are_inexact):
         return True
     programs = (getattr(x, "jaxpr", x) for x in jaxprs_in_params(eqn.params))

@@ -69,7 +69,8 @@ class AbstractStabilised(AbstractChartSolver, diffrax.AbstractAdaptiveSolver):
     first one of the next. Whatever the number of stages, a step keeps five arrays like the state:
     the state, the first field, two elements of the recursion and the point of an evaluation; what
     an evaluation keeps itself comes on top. `RKL3` keeps eight with given stages, ten with chosen
-    ones, as elements of parts and the middle of the step. An estimated radius takes one more.
+    ones, as elements of parts and the middle of the step. An estimated radius takes two more,
+    three with `RKL3`.
     Reverse mode works by checkpoints; forward mode needs `stages`, as it has no rule for a loop
     whose length is chosen.
     """
@@ -115,6 +116,10 @@ class AbstractStabilised(AbstractChartSolver, diffrax.AbstractAdaptiveSolver):
     @abc.abstractmethod
     def elements(self, chart: Chart) -> "_Elements":
         """The elements of the algebra along which a step moves."""
+
+    def range_of(self, z: Any) -> Any:
+        """How far a step is stable on the negative axis whose stages are chosen for z."""
+        return _reach(_stages_for(z, self.twice_index), self.twice_index)
 
     @property
     def first_same_as_last(self) -> bool:
@@ -182,7 +187,7 @@ class AbstractStabilised(AbstractChartSolver, diffrax.AbstractAdaptiveSolver):
     def step(self, terms, t0, t1, y0, args, solver_state, made_jump):
         self.for_terms(terms)
         solver: Any = self
-        number: Any = self.stages
+        z: Any = None
         iteration, most = solver_state.iteration, solver_state.most
         start, end = evaluation_times(t0, t1)
         if iteration is not None:
@@ -207,8 +212,8 @@ class AbstractStabilised(AbstractChartSolver, diffrax.AbstractAdaptiveSolver):
         )
         is_unstable = solver_state.is_unstable
         if iteration is not None:
-            range_ = _reach(number, self.twice_index)
             last = _first(state, terms, end, y1, args)
+            range_ = self.range_of(z)
             now_unstable = _is_unstable(range_, terms, t0, t1, y0, y1, args, last)
             # As above the estimate of an impossible step.
             zero = jnp.where(now_unstable, jnp.nan, 0.0)
@@ -351,9 +356,11 @@ class RKL2(_OneElement):
     - `stages`: the number of stages of every step, at least 3; an odd number damps what is stiffest
       most. None, the default, chooses it in each step from the step size and the spectral radius.
     - `spectral_radius`: the spectral radius of the field, or a bound on it (see
-      `cfjax.spectral_radius`): a number, or a function `(t, y, args)`. If it is too small, steps
-      are unstable, which error control sees. None, the default, estimates it with one power
-      iteration a step, and 30 at the start.
+      `cfjax.spectral_radius`): a number, or a function `(t, y, args)`, of which a step takes the
+      larger value at its two times, with the state at its start. If it is too small, steps are
+      unstable, which error control sees. None, the default, estimates it with 30 power iterations
+      at the start, and one a step, or up to 30 where it rises. A step that is unstable all the same
+      fails: error control takes it again, shorter, and `cfjax.integrate` raises an error.
     - `max_stages`: a step that needs more fails, before it evaluates a stage. Error control then
       takes it again, shorter. In float32 use some 50, as rounding errors grow with the square of
       the stages.
@@ -419,6 +426,10 @@ class RKL3(AbstractStabilised):
 
     def order(self, terms) -> int:
         return 3
+
+    def range_of(self, z):
+        # The halves may have stages for less.
+        return jnp.minimum(super().range_of(z), 2 * super().range_of(z / 2))
 
     def elements(self, chart):
         first, start = chart.first_field, chart.start
