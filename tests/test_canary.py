@@ -213,6 +213,7 @@ EXAMPLES: dict[str, tuple[Any, tuple[Any, ...], tuple[str, ...]]] = {
         (M,),
         ("unit_diagonal",),
     ),
+    "unstack": (jnp.unstack, (M,), ("axis",)),
     "while": (lambda x: lax.while_loop(lambda v: v[0] < 1, lambda v: v + 1, x), (X,), ()),
 }
 # One of these names, whichever this version has, with the parameter.

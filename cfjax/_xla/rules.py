@@ -36,6 +36,7 @@ _RULES: dict[str, Callable[[Call], StructOfArrays | list[StructOfArrays] | None]
     "squeeze": moves.reshaped,
     "stack": moves.stacked,
     "transpose": moves.transposed,
+    "unstack": moves.unpacked,
     **dict.fromkeys(ELEMENTWISE, arithmetic.elementwise),
     **dict.fromkeys(REDUCTIONS, arithmetic.reduced),
 }

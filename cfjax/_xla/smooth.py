@@ -29,7 +29,7 @@ _SMOOTH = frozenset(
     "cfjax_unpack complex concatenate conj copy cos cosh cumprod cumsum div dot_general erf exp "
     "exp2 expm1 fft imag integer_pow log log1p logistic mul neg pad pow real reduce_prod "
     "reduce_sum reshape rev rsqrt scatter-add scatter-mul sin sinh slice split sqrt square "
-    "squeeze stack stop_gradient sub tan tanh transpose".split()
+    "squeeze stack stop_gradient sub tan tanh transpose unstack".split()
 )
 # Which of their operands may be what a division gives. The others are indices and predicates.
 _SMOOTH_IN_PART = {

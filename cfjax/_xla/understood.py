@@ -19,7 +19,7 @@ REDUCTIONS = frozenset("reduce_and reduce_max reduce_min reduce_or reduce_prod r
 # Operations that only move entries.
 MOVES = frozenset(
     "broadcast_in_dim cfjax_pack cfjax_unpack concatenate dynamic_slice dynamic_update_slice "
-    "gather pad reshape rev scatter slice split squeeze stack transpose".split()
+    "gather pad reshape rev scatter slice split squeeze stack transpose unstack".split()
 )
 # The parameters of each operation. The rules of elementwise ones hand all of theirs on.
 _HANDED_ON = "accuracy input_dtype new_dtype out_dtype rounding_method sharding weak_type y"
@@ -47,6 +47,7 @@ _TEXTS: dict[str, str] = {
     "squeeze": "dimensions",
     "stack": "axis",
     "transpose": "permutation",
+    "unstack": "axis",
     **dict.fromkeys(ELEMENTWISE, _HANDED_ON),
     **dict.fromkeys(REDUCTIONS, "axes out_sharding"),
 }

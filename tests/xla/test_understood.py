@@ -44,6 +44,10 @@ SMALL = {
         lambda y: jnp.convolve(lax.dynamic_update_slice(y, y[:2] * y[1], (3,)), y[:3]),
         SIX,
     ),
+    "each row and each entry": (
+        lambda y: sum(a * b for a, b in jnp.unstack(y.reshape(2, 3), axis=1)) + jnp.unstack(y)[4],
+        SIX,
+    ),
     "nothing beside something": (lambda y: jnp.concatenate([y[:0], y, y[3:3]]), SIX),
     "key": (lambda y: jax.random.normal(jax.random.key(0), (6,)) * y, SIX),
     "permutation by a key": (lambda y: jax.random.permutation(jax.random.key(1), y), SIX),
