@@ -67,7 +67,7 @@ def _noise(shape: tuple[int, ...], dtype: Any, seed: int) -> Array:
 
 
 class Iteration(NamedTuple):
-    """The growth in a power iteration, and the vector of length one after it."""
+    """The growth in a power iteration, and the vector after it, of length one or zero."""
 
     growth: Real[Array, ""]
     vector: PyTree
@@ -87,7 +87,8 @@ def next_iteration(
     """One at another time and state, or as many as the growth rises for.
 
     A vector has no part in modes that were not there in the iterations before, such as those of a
-    diffusion that is switched on. So the random start is mixed into it, and a direction.
+    diffusion that is switched on, and is zero where there were none. So the random start is mixed
+    into it, and a direction in which stiff modes of the state stand out, such as the velocity.
     """
     iterate = _iteration(term, t, y, args)
     others = jtu.tree_map(jnp.add, start_vector(y), _normalised(lax.stop_gradient(direction))[1])
@@ -127,10 +128,7 @@ def _iteration(
 
     def iterate(vector: PyTree) -> Iteration:
         image = jax.jvp(lambda z: velocity_at(z, *constants), (y,), (vector,))[1]
-        growth, new = _normalised(image)
-        # Zero has no direction, and would stay zero.
-        new = jtu.tree_map(lambda a, b: jnp.where(growth == 0, b, a), new, vector)
-        return Iteration(growth, new)
+        return Iteration(*_normalised(image))
 
     return iterate
 
