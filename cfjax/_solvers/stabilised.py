@@ -44,7 +44,7 @@ _LEAST_RATIO = 0.9
 _MUCH_FASTER = 3
 # By how much the rate of the modes in it may be beyond the range, over the step: there a step
 # multiplies them by 4 to 7.
-_BEYOND = 2
+_BEYOND = 1
 
 
 class _State(State):
