@@ -50,6 +50,9 @@ def _jumps(eqn: JaxprEqn) -> bool:
     if name in ("eq", "ne") and eqn.invars[0] is eqn.invars[1]:
         # Whether it is NaN.
         return False
+    if not eqn.outvars:
+        # A print leads nowhere.
+        return False
     avals: list[Any] = [v.aval for v in eqn.outvars]
     are_inexact = (jax.dtypes.issubdtype(aval.dtype, np.inexact) for aval in avals)
     if name in _JUMPS or "call" in name or not all(are_inexact):

@@ -31,6 +31,7 @@ CONTINUOUS = {
     "comparisons of other values": jax.jit(lambda t: jnp.exp(-t) * jnp.where(TABLE > 3, TABLE, 0)),
     "functions of networks": lambda t: jax.nn.softplus(TABLE * t) + jax.nn.relu(t) + jnp.tanh(t),
     "whether it is a number": lambda t: jnp.where(jnp.isnan(t), 0.0, t),
+    "a print": lambda t: (jax.debug.print("{}", t), jnp.sin(t))[1],
     "bounds": lambda t: jnp.clip(t, 0.2, 0.4),
     "a loop": lambda t: jax.lax.scan(lambda x, a: (jnp.sin(a * x), None), t, TABLE)[0],
     "a derivative": jax.grad(lambda t: jnp.sin(t) ** 3),

@@ -950,7 +950,8 @@ def test_the_first_evaluation_is_the_last_of_the_step_before(name):
     jax.block_until_ready(y)
     jax.effects_barrier()
     assert len(times) == 1 + 4 * SOLVERS_ROWS[name].evaluations
-    assert max(times) == 1.0
+    # From within the step, by some units of rounding.
+    assert 1 - 1e-14 < max(times) < 1
 
 
 @names
