@@ -92,8 +92,6 @@ def map_batch(
     size = _batch_size(members)
     if not isinstance(mesh, Mesh | None):
         raise TypeError(f"mesh must be a jax.sharding.Mesh, got {mesh!r}.")
-    if not isinstance(progress, bool):
-        raise TypeError(f"progress must be a bool, got {progress!r}.")
     if folder is not None and not isinstance(folder, str | os.PathLike):
         raise TypeError(f"folder must be a path or None, got {folder!r}.")
     if folder == "":

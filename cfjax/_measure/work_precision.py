@@ -112,8 +112,7 @@ def work_precision(
     is_adaptive = tolerances is not None
     solvers = _checked_methods(methods, term, is_adaptive)
     repeats, max_steps = count("repeats", repeats), count("max_steps", max_steps)
-    is_number = isinstance(budget, int | float | np.number) and not isinstance(budget, bool)
-    if not is_number or not budget > 0:
+    if not isinstance(budget, int | float | np.number) or not budget > 0:
         raise ValueError(f"budget must be a positive number of seconds, got {budget!r}.")
     for name, function in (("controller", controller), ("error", error)):
         if not callable(function):
@@ -281,8 +280,7 @@ def _checked_settings(num_steps: Any, tolerances: Any) -> list[Any]:
         raise ValueError(f"{name} must have at least one entry, got none.")
     if tolerances is None:
         return [count("num_steps", n) for n in settings]
-    kinds = int | float | np.number
-    is_number = [isinstance(x, kinds) and not isinstance(x, bool) for x in settings]
+    is_number = [isinstance(x, int | float | np.number) for x in settings]
     if not all(is_number) or not all(0 < x < np.inf for x in settings):
         raise ValueError(f"tolerances must be positive and finite, got {settings}.")
     return [float(x) for x in settings]

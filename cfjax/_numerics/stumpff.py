@@ -2,7 +2,7 @@
 
 import functools
 from collections.abc import Sequence
-from math import factorial, log, pi
+from math import factorial, pi
 from typing import Any, NamedTuple
 
 import jax
@@ -48,78 +48,33 @@ def stumpff(n: int, s: Float[Array | np.ndarray, "*batch"]) -> Float[Array, "*ba
     s = jnp.asarray(s)
     if s.dtype not in (jnp.float32, jnp.float64):
         raise TypeError(f"s must be float32 or float64, got {s.dtype}.")
-    return _of_both_signs(max(n, 3), s)[n]
+    return _of_both_signs(n, s)
 
 
 @functools.partial(jax.custom_jvp, nondiff_argnums=(0,))
 @smooth
-def _of_both_signs(n: int, s: Float[Array, "*batch"]) -> tuple[Float[Array, "*batch"], ...]:
-    """The functions `c_0` to `c_n`, with a third more operations than `_stumpff_apart`.
-
-    For a negative s and `x = k log(2) + r` the powers of two in `exp(x) = 2^k exp(r)` take the
-    place of full turns. Below x = 2 there are none, as `exp(x) - 1 - x` would cancel.
-    """
-    constants = _constants(s)
-    is_square, size = s >= 0, jnp.abs(s)
-    turns, inverse = _turns(size, constants)
-    x, reciprocal = size * inverse, inverse * inverse
-    powers = jnp.where(x < 2, 0, jnp.round(x * (1 / log(2))))
-    excess = jnp.where(is_square, turns * (2 * pi), powers * log(2)) * inverse
-    scale = 1 - excess
-    square = scale * scale
-    # What is left of x has the same formulas for both signs.
-    z = s * square
-    c3 = polynomial(constants.c3, z)
-    c1 = scale - (scale * z) * c3
-    c2 = square * (0.5 - z * polynomial(constants.c4, z))
-    c0 = 1 - s * c2
-    # The reciprocal may overflow near zero.
-    c3 = (excess * inverse) * inverse + (scale * square) * c3
-    is_large = ~is_square & (powers > 0)
-    grown = _half_of_power(powers, constants) * (c0 + x * c1)
-    shrunk = _half_of_power(-powers, constants) * (c0 - x * c1)
-    c0 = jnp.where(is_large, grown + shrunk, c0)
-    c1 = jnp.where(is_large, (grown - shrunk) * inverse, c1)
-    c2 = jnp.where(is_large, (c0 - 1) * reciprocal, c2)
-    c3 = jnp.where(is_large, (c1 - 1) * reciprocal, c3)
-    reciprocal = jnp.where(is_square, reciprocal, -reciprocal)
-    return tuple(_higher(n, s, size < 16, [c0, c1, c2, c3], reciprocal))
+def _of_both_signs(n: int, s: Float[Array, "*batch"]) -> Float[Array, "*batch"]:
+    of_square = _together(*_stumpff_apart(max(n, 3), jnp.maximum(s, 0)))[n]
+    return jnp.where(s >= 0, of_square, _of_negative(n, s))
 
 
 @_of_both_signs.defjvp
 def _(n, primals, tangents):
-    c = _of_both_signs(n + 2, *primals)
-    return c[: n + 1], tuple(slope * tangents[0] for slope in _slopes(n, c))
+    value, first, second = (_of_both_signs(k, *primals) for k in (n, n + 1, n + 2))
+    return value, (n * second - first) / 2 * tangents[0]
 
 
-def _half_of_power(k: Float[Array, "*batch"], constants: "_Constants") -> Float[Array, "*batch"]:
-    """`2^(k - 1)` for an integer k, and 0 or infinity where that is out of range."""
-    info = jnp.finfo(k.dtype)
-    bits = jnp.clip(k + (info.maxexp - 2), 0, 2 * info.maxexp - 1).astype(constants.bits)
-    return lax.bitcast_convert_type(bits << info.nmant, k.dtype)
-
-
-def _higher(
-    n: int,
-    s: Float[Array, "*batch"],
-    is_small: Bool[Array, "*batch"],
-    c: Sequence[Array],
-    reciprocal: Float[Array, "*batch"],
-) -> list[Float[Array, "*batch"]]:
-    """The functions `c_0` to `c_n` from the first four, and `1 / s` where s is not small."""
-    c = list(c)
-    # The recursion loses digits to cancellation for small s, the series for large s.
-    for k in range(4, n + 1):
-        terms = [(-1) ** j / factorial(k + 2 * j) for j in range(18)]
-        series = polynomial(terms, jnp.where(is_small, s, 0))
-        recursion = (1 / factorial(k - 2) - c[k - 2]) * reciprocal
-        c.append(jnp.where(is_small, series, recursion))
-    return c
-
-
-def _slopes(n: int, c: Sequence[Array]) -> list[Array]:
-    """The derivatives of `c_0` to `c_n`, from `c_0` to `c_{n+2}`."""
-    return [(k * c[k + 2] - c[k + 1]) / 2 for k in range(n + 1)]
+def _of_negative(n: int, s: Float[Array, "*batch"]) -> Float[Array, "*batch"]:
+    """`c_n(s)` for a negative s: by its series and, from -16 on, by hyperbolic functions."""
+    is_small = s > -16
+    terms = [(-1) ** j / factorial(n + 2 * j) for j in range(18)]
+    series = polynomial(terms, jnp.where(is_small, s, 0))
+    square = jnp.where(is_small, 16, -s)
+    x = jnp.sqrt(square)
+    c = [jnp.cosh(x), jnp.sinh(x) / x]
+    for k in range(n - 1):
+        c.append((c[k] - 1 / factorial(k)) / square)
+    return jnp.where(is_small, series, c[n])
 
 
 # The square of a full turn.
@@ -190,10 +145,15 @@ def _stumpff_apart(
     d2 = (square * z) * p2 + square * ((1 - near) / 2)
     # Without a full turn the square of the inverse may overflow.
     c3 = (excess * inverse) * inverse - (scale * square) * p1
-    exponential = Exponential(near, d1, d2, c3)
-    c = _together(exponential, (1 - s * (near / 2 + d2),))
-    c = _higher(n, s, s < 16, c, inverse * inverse)
-    return exponential, (c[0], *c[4:])
+    c = {2: near / 2 + d2, 3: c3}
+    # The recursion loses digits to cancellation for small s, the series for large s.
+    small = s < 16
+    for k in range(4, n + 1):
+        terms = [(-1) ** j / factorial(k + 2 * j) for j in range(18)]
+        series = polynomial(terms, jnp.where(small, s, 0))
+        recursion = (1 / factorial(k - 2) - c[k - 2]) * (inverse * inverse)
+        c[k] = jnp.where(small, series, recursion)
+    return Exponential(near, d1, d2, c3), (1 - s * c[2], *(c[k] for k in range(4, n + 1)))
 
 
 @_stumpff_apart.defjvp
@@ -201,7 +161,7 @@ def _(n, primals, tangents):
     (s,), (s_dot,) = primals, tangents
     exponential, others = _stumpff_apart(n + 2, s)
     c = _together(exponential, others)
-    slopes = [slope * s_dot for slope in _slopes(n, c)]
+    slopes = [(k * c[k + 2] - c[k + 1]) / 2 * s_dot for k in range(n + 1)]
     tangents_out = Exponential(jnp.zeros_like(s), *slopes[1:4]), (slopes[0], *slopes[4:])
     return (exponential, others[: n - 2]), tangents_out
 
@@ -264,8 +224,6 @@ class _Constants(NamedTuple):
 
     sin: Sequence[float]  # sin(sqrt z) / sqrt z for 0 <= z <= 3.1417^2
     versin: Sequence[float]  # (1 - cos(sqrt z)) / z on the same interval
-    c3: Sequence[float]  # stumpff(3, z) for -4 <= z <= 3.1417^2
-    c4: Sequence[float]  # stumpff(4, z) on the same interval
     rsqrt: Sequence[float]  # 1 / sqrt(1 - e) for |e| <= 0.0682
     # `cotangent_excess` without its pole, for 0 <= s <= 4 pi^2.
     excess: Sequence[float]
@@ -310,18 +268,6 @@ _DOUBLE = _Constants(
         *(1.1470744505903215e-11, -4.779456606604926e-14, 1.5616675610328964e-16),
         *(-4.0910585753793584e-19, 8.062113626809763e-22),
     ),
-    c3=(
-        *(0.16666666666666666, -0.008333333333333333, 0.00019841269841269858),
-        *(-2.7557319223985926e-06, 2.5052108385401423e-08, -1.6059043836350627e-10),
-        *(7.647163762292193e-13, -2.811457884822523e-15, 8.220594377192923e-18),
-        *(-1.9551848106191658e-20, 3.66632034599463e-23),
-    ),
-    c4=(
-        *(0.041666666666666664, -0.00138888888888889, 2.4801587301587674e-05),
-        *(-2.755731922394019e-07, 2.0876756986681104e-09, -1.1470745637999605e-11),
-        *(4.779478626536974e-14, -1.561917646092497e-16, 4.106192006404996e-19),
-        *(-8.438138386051452e-22,),
-    ),
     rsqrt=(
         *(1.0, 0.500000000000004, 0.37500000000000383, 0.3124999999828909),
         *(0.2734374999836026, 0.2460937705876731, 0.22558595723120636, 0.20946255027202312),
@@ -347,11 +293,6 @@ _SINGLE = _Constants(
         *(0.5, -0.041666668, 0.0013888881, -2.480112e-05),
         *(2.7543695e-07, -2.0672082e-09, 9.928024e-12),
     ),
-    c3=(
-        *(0.16666667, -0.008333333, 0.0001984127, -2.755739e-06),
-        *(2.5053057e-08, -1.6033697e-10, 7.095441e-13),
-    ),
-    c4=(0.041666668, -0.0013888888, 2.4801646e-05, -2.755888e-07, 2.0851503e-09, -1.0667319e-11),
     rsqrt=(1.0, 0.49999833, 0.37499848, 0.3139365, 0.2747544),
     excess=(
         *(0.03267274, 0.00010564049, 5.63984e-07, 3.3205831e-09),

@@ -53,7 +53,7 @@ class Composition(AbstractLieSolver):
             raise TypeError(
                 f"solver must be a symmetric one, such as cfjax.Strang(), got {solver!r}."
             )
-        if not isinstance(order, int) or order not in COMPOSITIONS:
+        if order not in COMPOSITIONS:
             raise ValueError(f"order must be 4, 6 or 8, got {order!r}.")
         self.solver, self.composition_order = solver, order
 

@@ -79,7 +79,7 @@ class ImplicitMidpoint(AbstractLieSolver):
         return self
 
     def step(self, terms, t0, t1, y0, args, solver_state, made_jump):
-        t0, _ = begin_step(solver_state, t0, t1, lambda start: None, made_jump)
+        t0, _ = begin_step(solver_state, t0, lambda t0: None, made_jump)
         control, middle = terms.contr(t0, t1), time_at(0.5, t0, t1)
 
         def field(y: PyTree) -> PyTree:

@@ -109,9 +109,11 @@ class AbstractSplitting(AbstractLieSolver, diffrax.AbstractStratonovichSolver):
 
     def step(self, terms, t0, t1, y0, args, solver_state, made_jump):
         summands = terms.terms
-        t0, first = begin_step(
-            solver_state, t0, t1, lambda start: summands[0].vf(start, y0, args), made_jump
-        )
+
+        def evaluate(t0: Any) -> PyTree:
+            return summands[0].vf(evaluation_times(t0, t1)[0], y0, args)
+
+        t0, first = begin_step(solver_state, t0, evaluate, made_jump)
         times = evaluation_times(t0, t1)
         controls = control_of(terms, t0, t1)
 

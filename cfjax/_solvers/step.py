@@ -199,9 +199,11 @@ class AbstractChartSolver(AbstractLieSolver):
 
     def _step(self, terms, t0, t1, y0, args, solver_state, made_jump):
         compensation = solver_state.compensation
-        t0, first = begin_step(
-            solver_state, t0, t1, lambda start: terms.vf(start, y0, args), made_jump
-        )
+
+        def evaluate(t0: Any) -> PyTree:
+            return terms.vf(evaluation_times(t0, t1)[0], y0, args)
+
+        t0, first = begin_step(solver_state, t0, evaluate, made_jump)
         times = evaluation_times(t0, t1)
 
         def value(c: Time, y: PyTree) -> PyTree:
@@ -229,7 +231,7 @@ class AbstractChartSolver(AbstractLieSolver):
 
 
 def begin_step(
-    solver_state: State, t0: Any, t1: Any, evaluate: Callable[[Any], PyTree], made_jump: Any
+    solver_state: State, t0: Any, evaluate: Callable[[Any], PyTree], made_jump: Any
 ) -> tuple[Any, PyTree]:
     """The time of a step, NaN if the start was wrong, and the value of the field there, or None."""
     first = solver_state.first
@@ -238,10 +240,9 @@ def begin_step(
         t0 = jnp.where(solver_state.zero == 0, t0, jnp.nan)
     if first is None or made_jump is False:
         return t0, first
-    start, _ = evaluation_times(t0, t1)
     if made_jump is True:
-        return t0, evaluate(start)
-    return t0, lax.cond(made_jump, evaluate, lambda _: first, start)
+        return t0, evaluate(t0)
+    return t0, lax.cond(made_jump, evaluate, lambda _: first, t0)
 
 
 def finish_step(

@@ -973,7 +973,6 @@ def test_wrong_mesh(no_shape_hook):
     [
         (ValueError, r"folder must not be empty, got ''\.", {"folder": ""}),
         (TypeError, "folder must be a path or None, got 3", {"folder": 3}),
-        (TypeError, "progress must be a bool, got 'no'", {"progress": "no"}),
     ],
 )
 def test_wrong_options(kind, message, options, tmp_path, monkeypatch, no_shape_hook):
