@@ -79,8 +79,7 @@ def integrate(
       each group of this many steps, and computes the steps between a second time. About
       `sqrt(num_steps)` is best, and makes the memory proportional to `sqrt(num_steps)` states. It
       should divide `save_every`, or `num_steps` without that: the steps that remain are a loop of
-      their own, and the program takes up to twice as long to
-      compile.
+      their own, and the program takes up to twice as long to compile.
     - `step_back`: for reverse mode in constant memory. Reverse mode then stores only the saved
       states, and computes all others by stepping backwards. This works with symmetric solvers,
       which undo a step up to rounding: `cfjax.Strang` and other splittings,
