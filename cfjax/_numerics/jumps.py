@@ -14,7 +14,7 @@ from .linearity import CALLS
 
 # Operations on floating-point numbers that jump themselves. All others that jump have integers or
 # booleans on the way: comparisons, indices, arguments of extrema.
-_JUMPS = frozenset("ceil floor nextafter rem round sign".split())
+_JUMPS = frozenset("ceil floor rem round sign".split())
 
 
 def may_jump(fun: Callable[[Any], PyTree], x: Any) -> bool:
