@@ -14,7 +14,7 @@ import cfjax
 def test_fields_of_different_kinds_are_an_error_in_words():
     def field(t, y, args):
         kinds.append(1)
-        return cfjax.LeftMatrix(a) if len(kinds) < 3 else cfjax.RightMatrix(a)
+        return cfjax.LeftMatrix(a) if len(kinds) < 4 else cfjax.RightMatrix(a)
 
     kinds, a = [], problems.GENERATORS[0]
     with pytest.raises(TypeError, match="Only fields of one kind can be added"):
