@@ -116,8 +116,8 @@ def test_coordinates_that_grow_have_one_program_for_all_stages():
         jax.make_jaxpr(lambda y0, args: moved(solver, field, y0, args)[0])(*COLUMNS)
         return len(calls)
 
-    # Once to check the start, to see whether the field jumps, at the start, to see whether later ones
-    # are alike, in the loop and at the end; and at seven stages.
+    # Once to check the start, to see whether the field jumps, at the start, to see whether later
+    # ones are alike, in the loop and at the end; and at seven stages.
     assert evaluations(cfjax.CF54()) == 6
     assert evaluations(cfjax.CF54(unroll=True)) == 10
 
