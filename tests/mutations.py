@@ -3,7 +3,9 @@
     python tests/mutations.py [--count N] [--seed S] [PATH ...]
 
 Draws mutants of all the source, or of these files or folders, and plants each in a copy of the
-repository. There the tests of its file run, up to the first failure.
+repository. There the tests of its file run, up to the first failure. With `--matrix FOLDER` the
+quick tests that execute the changed line run, the quickest first, up to five failures or ten
+minutes for each mutant. All is kept in the folder, so that a run that was stopped goes on.
 """
 
 import argparse
@@ -24,6 +26,8 @@ from itertools import accumulate, pairwise
 from pathlib import Path
 from typing import Any, NamedTuple
 
+from kill_matrix import KillMatrix, cover
+
 ROOT = Path(__file__).parents[1]
 PACKAGE, TESTS = ROOT / "cfjax", ROOT / "tests"
 # Operators of which each may stand for the other, by their names in `ast`.
@@ -34,6 +38,8 @@ CHOICES = {"where", "select", "cond", "chosen"}
 UNORDERED = {"max", "min", "maximum", "minimum", "dot", "isinstance", "issubclass", "getattr"}
 # Nodes that need no parentheses.
 CLOSED = ast.stmt | ast.Name | ast.Attribute | ast.Call | ast.Subscript | ast.Constant
+
+TIME_LIMIT = "the time limit"
 
 
 class Mutant(NamedTuple):
@@ -130,15 +136,15 @@ def others(op: ast.AST) -> list[ast.AST]:
 
 
 def draw(places: Sequence[str], count: int, seed: int) -> list[tuple[Path, Mutant]]:
-    """No more than one mutant of a line."""
+    """No more than one mutant of a line, from all parts of the source alike."""
     found = {}
     for place in map(Path.resolve, map(Path, places)):
         for path in sorted(place.rglob("*.py")) or [place]:
             for mutant in mutants(path.read_text()):
                 found.setdefault((path, mutant.line), []).append((path, mutant))
-    drawn = random.Random(seed)
-    lines = drawn.sample(list(found.values()), min(count, len(found)))
-    return sorted(map(drawn.choice, lines))
+    drawn, lines = random.Random(seed), list(found.values())
+    edges = [len(lines) * k // count for k in range(count + 1)]
+    return [drawn.choice(drawn.choice(lines[a:b])) for a, b in pairwise(edges) if a < b]
 
 
 def tests_of(path: Path) -> tuple[str, ...]:
@@ -149,41 +155,58 @@ def tests_of(path: Path) -> tuple[str, ...]:
     return tuple(str(test.relative_to(ROOT)) for test in found)
 
 
-def first_failure(copy: Path, tests: Sequence[str], limit: float | None = None) -> str:
-    """The first test that fails, or nothing."""
+def failures(
+    copy: Path, tests: Sequence[str], number: int = 1, limit: float | None = None
+) -> list[str]:
+    """Up to `number` tests that fail, in the order given, and what else ends them."""
     # The copy and not what is installed, also in processes that the tests start.
     environment = os.environ | {"PYTHONPATH": str(copy), "PYTHONDONTWRITEBYTECODE": "1"}
-    command = [sys.executable, "-m", "pytest", "-x", "-q", "-p", "no:cacheprovider", *tests]
+    # There may be more tests than a command can have.
+    arguments = copy / "tests.txt"
+    arguments.write_text("\n".join(tests))
+    options = f"-v --tb=no --maxfail={number} -p no:cacheprovider".split()
+    command = [sys.executable, "-u", "-m", "pytest", *options, f"@{arguments}"]
     pipes: Any = {"stdout": subprocess.PIPE, "stderr": subprocess.STDOUT, "text": True}
+    end = ""
     with subprocess.Popen(
         command, cwd=copy, env=environment, start_new_session=True, **pipes
     ) as process:
         try:
             output, _ = process.communicate(timeout=limit)
         except subprocess.TimeoutExpired:
-            return "the time limit"
+            end = TIME_LIMIT
         finally:
             # With the processes that the tests have started.
             with suppress(ProcessLookupError):
                 os.killpg(process.pid, signal.SIGKILL)
-    if process.returncode <= 0:
-        return f"signal {-process.returncode}" if process.returncode else ""
+        if end:
+            output, _ = process.communicate()
+    if not end and process.returncode < 0:
+        end = f"signal {-process.returncode}"
     if "ImportError while loading conftest" in output:
-        return "the import of cfjax"
-    # FAILED and a test, or ERROR and a file that cannot be imported. Else no test has run.
-    found = re.search("^(?:FAILED|ERROR) (.*?)(?: - .*)?$", output, re.MULTILINE)
-    if not found:
+        end = "the import of cfjax"
+    # A test and FAILED or ERROR, or ERROR and a file that cannot be imported.
+    found = re.findall(r"^(\S+::.*) (?:FAILED|ERROR)\b|^ERROR (\S+\.py)\b", output, re.MULTILINE)
+    found = [*dict.fromkeys(test or file for test, file in found), *[end] * bool(end)]
+    if process.returncode and not found:
         raise RuntimeError(f"{' '.join(command)}:\n{output}")
-    return found[1]
+    return found
 
 
 @cache
 def limit_of(copy: Path, tests: tuple[str, ...]) -> float:
     """Seconds after which tests hang, from what they take without a mutant. They must pass."""
     begin = time.perf_counter()
-    if failure := first_failure(copy, tests):
-        raise SystemExit(f"Without a mutant, {failure} fails.")
+    if found := failures(copy, tests):
+        raise SystemExit(f"Without a mutant, {found[0]} fails.")
     return 30 + 3 * (time.perf_counter() - begin)
+
+
+def planted_lines(text: str, planted: str) -> tuple[str, str]:
+    """The first line that differs, before and after."""
+    pairs = zip(text.split("\n"), planted.split("\n"), strict=False)
+    before, after = next((a, b) for a, b in pairs if a != b)
+    return before.strip(), after.strip()
 
 
 def main() -> int:
@@ -192,28 +215,45 @@ def main() -> int:
     parser.add_argument("--count", type=int, default=50, help="how many mutants (50)")
     parser.add_argument("--seed", type=int, default=0, help="which of them (0)")
     parser.add_argument("--tests", nargs="+", help="run these and not those of the file")
+    parser.add_argument("--matrix", type=Path, metavar="FOLDER", help="record up to five killers")
     parser.add_argument("--need", type=float, default=0.0, help="share to kill for exit status 0")
     options = parser.parse_args()
-    drawn, killed = draw(options.places, options.count, options.seed), 0
+    matrix = options.matrix and KillMatrix(options.matrix, ROOT)
+    drawn, killed = draw(options.places, options.count, options.seed), []
     ignored = shutil.ignore_patterns(".*", "figures", "site", "__pycache__", "*.egg-info")
     with tempfile.TemporaryDirectory() as folder:
         copy = shutil.copytree(ROOT, Path(folder) / "cfjax", ignore=ignored)
         for path, mutant in drawn:
-            tests = tuple(options.tests or tests_of(path))
             text, file = path.read_text(), path.relative_to(ROOT)
-            planted, limit = mutant.plant(text), limit_of(copy, tests)
-            (copy / file).write_text(planted)
-            begin = time.perf_counter()
-            killer = first_failure(copy, tests, limit)
-            verdict = f"killed by {killer}" if killer else "SURVIVED"
-            print(f"{file}:{mutant.line}: {verdict}, {time.perf_counter() - begin:.0f} s")
+            planted, begin = mutant.plant(text), time.perf_counter()
             pairs = zip(text.split("\n"), planted.split("\n"), strict=False)
-            before, after = next((a, b) for a, b in pairs if a != b)
-            print(f"    - {before.strip()}\n    + {after.strip()}", flush=True)
+            before, after = next((a.strip(), b.strip()) for a, b in pairs if a != b)
+            name = f"{file}:{mutant.line}: {after}"
+            if matrix is None:
+                tests = tuple(options.tests or tests_of(path))
+                limit = limit_of(copy, tests)
+                (copy / file).write_text(planted)
+                killers = failures(copy, tests, 1, limit)
+            elif (killers := matrix.killers.get(name)) is None:
+                (copy / file).write_text(planted)
+                tests = matrix.tests_of_line(path, mutant.line)
+                limit = 60 + 3 * sum(matrix.seconds[test] for test in tests)
+                killers = failures(copy, tests, 5, min(limit, 600.0)) if tests else []
+                # Which is no fault of the mutant where so many tests take longer.
+                killers = [test for test in killers if test != TIME_LIMIT or limit < 600]
+                matrix.keep(name, killers)
             (copy / file).write_text(text)
-            killed += bool(killer)
-    print(f"{killed} of {len(drawn)} mutants killed: {killed / max(len(drawn), 1):.0%}")
-    return int(killed < options.need * len(drawn))
+            verdict = f"killed by {', '.join(killers)}" if killers else "SURVIVED"
+            print(f"{file}:{mutant.line}: {verdict}, {time.perf_counter() - begin:.0f} s")
+            print(f"    - {before}\n    + {after}", flush=True)
+            killed.append(killers)
+    count = sum(map(bool, killed))
+    print(f"{count} of {len(drawn)} mutants killed: {count / max(len(drawn), 1):.0%}")
+    if matrix is not None:
+        chosen = cover(killed, matrix.seconds)
+        seconds = sum(matrix.seconds.get(test, 0.0) for test in chosen)
+        print(f"{len(chosen)} tests of {seconds:.0f} seconds kill as many.")
+    return int(count < options.need * len(drawn))
 
 
 if __name__ == "__main__":

@@ -1,7 +1,9 @@
 """Which mistakes `make mutations` plants, and what it reads of the tests that see them."""
 
 import ast
+import shutil
 
+import kill_matrix
 import mutations
 import pytest
 from mutations import PACKAGE, ROOT
@@ -99,26 +101,71 @@ def test_the_tests_of_a_file():
 
 
 @pytest.mark.parametrize(
-    "script, killer",
+    "script, killers",
     [
-        ("echo '2 passed'", ""),
-        ("echo 'FAILED tests/a.py::test_b[c] - d - e'; exit 1", "tests/a.py::test_b[c]"),
-        ("echo 'ERROR tests/a.py'; exit 2", "tests/a.py"),
-        ("echo 'ImportError while loading conftest' >&2; exit 4", "the import of cfjax"),
-        ("sleep 600 & wait", "the time limit"),
-        ("kill -9 $$", "signal 9"),
+        ("echo '2 passed'", []),
+        (
+            "echo 'tests/a.py::test_b[c - d] FAILED [ 3%]'; echo 'tests/a.py::test_b[e] PASSED'; "
+            "echo 'tests/a.py::test_c ERROR'; echo 'FAILED tests/a.py::test_b[c - d] - e'; exit 1",
+            ["tests/a.py::test_b[c - d]", "tests/a.py::test_c"],
+        ),
+        ("echo 'ERROR tests/a.py - TypeError'; exit 2", ["tests/a.py"]),
+        ("echo 'ImportError while loading conftest' >&2; exit 4", ["the import of cfjax"]),
+        ("sleep 600 & wait", ["the time limit"]),
+        ("echo 'tests/a.py::test_b FAILED'; kill -9 $$", ["tests/a.py::test_b", "signal 9"]),
     ],
 )
-def test_what_pytest_says(script, killer, tmp_path, monkeypatch):
+def test_what_pytest_says(script, killers, tmp_path, monkeypatch):
     python = tmp_path / "python"
     python.write_text(f"#!/bin/sh\n{script}\n")
     python.chmod(0o755)
     monkeypatch.setattr(mutations.sys, "executable", str(python))
     limit = 0.5 if "sleep" in script else None
-    assert mutations.first_failure(tmp_path, [], limit) == killer
+    assert mutations.failures(tmp_path, [], 2, limit) == killers
 
 
 def test_where_no_test_has_run(tmp_path, monkeypatch):
     monkeypatch.setattr(mutations.sys, "executable", "false")
     with pytest.raises(RuntimeError, match="pytest"):
-        mutations.first_failure(tmp_path, [])
+        mutations.failures(tmp_path, [])
+
+
+def test_the_seconds_of_tests():
+    printed = """
+tests/a.py::test_b PASSED
+1.25s setup    tests/a.py::test_b
+2.50s call     tests/a.py::test_b
+12.00s call     tests/a.py::test_b[c - d]
+"""
+    found = kill_matrix.seconds_of(printed)
+    assert found == {"tests/a.py::test_b": 2.5, "tests/a.py::test_b[c - d]": 12.0}
+
+
+def test_tests_that_kill_all_mutants():
+    seconds = {"a": 1.0, "b": 1.0, "c": 5.0, "d": 0.1}
+    # The first mutant has survived. Nothing but c kills the last one, and it kills the others too.
+    assert kill_matrix.cover([[], ["a", "c"], ["b", "c"], ["c"]], seconds) == ["c"]
+    assert kill_matrix.cover([["a", "d"], ["a", "b"], ["a", "b"]], seconds) == ["a"]
+    assert kill_matrix.cover([["c", "d"], ["a", "c"], ["b"]], seconds) == ["d", "a", "b"]
+    assert kill_matrix.cover([], seconds) == []
+
+
+@pytest.mark.slow
+def test_a_matrix_of_a_small_repository(tmp_path):
+    root = tmp_path / "root"
+    (root / "tests").mkdir(parents=True)
+    (root / "cfjax").mkdir()
+    (root / "pyproject.toml").write_text("[tool.coverage.run]\nsource = ['cfjax']\n")
+    source = "LIMIT = 3\n\n\ndef f(x):\n    if x < 0:\n        return -x\n    return x\n"
+    (root / "cfjax" / "__init__.py").write_text(source)
+    tests = "import cfjax\n\n\ndef test_a():\n    cfjax.f(-1)\n\n\ndef test_b():\n    cfjax.f(1)\n"
+    (root / "tests" / "test_f.py").write_text(tests)
+    matrix = kill_matrix.KillMatrix(tmp_path / "matrix", root)
+    path, (a, b) = root / "cfjax" / "__init__.py", [f"tests/test_f.py::test_{x}" for x in "ab"]
+    assert set(matrix.seconds) == {a, b}
+    assert [set(matrix.tests_of_line(path, n)) for n in (1, 5, 6, 7)] == [{a, b}, {a, b}, {a}, {b}]
+    matrix.keep("cfjax/__init__.py:6: return x", [a])
+    # A second one runs nothing, and knows it.
+    shutil.rmtree(root)
+    again = kill_matrix.KillMatrix(tmp_path / "matrix", root)
+    assert again.killers == {"cfjax/__init__.py:6: return x": [a]}
