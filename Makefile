@@ -1,7 +1,7 @@
 PYTHON ?= python3
 BIN := .venv/bin
 # The whole suite, in as many processes as there are cores.
-PYTEST := -m pytest --numprocesses auto --dist worksteal --durations=10
+PYTEST := -m pytest --numprocesses auto --dist worksteal
 # Each solver and each field once, what the code relies on in jax, equinox and diffrax, and imports.
 QUICK := tests/test_quick.py tests/xla/test_struct_of_arrays.py tests/test_canary.py tests/test_public.py tests/test_architecture.py
 

@@ -4,6 +4,7 @@ from collections import defaultdict
 from pathlib import Path
 
 import jax
+import jaxlib.version
 import jaxtyping
 import pytest
 
@@ -14,9 +15,11 @@ jax.config.update("jax_numpy_rank_promotion", "raise")
 # and has XLA's older emitters write what LLVM compiles: all tests take two thirds of the time.
 # `XLA_FLAGS= make test` compiles with the emitters that users' programs are compiled with.
 jax.config.update("jax_disable_most_optimizations", True)
-os.environ.setdefault(
-    "XLA_FLAGS", "--xla_backend_extra_options=xla_cpu_disable_new_fusion_emitters"
-)
+# From 0.12 on there is one kind of emitter, and nothing to choose.
+if jaxlib.version.__version_info__ < (0, 12):
+    os.environ.setdefault(
+        "XLA_FLAGS", "--xla_backend_extra_options=xla_cpu_disable_new_fusion_emitters"
+    )
 # Tests raise on purpose, and do not show what they raise.
 jax.config.update("jax_traceback_filtering", "off")
 # Tracing makes many objects that stay, and little that only the garbage collector can free.
@@ -93,3 +96,16 @@ def pytest_collection_modifyitems(items):
 def values(item):
     """Which value each parameter has: the same objects make all sets of a product."""
     return {(name, id(value)) for name, value in item.callspec.params.items()}
+
+
+def pytest_terminal_summary(terminalreporter):
+    """What to make quicker first."""
+    seconds = defaultdict(float)
+    for reports in terminalreporter.stats.values():
+        for report in reports:
+            if isinstance(report, pytest.TestReport):
+                seconds[report.nodeid.partition("::")[0]] += report.duration
+    slowest = sorted(seconds, key=lambda file: -seconds[file])[:10]
+    terminalreporter.section(f"slowest files of {sum(seconds.values()):.0f} s")
+    for file in slowest:
+        terminalreporter.write_line(f"{seconds[file]:7.1f} s  {file}")
