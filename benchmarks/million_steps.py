@@ -12,6 +12,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 from jax import Array, lax
+from jax.typing import DTypeLike
 
 import cfjax
 import results
@@ -98,11 +99,11 @@ def in_plain_space(y: dict[str, Array]) -> dict[str, Array]:
     }
 
 
-def start(dtype: type) -> dict[str, Array]:
+def start(dtype: DTypeLike) -> dict[str, Array]:
     return {"q": jnp.asarray(START, dtype), "phase": jnp.asarray([1.0, 0.0, 0.0], dtype)}
 
 
-def by_solver(solver: cfjax.AbstractSolver, count: int, dtype: type = jnp.float32) -> Array:
+def by_solver(solver: cfjax.AbstractSolver, count: int, dtype: DTypeLike = jnp.float32) -> Array:
     t1 = jnp.asarray(STEP * count, dtype)
     sol = cfjax.integrate(cfjax.LieTerm(field), solver, 0 * t1, t1, start(dtype), num_steps=count)
     assert sol.ys is not None
