@@ -167,7 +167,7 @@ def failures(
     options = f"-v --tb=no --maxfail={number} -p no:cacheprovider".split()
     command = [sys.executable, "-u", "-m", "pytest", *options, f"@{arguments}"]
     pipes: Any = {"stdout": subprocess.PIPE, "stderr": subprocess.STDOUT, "text": True}
-    end = ""
+    output = end = ""
     with subprocess.Popen(
         command, cwd=copy, env=environment, start_new_session=True, **pipes
     ) as process:
