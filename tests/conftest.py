@@ -15,7 +15,7 @@ jax.config.update("jax_numpy_rank_promotion", "raise")
 # and has XLA's older emitters write what LLVM compiles: all tests take two thirds of the time.
 # `XLA_FLAGS= make test` compiles with the emitters that users' programs are compiled with.
 jax.config.update("jax_disable_most_optimizations", True)
-# From 0.12 on there is one kind of emitter, and nothing to choose.
+# From 0.12 on XLA ignores this.
 if jaxlib.version.__version_info__ < (0, 12):
     os.environ.setdefault(
         "XLA_FLAGS", "--xla_backend_extra_options=xla_cpu_disable_new_fusion_emitters"

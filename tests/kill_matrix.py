@@ -75,13 +75,14 @@ def cover(killers: Collection[Collection[str]], seconds: Mapping[str, float]) ->
     Again and again the one that kills most of those that are left in its time, and at the end
     without those that are not needed beside the others.
     """
-    killed = [set(tests) for tests in killers if tests]
+    # An import that fails, or a signal, is no test.
+    killed = [tests for found in killers if (tests := set(found) & seconds.keys())]
     left, chosen = killed, []
     while left:
 
         def kills_in_a_second(test: str, left: list[set[str]] = left) -> float:
             # A test of no time is still read.
-            return sum(test in tests for tests in left) / (0.01 + seconds.get(test, 0.0))
+            return sum(test in tests for tests in left) / (0.01 + seconds[test])
 
         best = max(sorted(set().union(*left)), key=kills_in_a_second)
         chosen.append(best)

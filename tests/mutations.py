@@ -186,7 +186,8 @@ def failures(
     if "ImportError while loading conftest" in output:
         end = "the import of cfjax"
     # A test and FAILED or ERROR, or ERROR and a file that cannot be imported.
-    found = re.findall(r"^(\S+::.*) (?:FAILED|ERROR)\b|^ERROR (\S+\.py)\b", output, re.MULTILINE)
+    failed = r"^(\S+::.*) (?:FAILED|ERROR)\b|^ERROR (\S+\.py)(?: |$)"
+    found = re.findall(failed, output, re.MULTILINE)
     found = [*dict.fromkeys(test or file for test, file in found), *[end] * bool(end)]
     if process.returncode and not found:
         raise RuntimeError(f"{' '.join(command)}:\n{output}")
@@ -200,13 +201,6 @@ def limit_of(copy: Path, tests: tuple[str, ...]) -> float:
     if found := failures(copy, tests):
         raise SystemExit(f"Without a mutant, {found[0]} fails.")
     return 30 + 3 * (time.perf_counter() - begin)
-
-
-def planted_lines(text: str, planted: str) -> tuple[str, str]:
-    """The first line that differs, before and after."""
-    pairs = zip(text.split("\n"), planted.split("\n"), strict=False)
-    before, after = next((a, b) for a, b in pairs if a != b)
-    return before.strip(), after.strip()
 
 
 def main() -> int:

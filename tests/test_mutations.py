@@ -106,7 +106,7 @@ def test_the_tests_of_a_file():
         ("echo '2 passed'", []),
         (
             "echo 'tests/a.py::test_b[c - d] FAILED [ 3%]'; echo 'tests/a.py::test_b[e] PASSED'; "
-            "echo 'tests/a.py::test_c ERROR'; echo 'FAILED tests/a.py::test_b[c - d] - e'; exit 1",
+            "echo 'tests/a.py::test_c ERROR'; echo 'ERROR tests/a.py::test_c - e'; exit 1",
             ["tests/a.py::test_b[c - d]", "tests/a.py::test_c"],
         ),
         ("echo 'ERROR tests/a.py - TypeError'; exit 2", ["tests/a.py"]),
@@ -143,8 +143,8 @@ tests/a.py::test_b PASSED
 
 def test_tests_that_kill_all_mutants():
     seconds = {"a": 1.0, "b": 1.0, "c": 5.0, "d": 0.1}
-    # The first mutant has survived. Nothing but c kills the last one, and it kills the others too.
-    assert kill_matrix.cover([[], ["a", "c"], ["b", "c"], ["c"]], seconds) == ["c"]
+    # No test has killed the first two. Nothing but c kills the last one, and it kills all others.
+    assert kill_matrix.cover([[], ["signal 9"], ["a", "c"], ["b", "c"], ["c"]], seconds) == ["c"]
     assert kill_matrix.cover([["a", "d"], ["a", "b"], ["a", "b"]], seconds) == ["a"]
     assert kill_matrix.cover([["c", "d"], ["a", "c"], ["b"]], seconds) == ["d", "a", "b"]
     assert kill_matrix.cover([], seconds) == []
