@@ -18,10 +18,11 @@ class KillMatrix:
     """What a folder keeps of the quick tests of a repository.
 
     `seconds.json` has the seconds of each, `coverage` the lines that it executes, and `matrix.json`
-    the tests that kill a mutant. The first two are made by running the tests, which must pass.
+    the tests that kill each mutant that a seed draws. The first two are made by running the tests,
+    which must pass.
     """
 
-    def __init__(self, folder: Path, root: Path):
+    def __init__(self, folder: Path, root: Path, seed: int):
         self._file = folder / "matrix.json"
         seconds, coverage = folder / "seconds.json", folder / "coverage"
         if not seconds.exists():
@@ -39,15 +40,16 @@ class KillMatrix:
                 raise SystemExit(f"Without a mutant, tests fail:\n{done.stdout[-5000:]}")
             seconds.write_text(json.dumps(seconds_of(done.stdout), indent=0))
         self.seconds: dict[str, float] = json.loads(seconds.read_text())
-        self.killers: dict[str, list[str]] = {}
+        self._of_seeds: dict[str, dict[str, list[str]]] = {}
         if self._file.exists():
-            self.killers = json.loads(self._file.read_text())
+            self._of_seeds = json.loads(self._file.read_text())
+        self.killers = self._of_seeds.setdefault(str(seed), {})
         self._lines = CoverageData(str(coverage))
         self._lines.read()
 
     def keep(self, mutant: str, killers: list[str]):
         self.killers[mutant] = killers
-        self._file.write_text(json.dumps(self.killers, indent=0))
+        self._file.write_text(json.dumps(self._of_seeds, indent=0))
 
     def tests_of_line(self, path: Path, line: int) -> list[str]:
         """The tests that execute a line, the quickest first.

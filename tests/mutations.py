@@ -212,7 +212,7 @@ def main() -> int:
     parser.add_argument("--matrix", type=Path, metavar="FOLDER", help="record up to five killers")
     parser.add_argument("--need", type=float, default=0.0, help="share to kill for exit status 0")
     options = parser.parse_args()
-    matrix = options.matrix and KillMatrix(options.matrix, ROOT)
+    matrix = options.matrix and KillMatrix(options.matrix, ROOT, options.seed)
     drawn, killed = draw(options.places, options.count, options.seed), []
     ignored = shutil.ignore_patterns(".*", "figures", "site", "__pycache__", "*.egg-info")
     with tempfile.TemporaryDirectory() as folder:

@@ -4,8 +4,6 @@ import json
 import re
 from pathlib import Path
 
-import pytest
-
 ROOT = Path(__file__).parents[1]
 PAGES = [
     *(ROOT / name for name in ("README.md", "ARCHITECTURE.md", "CONTRIBUTING.md", "CHANGELOG.md")),
@@ -13,7 +11,6 @@ PAGES = [
     *sorted((ROOT / "docs").rglob("*.md")),
     *sorted((ROOT / "notebooks").glob("*.ipynb")),
 ]
-named = pytest.mark.parametrize("page", PAGES, ids=lambda page: str(page.relative_to(ROOT)))
 
 
 def source(page):
@@ -38,21 +35,24 @@ def anchors(page):
     return {re.sub(r"[^\w\- ]", "", heading.lower()).replace(" ", "-") for heading in shown}
 
 
-@named
-def test_links_and_pictures_lead_to_what_is_there(page):
-    for target in targets(page):
-        path, _, anchor = target.partition("#")
-        found = (page.parent / path).resolve() if path else page
-        assert found.is_relative_to(ROOT) and found.exists(), target
-        assert not anchor or anchor in anchors(found), target
+def test_links_and_pictures_lead_to_what_is_there(subtests):
+    for page in PAGES:
+        with subtests.test(page=page):
+            for target in targets(page):
+                path, _, anchor = target.partition("#")
+                found = (page.parent / path).resolve() if path else page
+                assert found.is_relative_to(ROOT) and found.exists(), target
+                assert not anchor or anchor in anchors(found), target
 
 
-@named
-def test_nothing_needs_the_site(page):
-    text = source(page)
-    # References to the API, which only the site resolves; and its own math and attributes.
-    assert re.findall(r"\]\[[^\]]*\]", text) == []
-    assert re.findall(r"\\[(\[]|\{ ?[.:#]|^(?:!!!|\?\?\?)", text, flags=re.MULTILINE) == []
+def test_nothing_needs_the_site(subtests):
+    for page in PAGES:
+        with subtests.test(page=page):
+            text = source(page)
+            # References to the API, which only the site resolves; and its own math and attributes.
+            assert re.findall(r"\]\[[^\]]*\]", text) == []
+            own = re.findall(r"\\[(\[]|\{ ?[.:#]|^(?:!!!|\?\?\?)", text, flags=re.MULTILINE)
+            assert own == []
 
 
 def test_links_are_found():

@@ -160,12 +160,13 @@ def test_a_matrix_of_a_small_repository(tmp_path):
     (root / "cfjax" / "__init__.py").write_text(source)
     tests = "import cfjax\n\n\ndef test_a():\n    cfjax.f(-1)\n\n\ndef test_b():\n    cfjax.f(1)\n"
     (root / "tests" / "test_f.py").write_text(tests)
-    matrix = kill_matrix.KillMatrix(tmp_path / "matrix", root)
+    matrix = kill_matrix.KillMatrix(tmp_path / "matrix", root, 3)
     path, (a, b) = root / "cfjax" / "__init__.py", [f"tests/test_f.py::test_{x}" for x in "ab"]
     assert set(matrix.seconds) == {a, b}
     assert [set(matrix.tests_of_line(path, n)) for n in (1, 5, 6, 7)] == [{a, b}, {a, b}, {a}, {b}]
     matrix.keep("cfjax/__init__.py:6: return x", [a])
     # A second one runs nothing, and knows it.
     shutil.rmtree(root)
-    again = kill_matrix.KillMatrix(tmp_path / "matrix", root)
+    again, other = (kill_matrix.KillMatrix(tmp_path / "matrix", root, seed) for seed in (3, 4))
     assert again.killers == {"cfjax/__init__.py:6: return x": [a]}
+    assert other.killers == {}

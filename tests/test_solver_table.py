@@ -1,6 +1,7 @@
 """The table of solvers: none is left out, and each is and takes what its row says."""
 
 import inspect
+from functools import partial
 
 import diffrax
 import jax
@@ -13,7 +14,6 @@ from solver_table import COMMUTATOR_FREE, MUNTHE_KAAS, SOLVERS
 import cfjax
 
 ROWS = SOLVERS | COMMUTATOR_FREE | MUNTHE_KAAS
-by_name = pytest.mark.parametrize("name", ROWS)
 START = jnp.array([0.5, 0.7])
 DENSITY = jnp.eye(2, dtype=complex) / 2
 
@@ -74,9 +74,15 @@ def num_marked(jaxpr, used=None):
     return total
 
 
-@by_name
-def test_evaluations_of_a_step(name):
-    row = ROWS[name]
+# The rows in four tests, as this takes longest.
+@pytest.mark.parametrize("part", range(4))
+def test_evaluations_of_a_step(part, subtests):
+    for name in list(ROWS)[part::4]:
+        with subtests.test(name=name):
+            check_evaluations(ROWS[name])
+
+
+def check_evaluations(row):
     solver, term = row.make(), TERMS.get(row.takes, TRANSLATION)
     y0 = DENSITY if row.takes == "density matrices" else START
 
@@ -96,18 +102,14 @@ def test_evaluations_of_a_step(name):
         assert num_marked(later.jaxpr) == row.evaluations
 
 
-@by_name
-def test_a_solver_says_its_orders(name):
-    row = ROWS[name]
-    solver, term = row.make(), TERMS.get(row.takes, TRANSLATION)
-    assert solver.order(term) == row.order
-    if row.embedded is not None:
-        assert solver.error_order(term) == row.embedded + 1
-
-
-@by_name
-def test_a_solver_says_whether_it_is_symmetric(name):
-    assert ROWS[name].make().is_symmetric == ROWS[name].is_symmetric
+def test_a_solver_says_its_orders_and_whether_it_is_symmetric(subtests):
+    for name, row in ROWS.items():
+        with subtests.test(name=name):
+            solver, term = row.make(), TERMS.get(row.takes, TRANSLATION)
+            assert solver.order(term) == row.order
+            if row.embedded is not None:
+                assert solver.error_order(term) == row.embedded + 1
+            assert solver.is_symmetric == row.is_symmetric
 
 
 def growth(t, y, args):
@@ -115,17 +117,16 @@ def growth(t, y, args):
     return problems.Growth(-y)
 
 
-@by_name
-def test_which_solvers_take_any_field(name):
-    row = ROWS[name]
+def test_which_solvers_take_any_field(subtests):
+    def solve(y0, solver):
+        term = cfjax.LieTerm(growth)
+        return cfjax.integrate(term, solver, 0.0, 1.0, y0, num_steps=1, throw=False).ys
 
-    def solve(y0):
-        return cfjax.integrate(
-            cfjax.LieTerm(growth), row.make(), 0.0, 1.0, y0, num_steps=1, throw=False
-        ).ys
-
-    if row.takes == "any":
-        assert jax.eval_shape(solve, START).shape == (1, 2)
-    else:
-        with pytest.raises(TypeError):
-            jax.eval_shape(solve, START)
+    for name, row in ROWS.items():
+        shape = partial(jax.eval_shape, partial(solve, solver=row.make()), START)
+        with subtests.test(name=name):
+            if row.takes == "any":
+                assert shape().shape == (1, 2)
+            else:
+                with pytest.raises(TypeError):
+                    shape()
