@@ -80,6 +80,19 @@ def test_a_field_that_is_constant_in_each_step_is_solved_exactly(name):
     assert_is(solve(T1, T0, end), START)
 
 
+@pytest.mark.parametrize("ends", [(0.0, SLOT), (-SLOT, 0.0)])
+def test_a_step_that_begins_or_ends_at_zero(ends):
+    """Where one of the times has no rounding."""
+    t0, t1 = ends
+
+    def field(t, y, args):
+        return cfjax.Rotation(jnp.where((t > t0) & (t < t1), args, jnp.nan))
+
+    y0, a, term = jnp.asarray(START), AMPLITUDES[0], cfjax.LieTerm(field)
+    end = cfjax.integrate(term, cfjax.CF4(), t0, t1, y0, a, num_steps=1).ys[-1]
+    np.testing.assert_allclose(end, propagators()[1], atol=UNITS * float(np.finfo(float).eps))
+
+
 def test_single_precision():
     amplitudes, start = np.float32(AMPLITUDES), jnp.stack([np.float32(START)] * 3)
     term = cfjax.LieTerm(rotation)
@@ -88,8 +101,18 @@ def test_single_precision():
     assert_is(sol.ys[-1], propagators()[-1])
 
 
+def radius(t, y, args):
+    return jnp.abs(amplitudes(t, args)).sum()
+
+
 # Those whose last evaluation is otherwise the first one of the next step.
-@pytest.mark.parametrize("solver", [cfjax.CF4(), cfjax.RKMK5(), cfjax.Magnus6(), cfjax.RKL2(5)])
+@pytest.mark.parametrize(
+    "solver",
+    [
+        *[cfjax.CF4(), cfjax.RKMK5(), cfjax.Magnus6(), cfjax.RKL2(5), cfjax.RKL2()],
+        cfjax.RKL2(spectral_radius=radius),
+    ],
+)
 def test_the_last_evaluation_is_not_handed_on(solver):
     sol = diffrax.diffeqsolve(
         cfjax.LieTerm(rotation),
