@@ -3,9 +3,10 @@
     python tests/mutations.py [--count N] [--seed S] [PATH ...]
 
 Draws mutants of all the source, or of these files or folders, and plants each in a copy of the
-repository. There the tests of its file run, up to the first failure. With `--matrix FOLDER` the
-quick tests that execute the changed line run, the quickest first, up to five failures or ten
-minutes for each mutant. All is kept in the folder, so that a run that was stopped goes on.
+repository, as many at once as there are cores. There the tests of its file run, up to the first
+failure. With `--matrix FOLDER` the quick tests that execute the changed line run, the quickest
+first, up to five failures or ten minutes for each mutant. All is kept in the folder, so that a run
+that was stopped goes on.
 """
 
 import argparse
@@ -20,10 +21,12 @@ import sys
 import tempfile
 import time
 from collections.abc import Iterator, Sequence
-from contextlib import suppress
+from concurrent.futures import ThreadPoolExecutor, as_completed
+from contextlib import ExitStack, suppress
 from functools import cache
 from itertools import accumulate, pairwise
 from pathlib import Path
+from queue import SimpleQueue
 from typing import Any, NamedTuple
 
 from kill_matrix import KillMatrix, cover
@@ -40,6 +43,8 @@ UNORDERED = {"max", "min", "maximum", "minimum", "dot", "isinstance", "issubclas
 CLOSED = ast.stmt | ast.Name | ast.Attribute | ast.Call | ast.Subscript | ast.Constant
 
 TIME_LIMIT = "the time limit"
+# Of one mutant in a matrix.
+MOST_SECONDS = 600.0
 
 
 class Mutant(NamedTuple):
@@ -203,6 +208,38 @@ def limit_of(copy: Path, tests: tuple[str, ...]) -> float:
     return 30 + 3 * (time.perf_counter() - begin)
 
 
+def said(path: Path, mutant: Mutant) -> str:
+    """The place of a mutant, and the line before and after it."""
+    text = path.read_text()
+    pairs = zip(text.split("\n"), mutant.plant(text).split("\n"), strict=False)
+    before, after = next((a.strip(), b.strip()) for a, b in pairs if a != b)
+    return f"{path.relative_to(ROOT)}:{mutant.line}\n    - {before}\n    + {after}"
+
+
+def killers_of(
+    path: Path,
+    mutant: Mutant,
+    copies: SimpleQueue[Path],
+    tests: Sequence[str],
+    number: int,
+    limit: float,
+) -> tuple[list[str], float]:
+    """Up to `number` tests that see a mutant, planted in one of the copies, and the seconds."""
+    if not tests:
+        return [], 0.0
+    begin, copy, text = time.perf_counter(), copies.get(), path.read_text()
+    planted = copy / path.relative_to(ROOT)
+    try:
+        planted.write_text(mutant.plant(text))
+        found = failures(copy, tests, number, limit)
+    finally:
+        planted.write_text(text)
+        copies.put(copy)
+    # It is no fault of the mutant where so many tests take longer.
+    found = [test for test in found if test != TIME_LIMIT or limit != MOST_SECONDS]
+    return found, time.perf_counter() - begin
+
+
 def main() -> int:
     parser = argparse.ArgumentParser(description=__doc__.split("\n")[0])
     parser.add_argument("places", nargs="*", default=[str(PACKAGE)], metavar="PATH")
@@ -215,31 +252,35 @@ def main() -> int:
     matrix = options.matrix and KillMatrix(options.matrix, ROOT, options.seed)
     drawn, killed = draw(options.places, options.count, options.seed), []
     ignored = shutil.ignore_patterns(".*", "figures", "site", "__pycache__", "*.egg-info")
-    with tempfile.TemporaryDirectory() as folder:
-        copy = shutil.copytree(ROOT, Path(folder) / "cfjax", ignore=ignored)
+    number_at_once = os.cpu_count() or 1
+    with tempfile.TemporaryDirectory() as folder, ExitStack() as stack:
+        pool = ThreadPoolExecutor(number_at_once)
+        stack.callback(pool.shutdown, cancel_futures=True)
+        unchanged, *others = (
+            shutil.copytree(ROOT, Path(folder) / str(k), ignore=ignored)
+            for k in range(1 + number_at_once)
+        )
+        copies = SimpleQueue[Path]()
+        for copy in others:
+            copies.put(copy)
+        names = {}
         for path, mutant in drawn:
-            text, file = path.read_text(), path.relative_to(ROOT)
-            planted, begin = mutant.plant(text), time.perf_counter()
-            pairs = zip(text.split("\n"), planted.split("\n"), strict=False)
-            before, after = next((a.strip(), b.strip()) for a, b in pairs if a != b)
-            name = f"{file}:{mutant.line}: {after}"
+            name, number = said(path, mutant), 1
             if matrix is None:
                 tests = tuple(options.tests or tests_of(path))
-                limit = limit_of(copy, tests)
-                (copy / file).write_text(planted)
-                killers = failures(copy, tests, 1, limit)
-            elif (killers := matrix.killers.get(name)) is None:
-                (copy / file).write_text(planted)
-                tests = matrix.tests_of_line(path, mutant.line)
-                limit = 60 + 3 * sum(matrix.seconds[test] for test in tests)
-                killers = failures(copy, tests, 5, min(limit, 600.0)) if tests else []
-                # Which is no fault of the mutant where so many tests take longer.
-                killers = [test for test in killers if test != TIME_LIMIT or limit < 600]
+                limit = limit_of(unchanged, tests)
+            else:
+                tests = [] if name in matrix.killers else matrix.tests_of_line(path, mutant.line)
+                seconds = sum(matrix.seconds[test] for test in tests)
+                number, limit = 5, min(60 + 3 * seconds, MOST_SECONDS)
+            names[pool.submit(killers_of, path, mutant, copies, tests, number, limit)] = name
+        for future in as_completed(names):
+            name, (killers, seconds) = names[future], future.result()
+            if matrix is not None:
+                killers = matrix.killers.get(name, killers)
                 matrix.keep(name, killers)
-            (copy / file).write_text(text)
             verdict = f"killed by {', '.join(killers)}" if killers else "SURVIVED"
-            print(f"{file}:{mutant.line}: {verdict}, {time.perf_counter() - begin:.0f} s")
-            print(f"    - {before}\n    + {after}", flush=True)
+            print(f"{name}\n    {verdict}, {seconds:.0f} s", flush=True)
             killed.append(killers)
     count = sum(map(bool, killed))
     print(f"{count} of {len(drawn)} mutants killed: {count / max(len(drawn), 1):.0%}")
