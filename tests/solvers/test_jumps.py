@@ -109,8 +109,8 @@ def radius(t, y, args):
 @pytest.mark.parametrize(
     "solver",
     [
-        *[cfjax.CF4(), cfjax.RKMK5(), cfjax.Magnus6(), cfjax.RKL2(5), cfjax.RKL2()],
-        cfjax.RKL2(spectral_radius=radius),
+        *[cfjax.CF4(), cfjax.RKMK5(), cfjax.Magnus6(), cfjax.RKL2(spectral_radius=radius)],
+        *[pytest.param(solver, marks=pytest.mark.slow) for solver in (cfjax.RKL2(5), cfjax.RKL2())],
     ],
 )
 def test_the_last_evaluation_is_not_handed_on(solver):
