@@ -37,7 +37,7 @@ def anchors(page):
 
 def test_links_and_pictures_lead_to_what_is_there(subtests):
     for page in PAGES:
-        with subtests.test(page=page):
+        with subtests.test(page=str(page.relative_to(ROOT))):
             for target in targets(page):
                 path, _, anchor = target.partition("#")
                 found = (page.parent / path).resolve() if path else page
@@ -47,7 +47,7 @@ def test_links_and_pictures_lead_to_what_is_there(subtests):
 
 def test_nothing_needs_the_site(subtests):
     for page in PAGES:
-        with subtests.test(page=page):
+        with subtests.test(page=str(page.relative_to(ROOT))):
             text = source(page)
             # References to the API, which only the site resolves; and its own math and attributes.
             assert re.findall(r"\]\[[^\]]*\]", text) == []
