@@ -12,8 +12,7 @@ jax.config.update("jax_enable_x64", True)
 jax.config.update("jax_numpy_dtype_promotion", "strict")
 jax.config.update("jax_numpy_rank_promotion", "raise")
 # Programs are compiled to run once. This leaves out what LLVM does, and not what XLA does before,
-# and has XLA's older emitters write what LLVM compiles, in one piece: all tests take less than two
-# thirds of the time.
+# and has XLA's older emitters write what LLVM compiles, in one piece.
 # `XLA_FLAGS= make test` compiles with the emitters that users' programs are compiled with.
 jax.config.update("jax_disable_most_optimizations", True)
 # From 0.12 on XLA ignores this.

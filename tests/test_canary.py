@@ -253,7 +253,7 @@ def equations(jaxpr: Any) -> dict[str, Any]:
 
 
 def test_a_primitive_has_its_name_and_parameters(subtests):
-    """The rules know all that it has, too: with one more, programs would stay as slow as traced."""
+    """An operation with one that the rules do not know is not scalarised, and programs are slow."""
     for names, (fun, args, parameters) in NAMED.items():
         with subtests.test(names=names):
             found = equations(jax.make_jaxpr(fun)(*args))

@@ -162,21 +162,20 @@ class AbstractStabilised(AbstractChartSolver, diffrax.AbstractAdaptiveSolver):
 
     def start(self, terms, t0, t1, y0, args) -> tuple[_State, Fault]:
         state, fault = super().start(terms, t0, t1, y0, args)
-        begin, _ = evaluation_times(t0, t1)
-        if self.spectral_radius is not None:
-            radius = self._radius(begin, y0, args, None)
-            fault = fault.with_case(
-                ~(radius >= 0),
-                "spectral_radius must not be negative, got a negative number or NaN at the start.",
-            )
-        iteration = None
-        if self.stages is None and self.spectral_radius is None:
-            iteration = first_iteration(terms, begin, y0, args)
-        most = None
+        iteration = most = is_unstable = None
         if self.stages is None:
-            z = jnp.abs(t1 - t0) * self._radius(begin, y0, args, iteration)
-            most = jnp.zeros((), z.dtype)
-        is_unstable = None if iteration is None else jnp.zeros((), bool)
+            begin, _ = evaluation_times(t0, t1)
+            if self.spectral_radius is None:
+                iteration = first_iteration(terms, begin, y0, args)
+                is_unstable = jnp.zeros((), bool)
+            radius = self._radius(begin, y0, args, iteration)
+            if self.spectral_radius is not None:
+                fault = fault.with_case(
+                    ~(radius >= 0),
+                    "spectral_radius must not be negative, got a negative number or NaN at the "
+                    "start.",
+                )
+            most = jnp.zeros((), (jnp.abs(t1 - t0) * radius).dtype)
         return _State(state.compensation, state.first, None, iteration, most, is_unstable), fault
 
     def _radius(self, t, y, args, iteration: Iteration | None) -> Real[Array, ""]:
