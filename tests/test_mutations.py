@@ -155,8 +155,12 @@ def test_a_matrix_of_a_small_repository(tmp_path):
     root = tmp_path / "root"
     (root / "tests").mkdir(parents=True)
     (root / "cfjax").mkdir()
-    (root / "pyproject.toml").write_text("[tool.coverage.run]\nsource = ['cfjax']\n")
+    # It reaches less than it demands.
+    (root / "pyproject.toml").write_text(
+        "[tool.coverage]\nrun.source = ['cfjax']\nreport.fail_under = 95\n"
+    )
     source = "LIMIT = 3\n\n\ndef f(x):\n    if x < 0:\n        return -x\n    return x\n"
+    source += "\n\ndef g(x):\n    return x\n"
     (root / "cfjax" / "__init__.py").write_text(source)
     tests = "import cfjax\n\n\ndef test_a():\n    cfjax.f(-1)\n\n\ndef test_b():\n    cfjax.f(1)\n"
     (root / "tests" / "test_f.py").write_text(tests)
