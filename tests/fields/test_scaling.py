@@ -6,6 +6,7 @@ import jax.numpy as jnp
 import numpy as np
 import problems
 import pytest
+from jax import lax
 
 import cfjax
 from cfjax import Scaling
@@ -22,35 +23,28 @@ def normal(seed, *shape):
     return np.random.default_rng(seed).normal(size=shape)
 
 
-@pytest.mark.parametrize(
-    ("dtype", "point_dtype"),
-    [
-        ("float32", "float32"),
-        ("float64", "float64"),
-        ("complex64", "complex64"),
-        ("complex128", "complex128"),
-        ("float64", "complex128"),
-    ],
-)
-def test_every_entry_is_relatively_accurate(dtype, point_dtype):
-    info = np.finfo(dtype)
-    rate = (LARGEST[str(info.dtype)] * RATES).astype(dtype)
-    if np.iscomplexobj(rate):
-        rate += (1j * np.linspace(-30, 30, len(rate))).astype(dtype)
-    # The entries have all sizes from 1e-3 to 1e3, and both signs.
-    point = (10.0 ** np.linspace(-3, 3, len(rate)) * (-1) ** np.arange(len(rate))).astype(dtype)
-    if point_dtype.startswith("complex"):
-        point = (point * np.exp(1j * np.arange(len(rate)))).astype(point_dtype)
-    flow, tangent = jax.jit(lambda field, x: (field.flow(x), field.tangent(x)))(
-        Scaling(rate), point
-    )
-    assert flow.dtype == tangent.dtype == point_dtype
-    exact = np.exp(rate.astype(np.clongdouble)) * point.astype(np.clongdouble)
-    # The exponential is off by up to two units, and a complex one in each part; then a product.
-    off = np.abs(np.asarray(flow, np.clongdouble) - exact) / np.abs(exact)
-    assert np.all(off <= 5 * info.eps)
-    off = np.abs(np.asarray(tangent, np.clongdouble) - rate * point.astype(np.clongdouble))
-    assert np.all(off <= 3 * info.eps * np.abs(rate * point))
+def test_every_entry_is_relatively_accurate():
+    dtypes = [(x, x) for x in ("float32", "float64", "complex64", "complex128")]
+    dtypes.append(("float64", "complex128"))
+    cases = []
+    for dtype, point_dtype in dtypes:
+        rate = (LARGEST[str(np.finfo(dtype).dtype)] * RATES).astype(dtype)
+        if np.iscomplexobj(rate):
+            rate += (1j * np.linspace(-30, 30, len(rate))).astype(dtype)
+        # The entries have all sizes from 1e-3 to 1e3, and both signs.
+        point = (10.0 ** np.linspace(-3, 3, len(rate)) * (-1) ** np.arange(len(rate))).astype(dtype)
+        if point_dtype.startswith("complex"):
+            point = (point * np.exp(1j * np.arange(len(rate)))).astype(point_dtype)
+        cases.append((rate, point))
+    motions = jax.jit(lambda xs: [(Scaling(r).flow(x), Scaling(r).tangent(x)) for r, x in xs])
+    for (rate, point), found in zip(cases, motions(cases), strict=True):
+        assert [x.dtype for x in found] == [point.dtype] * 2
+        flow, tangent = (np.asarray(x, np.clongdouble) for x in found)
+        eps, x = np.finfo(rate.dtype).eps, point.astype(np.clongdouble)
+        exact = np.exp(rate.astype(np.clongdouble)) * x
+        # The exponential is off by up to two units, and a complex one in each part; then a product.
+        assert np.all(np.abs(flow - exact) <= 5 * eps * np.abs(exact))
+        assert np.all(np.abs(tangent - rate * x) <= 3 * eps * np.abs(rate * x))
 
 
 def test_signs_zeros_and_moduli():
@@ -89,60 +83,57 @@ def test_what_is_small_decays_as_accurately_as_what_is_large():
     np.testing.assert_allclose(y1, y0 * np.exp(-210.0), rtol=5 * 60 * 6 * EPS)
 
 
-def test_derivatives():
-    """By time, twice, along a rate and a point that move; and pulled back. At zero too."""
-    p, q, w = (normal(k, 4) + 1j * normal(9 + k, 4) for k in range(3))
-    r = normal(5, 4) + 1j * normal(6, 4)
-    for rate in (np.zeros(4, complex), r, -300.0 + r):
+def test_derivatives_of_what_decays():
+    """To relative rounding: by time, twice, along a rate and a point that move; and pulled back."""
+    p, q, w = (jnp.asarray(normal(k, 4) + 1j * normal(9 + k, 4)) for k in range(3))
+    rate = -300.0 + normal(5, 4) + 1j * normal(6, 4)
 
-        def at(t, rate=rate):
-            return Scaling(rate + t * w).flow(p + t * q)
-
-        def first(t, at=at):
-            return jax.jvp(at, (t,), (jnp.ones_like(t),))[1]
-
+    @jax.jit
+    def everything():
+        at = lambda t: Scaling(rate + t * w).flow(p + t * q)  # noqa: E731
+        first = lambda t: jax.jvp(at, (t,), (jnp.ones_like(t),))[1]  # noqa: E731
         zero = jnp.zeros((), complex)
-        second = jax.jvp(first, (zero,), (zero + 1,))[1]
-        factor = np.exp(rate)
+        pulled = jax.vjp(lambda rate, x: Scaling(rate).flow(x), rate, p)[1](w)
+        return *jax.jvp(first, (zero,), (zero + 1,)), *pulled
+
+    factor = np.exp(rate)
+    wants = w * p + q, w * w * p + 2 * w * q, p * w, w
+    for found, want in zip(everything(), wants, strict=True):
         # Some ten roundings of numbers of up to 3, and of the rate's own in NumPy's factor.
-        rtol = 40 * EPS
-        np.testing.assert_allclose(first(zero), factor * (w * p + q), rtol=rtol)
-        np.testing.assert_allclose(second, factor * (w * w * p + 2 * w * q), rtol=rtol)
-        pulled = jax.vjp(lambda rate, x: Scaling(rate).flow(x), rate, p)[1](jnp.asarray(w))
-        np.testing.assert_allclose(pulled[0], factor * p * w, rtol=rtol)
-        np.testing.assert_allclose(pulled[1], factor * w, rtol=rtol)
+        np.testing.assert_allclose(found, factor * want, rtol=40 * EPS)
 
 
-@pytest.mark.parametrize("shape", [(), (1,), (4,), (1, 4), (3, 1), (3, 4), (2, 1, 1), (2, 3, 4)])
-def test_rates_are_broadcast(shape):
-    rate, x = normal(1, *shape), jnp.asarray(normal(2, 2, 3, 4))
-    field, full = Scaling(rate), Scaling(np.broadcast_to(rate, x.shape))
-    np.testing.assert_array_equal(field.flow(x), full.flow(x))
-    np.testing.assert_array_equal(field.tangent(x), full.tangent(x))
-    # An exponential of a rate is computed once.
-    jaxpr = str(jax.make_jaxpr(field.flow)(x))
-    sizes = ",".join(map(str, shape))
-    assert f"f64[{sizes}] = exp" in jaxpr
-    term = cfjax.LieTerm(lambda t, y, args: field)
+def test_rates_are_broadcast():
+    shapes = [(), (1,), (4,), (1, 4), (3, 1), (3, 4), (2, 1, 1), (2, 3, 4)]
+    x = jnp.asarray(normal(2, 2, 3, 4))
+
+    def motions(fields):
+        return [(field.flow(x), field.tangent(x)) for field in fields]
+
+    fields = [Scaling(normal(1, *shape)) for shape in shapes]
+    full = [Scaling(np.broadcast_to(field.rate, x.shape)) for field in fields]
+    found, wants = jax.jit(lambda *args: tuple(map(motions, args)))(fields, full)
+    jax.tree.map(np.testing.assert_array_equal, found, wants)
+    for shape, field in zip(shapes, fields, strict=True):
+        # An exponential of a rate is computed once.
+        jaxpr = str(jax.make_jaxpr(field.flow)(x))
+        assert f"f64[{','.join(map(str, shape))}] = exp" in jaxpr
+    term = cfjax.LieTerm(lambda t, y, args: fields[4])
     y1 = cfjax.integrate(term, cfjax.CF2(), 0.0, 1.0, x, num_steps=2).ys[-1]
     # Four flows, each of some units.
-    np.testing.assert_allclose(y1, full.flow(x), rtol=20 * EPS)
+    np.testing.assert_allclose(y1, wants[4][0], rtol=20 * EPS)
 
 
-def test_sums_and_the_algebra():
+def test_the_algebra_commutes():
     a, b = Scaling(normal(1, 4)), Scaling(normal(2, 4))
-    x = jnp.asarray(normal(3, 4))
     np.testing.assert_array_equal(a.bracket(b).rate, np.zeros(4))
     assert a.dexpinv(b, 5) is b
-    # One sum, and of a flow of a flow; a product and an exponential each.
-    together = cfjax.combine((1.0, 1.0), (a, b)).flow(x)
-    np.testing.assert_allclose(together, a.flow(b.flow(x)), rtol=20 * EPS)
-    assert a.increment(x) is None
+    assert a.increment(jnp.asarray(normal(3, 4))) is None
 
 
-@pytest.mark.parametrize("solver", [cfjax.RKMK3(), cfjax.RKMK5(), cfjax.RKMK8()])
-def test_a_munthe_kaas_method_acts_on_logarithms(solver):
+def test_a_munthe_kaas_method_acts_on_logarithms():
     """It is the method of its tableau for them, exactly."""
+    solver = cfjax.RKMK5()
 
     def rate(t, y):
         return jnp.stack([1 - y[1] + jnp.sin(t), y[0] - 1])
@@ -152,24 +143,20 @@ def test_a_munthe_kaas_method_acts_on_logarithms(solver):
     y0 = jnp.array([0.4, 1.2])
     y1 = cfjax.integrate(amounts, solver, 0.0, 5.0, y0, num_steps=8).ys[-1]
     z1 = cfjax.integrate(logarithms, solver, 0.0, 5.0, jnp.log(y0), num_steps=8).ys[-1]
-    # 13 stages of 8 steps, each with some units, and a flow of the equation that enlarges them.
-    np.testing.assert_allclose(y1, jnp.exp(z1), rtol=1e3 * EPS)
+    # 6 stages of 8 steps, each with some units, and a flow of the equation that enlarges them.
+    np.testing.assert_allclose(y1, jnp.exp(z1), rtol=5e2 * EPS)
 
 
-@pytest.mark.usefixtures("no_shape_hook")
-@pytest.mark.parametrize(
-    ("call", "error", "text"),
-    [
-        (
-            lambda: Scaling(np.arange(3)),
-            TypeError,
-            "rate must be one of float32, float64, complex64, complex128, got int64",
-        ),
-        (
-            lambda: Scaling(np.ones(3, np.float16)),
-            TypeError,
-            "rate must be one of float32, float64, complex64, complex128, got float16",
-        ),
+def test_refuses(no_shape_hook, subtests):
+    def solve(rate):
+        term = cfjax.LieTerm(lambda t, y, args: Scaling(rate))
+        cfjax.integrate(term, cfjax.CF2(), 0.0, 1.0, np.ones(3), num_steps=1)
+
+    one = Scaling(np.ones(3))
+    dtypes = "rate must be one of float32, float64, complex64, complex128, got"
+    for call, error, text in [
+        (lambda: Scaling(np.arange(3)), TypeError, f"{dtypes} int64"),
+        (lambda: Scaling(np.ones(3, np.float16)), TypeError, f"{dtypes} float16"),
         (
             lambda: Scaling(np.ones(4)).flow(jnp.ones((4, 3))),
             ValueError,
@@ -183,37 +170,29 @@ def test_a_munthe_kaas_method_acts_on_logarithms(solver):
         ),
         (
             # The result would have the shape of the rate.
-            lambda: Scaling(np.ones(3)).flow(jnp.ones(1)),
+            lambda: one.flow(jnp.ones(1)),
             ValueError,
             r"Scaling with rate of shape \(3,\) acts on .* broadcasts to, got \(1,\)\.$",
         ),
         (
-            lambda: Scaling(np.ones(3)).flow(jnp.ones(3, jnp.float32)),
+            lambda: one.flow(jnp.ones(3, jnp.float32)),
             TypeError,
             "rate must have the precision of the point, float32, got float64",
         ),
         (
-            lambda: Scaling(np.ones(3)).bracket(cfjax.LeftMatrix(np.eye(3))),
+            lambda: one.bracket(cfjax.LeftMatrix(np.eye(3))),
             TypeError,
             "Cannot compute the bracket of Scaling and LeftMatrix: both must be of one class",
         ),
-    ],
-)
-def test_refuses(call, error, text):
-    with pytest.raises(error, match=text):
-        call()
-
-
-@pytest.mark.usefixtures("no_shape_hook")
-def test_a_solve_refuses():
-    def solve(rate):
-        term = cfjax.LieTerm(lambda t, y, args: Scaling(rate))
-        cfjax.integrate(term, cfjax.CF2(), 0.0, 1.0, np.ones(3), num_steps=1)
-
-    with pytest.raises(ValueError, match="make y0 complex"):
-        solve(1j * np.ones(3))
-    with pytest.raises(TypeError, match="does not act there: rate must have the precision of the"):
-        solve(np.ones(3, np.float32))
+        (lambda: solve(1j * np.ones(3)), ValueError, "make y0 complex"),
+        (
+            lambda: solve(np.ones(3, np.float32)),
+            TypeError,
+            "does not act there: rate must have the precision of the",
+        ),
+    ]:
+        with subtests.test(case=text), pytest.raises(error, match=text):
+            call()
 
 
 # The nonlinear Schroedinger equation i psi_t = -psi_xx / 2 - |psi|^2 psi, on a period so long that
@@ -232,31 +211,34 @@ def soliton(t):
 
 TERMS = diffrax.MultiTerm(
     cfjax.LieTerm(lambda t, psi, args: Scaling(1j * (jnp.abs(psi) ** 2).astype(psi.dtype))),
-    cfjax.LieTerm(
-        lambda t, psi, args: cfjax.Affine(jnp.zeros_like(psi), KINETIC, FOURIER),
-    ),
+    cfjax.LieTerm(lambda t, psi, args: cfjax.Affine(jnp.zeros_like(psi), KINETIC, FOURIER)),
 )
 
 
-def test_the_terms_of_the_nonlinear_schroedinger_equation_have_exact_flows():
-    cfjax.check_terms(TERMS, 0.0, jnp.asarray(soliton(0.3)))
-
-
-@pytest.mark.parametrize(("solver", "order"), [(cfjax.Strang(), 2), (cfjax.BlanesMoan4(), 4)])
+@pytest.mark.parametrize(("solver", "order"), [(cfjax.BlanesMoan4(), 4), (cfjax.Strang(), 2)])
 def test_the_order_of_a_splitting_for_a_soliton(solver, order):
+    y0 = jnp.asarray(soliton(0.0))
+
+    @jax.jit
+    def end(num_steps):
+        h = 2.0 / num_steps
+
+        def step(n, carry):
+            y, state = carry
+            y, *_, state, _ = solver.step(TERMS, n * h, (n + 1) * h, y, None, state, False)
+            return y, state
+
+        start = y0, solver.init(TERMS, 0.0, h, y0, None)
+        return lax.fori_loop(0, num_steps, step, start)[0]
+
     steps = [20, 40, 80]
-    ends = [
-        cfjax.integrate(TERMS, solver, 0.0, 2.0, soliton(0.0), num_steps=n).ys[-1] for n in steps
-    ]
+    ends = [end(n) for n in steps]
     errors = np.array([np.abs(end - soliton(2.0)).max() for end in ends])
     assert order - 0.1 < problems.slope(steps, errors) < order + 0.1
     # The norm, with some units of rounding for each of 80 or 480 transforms and phases.
-    norms = [np.linalg.norm(y) for y in (ends[-1], soliton(0.0))]
+    norms = [np.linalg.norm(y) for y in (ends[-1], y0)]
     assert norms[0] == pytest.approx(norms[1], rel=480 * 10 * EPS)
-
-
-def test_a_splitting_of_order_4_reaches_the_error_of_the_grid():
-    y1 = cfjax.integrate(TERMS, cfjax.BlanesMoan4(), 0.0, 2.0, soliton(0.0), num_steps=640).ys[-1]
-    # Its own is 3e-9 / 8^4 = 7e-13; the grid's is as large, and so is the rounding of 640 * 13
-    # transforms of some units each.
-    np.testing.assert_allclose(y1, soliton(2.0), rtol=0, atol=5e-12)
+    if order == 4:
+        # Its own is 3e-9 / 8^4 = 7e-13; the grid's is as large, and so is the rounding of 640 * 13
+        # transforms of some units each.
+        np.testing.assert_allclose(end(640), soliton(2.0), rtol=0, atol=5e-12)
