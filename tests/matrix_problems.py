@@ -145,10 +145,7 @@ PROBLEMS = {
 
 def both(t, y, args):
     """Columns and a lattice, each with a projection of its own."""
-    return {
-        "columns": left(t, y["columns"], args),
-        "lattice": flow_of_toda(t, y["lattice"], None),
-    }
+    return {"columns": left(t, y["columns"], args), "lattice": flow_of_toda(t, y["lattice"], None)}
 
 
 _GIVEN = PROBLEMS["columns"]
@@ -158,30 +155,3 @@ BOTH = Problem(
     _GIVEN.args,
     lambda t: {"columns": _GIVEN.exact(t), "lattice": toda.reference(t, LATTICE)},
 )
-
-
-def check_batches(given, solver, scaled):
-    """`vmap` and leading axes, of fields at two scales, give what single solves do."""
-    y0, args = problems.arrays((given.y0, given.args))
-    scales, options = jnp.asarray([0.3, 1.0]), {"num_steps": 3}
-
-    def of_one(t, y, args):
-        scale, args = args
-        return scaled(scale, given.field(t, y, args))
-
-    def of_both(t, y, args):
-        scales, args = args
-        return jax.vmap(lambda scale, y: of_one(t, y, (scale, args)))(scales, y)
-
-    def solve(field, y0, scale):
-        term = cfjax.LieTerm(field)
-        ys = cfjax.integrate(term, solver, 0.0, 1.0, y0, (scale, args), **options).ys
-        return jax.tree_util.tree_map(lambda y: y[-1], ys)
-
-    stack = lambda *xs: jnp.stack(xs)  # noqa: E731
-    expected = jax.tree_util.tree_map(stack, *(solve(of_one, y0, x) for x in scales))
-    assert max(np.abs(x[0] - x[1]).max() for x in jax.tree_util.tree_leaves(expected)) > 0.01
-    pairs = jax.tree_util.tree_map(stack, y0, y0)
-    problems.assert_close(solve(of_both, pairs, scales), expected, 1e-14)
-    found = jax.vmap(lambda x: solve(of_one, y0, x))(scales)
-    problems.assert_close(found, expected, 1e-14)

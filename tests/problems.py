@@ -1,6 +1,7 @@
 """Problems and small tools that several test files share. No answer here comes from cfjax."""
 
 from collections.abc import Callable, Sequence
+from itertools import pairwise
 from typing import Any, cast
 
 import diffrax
@@ -10,7 +11,7 @@ import jax.numpy as jnp
 import jax.tree_util as jtu
 import numpy as np
 from jax import lax
-from jax.extend.core import jaxprs_in_params
+from jax.extend.core import jaxpr_as_fun, jaxprs_in_params
 from scipy.integrate import solve_ivp
 
 import cfjax
@@ -291,3 +292,29 @@ SQUARES_OF_ANGLES = [
     110.0,
     1e4,
 ]
+
+
+def hat(w) -> np.ndarray:
+    """The matrix of the cross product with w."""
+    return np.array([[0, -w[2], w[1]], [w[2], 0, -w[0]], [-w[1], w[0], 0]])
+
+
+def op_by_op(fun: Callable[..., Any], *args: Any) -> Any:
+    """`fun(*args)` by its program, operation by operation.
+
+    Each operation is compiled once for all programs. To compile every program takes far longer.
+    """
+    args = arrays(args)
+    program, shape = jax.make_jaxpr(fun, return_shape=True)(*args)
+    return jtu.tree_unflatten(
+        jtu.tree_structure(shape), jaxpr_as_fun(program)(*jtu.tree_leaves(args))
+    )
+
+
+def in_pieces(term, solver, t0, t1, y0, args, num_steps: int, pieces: int) -> Any:
+    """The end of as many solves of `num_steps` steps, one after the other, by one program."""
+    y, args = arrays((y0, args))
+    for start, end in pairwise(np.linspace(t0, t1, pieces + 1)):
+        ys = cfjax.integrate(term, solver, start, end, y, args, num_steps=num_steps).ys
+        y = jtu.tree_map(lambda x: x[-1], ys)
+    return y

@@ -74,12 +74,10 @@ def num_marked(jaxpr, used=None):
     return total
 
 
-# The rows in four tests, as this takes longest.
-@pytest.mark.parametrize("part", range(4))
-def test_evaluations_of_a_step(part, subtests):
-    for name in list(ROWS)[part::4]:
+def test_evaluations_of_a_step(subtests):
+    for name, row in ROWS.items():
         with subtests.test(name=name):
-            check_evaluations(ROWS[name])
+            check_evaluations(row)
 
 
 def check_evaluations(row):

@@ -2,79 +2,74 @@
 
 from typing import Any
 
+import diffrax
 import jax
 import jax.numpy as jnp
 import numpy as np
 import problems
 import pytest
-from matrix_problems import PROBLEMS, skew
+from matrix_checks import product
+from matrix_problems import PROBLEMS, Problem, skew
 
 import cfjax
+from cfjax.scenes import zeitlin
 
 NAMES = ["projected", "cayley"]
 
 
-@pytest.mark.parametrize("make", [cfjax.RKMK5, cfjax.RKMK8])
-@pytest.mark.parametrize("name", ["caley", "Projected", None])
-def test_other_coordinates_are_refused(make, name, no_shape_hook):
+def test_coordinates_are_part_of_the_method(no_shape_hook):
     message = "coordinates must be 'exponential', 'projected' or 'cayley', got"
-    with pytest.raises(ValueError, match=message):
-        make(coordinates=name)
-
-
-@pytest.mark.parametrize("coordinates", NAMES)
-def test_coordinates_are_part_of_the_method(coordinates):
-    solver = cfjax.RKMK5(coordinates=coordinates)
-    assert cfjax.RKMK5() == cfjax.RKMK5(coordinates="exponential") != solver
-    assert solver == cfjax.RKMK5(coordinates=coordinates)
-    for name in ("a", "b", "b_error", "c"):
-        assert getattr(solver, name) == getattr(cfjax.RKMK5(), name)
+    for name in ("caley", "Projected", None):
+        with pytest.raises(ValueError, match=message):
+            cfjax.RKMK8(coordinates=name)
+    for name in NAMES:
+        solver = cfjax.RKMK5(coordinates=name)
+        assert cfjax.RKMK5() == cfjax.RKMK5(coordinates="exponential") != solver
+        assert solver == cfjax.RKMK5(coordinates=name)
+        for row in ("a", "b", "b_error", "c"):
+            assert getattr(solver, row) == getattr(cfjax.RKMK5(), row)
 
 
 CLOSED = r'coordinates="exponential", the default'
 OTHERS = r"commutator-free method.*cfjax\.CF4\(\)"
 
 
-@pytest.mark.parametrize("coordinates", NAMES)
-@pytest.mark.parametrize(
-    "field, y0, name, advice",
-    [
-        (lambda y: cfjax.Rotation(-y), np.ones(3), "Rotation", CLOSED),
-        (
-            lambda y: cfjax.QuaternionRotation(y[1:], frame="body", layout="wxyz"),
-            np.eye(4)[0],
-            "QuaternionRotation",
-            CLOSED,
-        ),
-        (
-            lambda y: cfjax.RigidMotion(omega=y[:3], v=y[:3], frame="body", layout="wxyz_xyz"),
-            np.eye(7)[0],
-            "RigidMotion",
-            CLOSED,
-        ),
-        (lambda y: cfjax.Congruence(-y, y), np.eye(2), "Congruence", OTHERS),
-        (
-            lambda y: cfjax.Affine(y, -jnp.ones(3)),
-            np.ones(3),
-            "Affine",
-            OTHERS,
-        ),
-        (lambda y: {"a": -y["a"], "b": cfjax.Rotation(y["b"])}, None, "Rotation", CLOSED),
-        (
-            lambda y: cfjax.elementwise(problems.Growth(y[:, 0])),
-            np.ones((2, 3)),
-            "Elementwise",
-            OTHERS,
-        ),
-    ],
-)
-def test_fields_without_these_coordinates_are_refused(coordinates, field, y0, name, advice):
-    y0 = {"a": jnp.ones(2), "b": jnp.ones(3)} if y0 is None else jnp.asarray(y0)
-    term = cfjax.LieTerm(lambda t, y, args: field(y))
-    solver = cfjax.RKMK5(coordinates=coordinates)
-    message = f'^{name} has no coordinates for coordinates="{coordinates}".*{advice}'
-    with pytest.raises(TypeError, match=message):
-        cfjax.integrate(term, solver, 0.0, 1.0, y0, num_steps=2)
+REFUSED = {
+    "Rotation": (lambda y: cfjax.Rotation(-y), jnp.ones(3), CLOSED),
+    "QuaternionRotation": (
+        lambda y: cfjax.QuaternionRotation(y[1:], frame="body", layout="wxyz"),
+        jnp.eye(4)[0],
+        CLOSED,
+    ),
+    "RigidMotion": (
+        lambda y: cfjax.RigidMotion(omega=y[:3], v=y[:3], frame="body", layout="wxyz_xyz"),
+        jnp.eye(7)[0],
+        CLOSED,
+    ),
+    "Congruence": (lambda y: cfjax.Congruence(-y, y), jnp.eye(2), OTHERS),
+    "Affine": (lambda y: cfjax.Affine(y, -jnp.ones(3)), jnp.ones(3), OTHERS),
+    "Rotation of a part": (
+        lambda y: {"a": -y["a"], "b": cfjax.Rotation(y["b"])},
+        {"a": jnp.ones(2), "b": jnp.ones(3)},
+        CLOSED,
+    ),
+    "Elementwise": (
+        lambda y: cfjax.elementwise(problems.Growth(y[:, 0])),
+        jnp.ones((2, 3)),
+        OTHERS,
+    ),
+}
+
+
+def test_fields_without_these_coordinates_are_refused(subtests):
+    for name, (field, y0, advice) in REFUSED.items():
+        term = cfjax.LieTerm(lambda t, y, args, field=field: field(y))
+        for coordinates in NAMES:
+            solver = cfjax.RKMK5(coordinates=coordinates)
+            message = f'^{name.split()[0]} has no coordinates for coordinates="{coordinates}"'
+            with subtests.test(case=(name, coordinates)):
+                with pytest.raises(TypeError, match=f"{message}.*{advice}"):
+                    cfjax.integrate(term, solver, 0.0, 1.0, y0, num_steps=2)
 
 
 class Turn(cfjax.AbstractFrozenField):
@@ -109,24 +104,24 @@ def test_a_field_of_a_users_own_can_take_those_of_its_matrix(coordinates):
     assert abs(np.linalg.norm(y) - 1) < 4e-16
 
 
-@pytest.mark.parametrize("coordinates", NAMES)
-@pytest.mark.parametrize("problem", ["SU(3)", "Toda", "orthonormal columns, low rank"])
-def test_the_field_at_the_end_of_a_step_is_the_first_of_the_next(coordinates, problem):
-    """So a step takes six evaluations, with its estimate."""
-    given, count = PROBLEMS[problem], []
+def test_the_field_at_the_end_of_a_step_is_the_first_of_the_next():
+    """So a step of three stages takes as many evaluations, with its estimate."""
+    given = product({x: PROBLEMS[x] for x in ("SU(3)", "Toda", "orthonormal columns, low rank")})
+    (y0, args), count = problems.arrays((given.y0, given.args)), []
 
     def field(t, y, args):
         count.append(None)
         return given.field(t, y, args)
 
-    solver = cfjax.RKMK5(coordinates=coordinates, unroll=True)
-    y0, args = problems.arrays((given.y0, given.args))
-    term = cfjax.LieTerm(field)
-    t0, t1 = jnp.asarray(0.0), jnp.asarray(0.1)
-    state = solver.init(term, t0, t1, y0, args)
-    count.clear()
-    jax.eval_shape(lambda: solver.step(term, t0, t1, y0, args, state, made_jump=False))
-    assert len(count) == 6
+    term, times = cfjax.LieTerm(field), (jnp.asarray(0.0), jnp.asarray(0.1))
+    for coordinates in NAMES:
+        solver = cfjax.RKMK(diffrax.Bosh3.tableau, coordinates=coordinates, unroll=True)
+        state = solver.init(term, *times, y0, args)
+        count.clear()
+        jax.eval_shape(
+            lambda: solver.step(term, *times, y0, args, state, made_jump=False)  # noqa: B023
+        )
+        assert len(count) == 3
 
 
 @pytest.mark.parametrize("coordinates", NAMES)
@@ -147,7 +142,7 @@ def test_products_with_arrays_and_parts_at_rest(coordinates):
         "path": np.zeros(5),
     }
     y0, args = problems.arrays((y0, frame.args))
-    term, solver = cfjax.LieTerm(field), cfjax.RKMK8(coordinates=coordinates)
+    term, solver = cfjax.LieTerm(field), cfjax.RKMK8(coordinates=coordinates, unroll=False)
     ys: Any = cfjax.integrate(term, solver, 0.0, 2.0, y0, args, num_steps=20).ys
     times, weights = np.polynomial.legendre.leggauss(20)
     path = sum(w * frame.exact(1 + t)[:, 0] for t, w in zip(times, weights, strict=True))
@@ -159,17 +154,36 @@ def test_products_with_arrays_and_parts_at_rest(coordinates):
 
 
 @pytest.mark.parametrize("coordinates", NAMES)
-@pytest.mark.parametrize("cls, factor", [(cfjax.Conjugation, 1.0), (cfjax.Congruence, 1.0j)])
-def test_multiples_of_the_identity_that_move_nothing(coordinates, cls, factor):
+def test_multiples_of_the_identity_that_move_nothing(coordinates):
     """They are no turn, whatever their size, and no error."""
     a, y0 = skew(3, True), jnp.diag(jnp.arange(3.0)).astype(complex)
-    unit = factor * jnp.eye(3, dtype=complex)
-    term = cfjax.LieTerm(lambda t, y, s: cls(jnp.cos(t).astype(complex) * a + s * unit))
+    unit = jnp.eye(3, dtype=complex)
+
+    def field(t, y, s):
+        moved = jnp.cos(t).astype(complex) * a
+        return cfjax.Conjugation(moved + s * unit), cfjax.Congruence(moved + s * (1j * unit))
+
+    term, solver = cfjax.LieTerm(field), cfjax.RKMK5(coordinates=coordinates, unroll=False)
 
     def end(size):
         s = jnp.asarray(size, complex)
-        solver = cfjax.RKMK5(coordinates=coordinates)
-        return cfjax.integrate(term, solver, 0.0, 1.0, y0, s, num_steps=4).ys[-1]
+        return cfjax.integrate(term, solver, 0.0, 1.0, (y0, y0), s, num_steps=4).ys
 
     # Rounding of a matrix with such entries.
-    np.testing.assert_allclose(end(50.0), end(0.0), rtol=0, atol=5e-14)
+    problems.assert_close(end(50.0), end(0.0), 5e-14)
+
+
+@pytest.mark.parametrize("coordinates", NAMES)
+def test_rossby_haurwitz_waves(coordinates):
+    """Vorticity on a sphere as a Hermitian matrix: the eigenvalues stay, and the pattern turns."""
+    n, t1 = 8, 2.0
+    args = zeitlin.inverse_laplacian(n)
+    start, end = (zeitlin.rossby_haurwitz(t, n) for t in (0.0, t1))
+    solver = cfjax.RKMK8(coordinates=coordinates, unroll=False)
+    y = np.asarray(Problem(zeitlin.field, start, args, None).end(solver, t1, 40))
+    np.testing.assert_array_equal(y, y.conj().T)
+    spectra = [np.linalg.eigvalsh(x) for x in (y, start)]
+    # Some roundings of eigenvalues up to 10.
+    np.testing.assert_allclose(*spectra, rtol=0, atol=4e-14)
+    assert np.abs(start - end).max() > 0.5
+    np.testing.assert_allclose(y, end, rtol=0, atol=1e-8)

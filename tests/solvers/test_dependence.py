@@ -29,42 +29,35 @@ DEPENDING = {
 }
 
 
-@pytest.mark.parametrize("name", DEPENDING)
-def test_a_field_that_depends_on_the_state_is_refused(name):
-    with pytest.raises(TypeError, match=r"t but not on y.*depends on the state.*cfjax.CF4\(\)"):
-        cfjax.integrate(
-            cfjax.LieTerm(DEPENDING[name]), cfjax.Magnus6(), 0.0, 1.0, START, num_steps=2
-        )
+def solve(field, solver, y0=START):
+    return cfjax.integrate(cfjax.LieTerm(field), solver, 0.0, 1.0, y0, num_steps=2).ys[-1]
 
 
-def test_a_frame_in_its_own_span_is_refused():
-    y0 = np.linalg.qr(np.arange(8.0).reshape(4, 2) ** 2 + np.eye(4)[:, :2])[0]
-    term = cfjax.LieTerm(
-        lambda t, y, _: cfjax.LowRankSkew(jnp.sin(t + jnp.arange(8.0)).reshape(4, 2))
-    )
-    with pytest.raises(TypeError, match="LowRankSkew, depends on the state"):
-        cfjax.integrate(term, cfjax.Magnus4(), 0.0, 1.0, y0, num_steps=2)
-
-
-def test_the_error_names_the_part_of_the_state():
-    def field(t, y, args):
-        return {"R": cfjax.Rotation(jnp.ones(3)), "m": y["m"]}
-
-    y0 = {"R": jnp.eye(3), "m": jnp.ones(3)}
-    with pytest.raises(TypeError, match=r"Magnus8.*y\['m'\].*a translation.*LeftMatrix\(A\(t\)\)"):
-        diffrax.diffeqsolve(cfjax.LieTerm(field), cfjax.Magnus8(), 0.0, 1.0, 0.1, y0)
-
-
-def test_an_ordinary_term_that_depends_on_the_state_is_refused():
-    term = diffrax.ODETerm(lambda t, y, _: t * y)
-    with pytest.raises(TypeError, match="Magnus2 takes fields that depend on t but not on y"):
-        cfjax.integrate(term, cfjax.Magnus2(), 0.0, 1.0, START, num_steps=2)
+def test_a_field_that_depends_on_the_state_is_refused(subtests):
+    message = r"t but not on y.*depends on the state.*cfjax.CF4\(\)"
+    for name, field in DEPENDING.items():
+        with subtests.test(field=name), pytest.raises(TypeError, match=message):
+            solve(field, cfjax.Magnus6())
+    with subtests.test(field="a frame in its own span"):
+        y0 = np.linalg.qr(np.arange(8.0).reshape(4, 2) ** 2 + np.eye(4)[:, :2])[0]
+        columns = jnp.sin(jnp.arange(8.0)).reshape(4, 2)
+        with pytest.raises(TypeError, match="LowRankSkew, depends on the state"):
+            solve(lambda t, y, _: cfjax.LowRankSkew(t * columns), cfjax.Magnus4(), y0)
+    with subtests.test(field="an ordinary term"):
+        term = diffrax.ODETerm(lambda t, y, _: t * y)
+        with pytest.raises(TypeError, match="Magnus2 takes fields that depend on t but not on y"):
+            cfjax.integrate(term, cfjax.Magnus2(), 0.0, 1.0, START, num_steps=2)
+    with subtests.test(field="a part of the state"):
+        term = cfjax.LieTerm(lambda t, y, _: {"R": cfjax.Rotation(jnp.ones(3)), "m": y["m"]})
+        y0 = {"R": jnp.eye(3), "m": jnp.ones(3)}
+        message = r"Magnus8.*y\['m'\].*a translation.*LeftMatrix\(A\(t\)\)"
+        with pytest.raises(TypeError, match=message):
+            diffrax.diffeqsolve(term, cfjax.Magnus8(), 0.0, 1.0, 0.1, y0)
 
 
 def test_dependence_is_seen_within_other_solvers_and_transformations():
     def end(y0):
-        solver, term = cfjax.Richardson(cfjax.Magnus2()), cfjax.LieTerm(DEPENDING["coordinates"])
-        return cfjax.integrate(term, solver, 0.0, 1.0, y0, num_steps=2).ys[-1].sum()
+        return solve(DEPENDING["coordinates"], cfjax.Richardson(cfjax.Magnus2()), y0).sum()
 
     with pytest.raises(TypeError, match="depends on the state"):
         jax.jit(jax.vmap(jax.grad(end)))(jnp.ones((2, 3)))
@@ -78,8 +71,7 @@ def on_host(*operands, **options):
 
 
 def solve_on_host(field):
-    y0 = jnp.asarray([1.0, 0.0])
-    return cfjax.integrate(cfjax.LieTerm(field), cfjax.Magnus4(), 0.0, 1.0, y0, num_steps=2).ys[-1]
+    return solve(field, cfjax.Magnus4(), jnp.asarray([1.0, 0.0]))
 
 
 def test_a_function_of_the_host_may_take_the_time():
@@ -88,16 +80,14 @@ def test_a_function_of_the_host_may_take_the_time():
     np.testing.assert_allclose(y1, [np.cos(0.5), -np.sin(0.5)], rtol=0, atol=1e-15)
 
 
-@pytest.mark.parametrize(
-    ("options", "message"),
-    [
-        ({}, r"^The field gives y to a function of the host \(jax\.pure_callback without"),
+def test_a_function_of_the_host_may_not_take_the_state():
+    message = r"^The field gives y to a function of the host \(jax\.pure_callback without"
+    for options, text in (
+        ({}, message),
         ({"vmap_method": "sequential"}, "LeftMatrix, depends on the state"),
-    ],
-)
-def test_a_function_of_the_host_may_not_take_the_state(options, message):
-    with pytest.raises(TypeError, match=message):
-        solve_on_host(lambda t, y, args: cfjax.LeftMatrix(on_host(t, y, **options)))
+    ):
+        with pytest.raises(TypeError, match=text):
+            solve_on_host(lambda t, y, args: cfjax.LeftMatrix(on_host(t, y, **options)))  # noqa: B023
 
 
 def test_a_mistake_in_the_field_has_its_own_message():

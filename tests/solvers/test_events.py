@@ -15,8 +15,8 @@ from scipy.integrate import solve_ivp
 
 import cfjax
 
-# For each kind of field one that comes to rest, with its velocity as a plain function in NumPy and
-# the start. At rest the coordinates are zero of the quaternion's and the translation's alone.
+# Fields that come to rest, with their velocity as a plain function in NumPy and the start. The
+# velocity of each kind of field is checked in fields/test_contract.py.
 
 SCALES = np.array([1.0, 2.0, 3.0, 4.0])
 AIM = np.array([0.6, 0.0, 0.8])
@@ -32,27 +32,8 @@ def rotation_ode(t, y):
     return np.cross(np.cross(y, AIM), y)
 
 
-def quaternion(t, y, args):
-    return cfjax.QuaternionRotation(-y[1:] * y[0], frame="fixed", layout="wxyz")
-
-
-def quaternion_ode(t, y):
-    w, v = y[0], y[1:]
-    omega = -v * w
-    return np.append(-omega @ v, w * omega + np.cross(omega, v)) / 2
-
-
-def matrix(t, y, args):
-    a = jnp.diag(jnp.asarray(SCALES))
-    return cfjax.LeftMatrix(a - jnp.dot(y, a @ y) * jnp.eye(4))
-
-
 def matrix_ode(t, y):
     return SCALES * y - y * (y @ (SCALES * y))
-
-
-def sphere(t, y, args):
-    return cfjax.SphereRotation(SCALES * y)
 
 
 def low_rank(t, y, args):
@@ -63,14 +44,6 @@ def low_rank_ode(t, y):
     q = y.reshape(4, 2)
     g = SCALES[:, None] * q
     return (g @ (q.T @ q) - q @ (g.T @ q)).ravel()
-
-
-def affine(t, y, args):
-    return cfjax.Affine(jnp.sin(y) + 1.0, -SCALES)
-
-
-def affine_ode(t, y):
-    return -SCALES * y + np.sin(y) + 1.0
 
 
 def product(t, y, args):
@@ -84,11 +57,7 @@ def product_ode(t, y):
 UNIT = np.array([0.7, 0.5, 0.1, 0.5])
 CASES: dict[str, Any] = {
     "Rotation": (rotation, rotation_ode, np.array([0.48, 0.6, -0.64])),
-    "QuaternionRotation": (quaternion, quaternion_ode, UNIT),
-    "LeftMatrix": (matrix, matrix_ode, UNIT),
-    "SphereRotation": (sphere, matrix_ode, UNIT),
     "LowRankSkew": (low_rank, low_rank_ode, FRAME),
-    "Affine": (affine, affine_ode, np.zeros(4)),
     "a pytree": (product, product_ode, {"on": UNIT, "x": np.array([0.2, 0.0])}),
 }
 cases = pytest.mark.parametrize("name", CASES)
@@ -98,27 +67,23 @@ cases = pytest.mark.parametrize("name", CASES)
 
 SOLVERS = {
     "CF4": cfjax.CF4(),
-    "CG4": cfjax.CG4(),
-    "BWRRK53": cfjax.BWRRK53(),
     "RKMK4": cfjax.RKMK4(),
-    "RKMK": cfjax.RKMK(diffrax.Dopri5.tableau),
     "Magnus4": cfjax.Magnus4(),
-    "CayleyRK4": cfjax.CayleyRK4(),
     "Richardson": cfjax.Richardson(cfjax.CF4()),
     "HalfSolver": diffrax.HalfSolver(cfjax.RKMK3()),
 }
 
 
-@cases
-def test_func_is_the_velocity(name):
+def test_func_is_the_velocity():
     """As diffrax means it: what an event calls steady, and a first step is chosen by."""
-    field, ode, y0 = CASES[name]
-    y = problems.arrays(y0)
-    expected = ode(0.3, problems.flat(y0))
-    for solver in SOLVERS.values():
-        found = solver.func(cfjax.LieTerm(field), jnp.asarray(0.3), y, None)
+    pairs = [("CF4", name) for name in CASES] + [(solver, "a pytree") for solver in SOLVERS]
+    for solver, name in pairs:
+        field, ode, y0 = CASES[name]
+        y = problems.arrays(y0)
+        found = SOLVERS[solver].func(cfjax.LieTerm(field), jnp.asarray(0.3), y, None)
         assert jtu.tree_structure(found) == jtu.tree_structure(y)
         # Some ten products of numbers below 10.
+        expected = ode(0.3, problems.flat(y0))
         np.testing.assert_allclose(problems.flat(found), expected, rtol=0, atol=1e-14)
 
 
@@ -172,17 +137,14 @@ def steady(field, solver, y0, condition, controller=None, t1=100.0, **kwargs):
     return diffrax.diffeqsolve(
         cfjax.LieTerm(field),
         solver,
-        0.0,
-        t1,
-        STEP,
-        problems.arrays(y0),
+        *(0.0, t1, STEP, problems.arrays(y0)),
         stepsize_controller=diffrax.ConstantStepSize() if controller is None else controller,
         event=diffrax.Event(condition),
         **kwargs,
     )
 
 
-@pytest.mark.representatives(3)
+@pytest.mark.representatives(1)
 @cases
 def test_a_steady_state_ends_a_solve(name):
     field, ode, y0 = CASES[name]
@@ -199,12 +161,12 @@ def test_a_steady_state_ends_a_solve(name):
     np.testing.assert_allclose(sol.ts[-1], np.ceil(nodes) * STEP, rtol=0, atol=1e-12)
 
 
-@pytest.mark.representatives(1)
+@pytest.mark.slow
 @pytest.mark.parametrize("rtol", [0.0, 1e-4], ids=["absolute", "relative"])
 def test_the_tolerances_of_a_steady_state_may_be_the_controller_s(rtol):
-    field, ode, y0 = CASES["SphereRotation"]
+    field, ode, y0 = CASES["LowRankSkew"]
     controller = diffrax.PIDController(rtol=rtol, atol=1e-5)
-    # A state of length 1 has a root mean square of 1/2.
+    # Two columns of length 1 with 8 entries have a root mean square of 1/2.
     limit = 1e-5 + rtol / 2
     time, _ = crossing(ode, y0, lambda t, y: root_mean_square(ode(t, y)) - limit)
     sol = steady(
@@ -224,28 +186,10 @@ def test_the_tolerances_of_a_steady_state_may_be_the_controller_s(rtol):
     assert ts[-1] < 20.0
 
 
-def test_a_steady_state_of_a_sum_of_terms():
-    """Each of the two goes on at rest. The norm is one of our own, of the whole velocity."""
-    to = cfjax.LieTerm(lambda t, y, args: cfjax.SphereRotation(2.0 * SCALES * y + jnp.ones(4)))
-    fro = cfjax.LieTerm(lambda t, y, args: cfjax.SphereRotation(-SCALES * y - jnp.ones(4)))
-    time, _ = crossing(matrix_ode, UNIT, lambda t, y: np.abs(matrix_ode(t, y)).max() - 1e-3)
-    condition = diffrax.steady_state_event(0.0, 1e-3, norm=lambda y: jnp.max(jnp.abs(y)))
-    sol = diffrax.diffeqsolve(
-        diffrax.MultiTerm(to, fro),
-        cfjax.CF4(estimate=None),
-        0.0,
-        100.0,
-        STEP,
-        jnp.asarray(UNIT),
-        event=diffrax.Event(condition),
-    )
-    np.testing.assert_allclose(sol.ts[-1], np.ceil(time / STEP) * STEP, rtol=0, atol=1e-12)
-
-
 # Other events
 
 
-@pytest.mark.representatives(2)
+@pytest.mark.representatives(1)
 @cases
 def test_events_of_every_kind_at_once(name):
     """Numbers with directions, a bool, and a root: the first that happens ends the solve."""
@@ -273,10 +217,7 @@ def test_events_of_every_kind_at_once(name):
         return diffrax.diffeqsolve(
             cfjax.LieTerm(field),
             cfjax.CF4(),
-            0.0,
-            4.0,
-            0.1,
-            problems.arrays(y0),
+            *(0.0, 4.0, 0.1, problems.arrays(y0)),
             stepsize_controller=diffrax.PIDController(rtol=0.0, atol=1e-9),
             event=event,
             max_steps=512,
@@ -292,22 +233,13 @@ def test_events_of_every_kind_at_once(name):
     np.testing.assert_allclose(found.ts[-1], time, rtol=0, atol=1e-5)
 
 
-@pytest.mark.representatives(1)
-@pytest.mark.parametrize("solver", [cfjax.CF4(), cfjax.RKMK3()], ids=["CF4", "RKMK3"])
-def test_without_a_root_finder_an_event_ends_with_its_step(solver):
-    field, ode, y0 = CASES["LowRankSkew"]
-    time, _ = crossing(ode, y0, lambda t, y: t - 0.513)
-    sol = steady(field, solver, y0, lambda t, y, args, **kwargs: t - 0.513)
-    # The times add up with a rounding each.
-    np.testing.assert_allclose(sol.ts[-1], np.ceil(time / STEP) * STEP, rtol=0, atol=1e-12)
-
-
 def test_each_member_of_a_batch_has_an_event_and_a_result_of_its_own():
     """`y' = y^2` is `y0 / (1 - t y0)`: one blows up, one passes its level, one does neither."""
 
     def passes(t, y, args, **kwargs):
         return y[0] > args
 
+    @eqx.filter_jit
     def one(y0, level):
         return diffrax.diffeqsolve(
             cfjax.LieTerm(lambda t, y, args: y * y),

@@ -1,6 +1,8 @@
-"""Low-storage methods: the same step as their tableau's, in two copies of the state."""
+"""Low-storage methods: loops over their stages, and memory.
 
-import diffrax
+Their steps are those of their tableaus in test_step.py.
+"""
+
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -11,54 +13,39 @@ from solver_table import solvers
 import cfjax
 
 METHODS = solvers("low-storage")
-names = pytest.mark.parametrize("name", METHODS)
+START, INERTIA = jnp.asarray(problems.MOMENTUM), jnp.asarray(problems.INERTIA)
 
 
-@names
-def test_the_orders_by_their_conditions(name):
-    row, tableau = METHODS[name], getattr(cfjax, name).tableau
-    assert cfjax.order(tableau) == row.order
-    assert tableau.num_flows == tableau.num_evaluations == row.evaluations
-    if row.embedded is None:
-        assert tableau.embedded is None
-    else:
-        assert cfjax.order(tableau.embedded_method) == row.embedded
-        assert tableau.num_embedded_flows == {"Luscher3": 1, "CFEES25": 1}.get(name, 0)
-
-
-@pytest.mark.slow
-@names
-def test_a_step_is_that_of_the_tableau(name):
-    solver = getattr(cfjax, name)()
-    same = cfjax.CommutatorFree(solver.tableau)
-    y0, inertia = jnp.asarray(problems.MOMENTUM), jnp.asarray(problems.INERTIA)
-    term, times = cfjax.LieTerm(problems.driven_body), (jnp.asarray(0.3), jnp.asarray(0.5))
-    found, expected = (
-        jax.jit(lambda s=s: problems.first_step(s, term, *times, y0, inertia)[:2])()
-        for s in (solver, same)
-    )
-    # The sums of YRK135 grow to 36 times a field of size 1 and cancel again.
-    problems.assert_close(found, expected, 1e-13 if name == "YRK135" else 1e-15 * 5)
+def test_the_orders_by_their_conditions(subtests):
+    for name, row in METHODS.items():
+        tableau = getattr(cfjax, name).tableau
+        with subtests.test(name=name):
+            assert cfjax.order(tableau) == row.order
+            assert tableau.num_flows == tableau.num_evaluations == row.evaluations
+            if row.embedded is None:
+                assert tableau.embedded is None
+            else:
+                assert cfjax.order(tableau.embedded_method) == row.embedded
+                flows = {"Luscher3": 1, "CFEES25": 1}.get(name, 0)
+                assert tableau.num_embedded_flows == flows
 
 
 def test_a_step_in_a_loop_is_that_of_the_tableau():
-    y0, inertia = jnp.asarray(problems.MOMENTUM), jnp.asarray(problems.INERTIA)
     term, times = cfjax.LieTerm(problems.driven_body), (jnp.asarray(0.3), jnp.asarray(0.5))
     found, expected = (
-        jax.jit(lambda s=s: problems.first_step(s, term, *times, y0, inertia)[:2])()
+        jax.jit(lambda s=s: problems.first_step(s, term, *times, START, INERTIA)[:2])()
         for s in (cfjax.BWRRK53(unroll=False), cfjax.CommutatorFree(cfjax.BWRRK53.tableau))
     )
     problems.assert_close(found, expected, 1e-15 * 5)
 
 
-@pytest.mark.representatives(1)
-@pytest.mark.parametrize("name", ["BWRRK33", "CK54", "YRK135"])
-def test_the_observed_order(body_problem, name):
+@pytest.mark.slow
+def test_the_observed_order(body_problem):
     field, y0, args, answer = body_problem
-    steps = [6, 8, 12, 16] if name == "YRK135" else [16, 32, 64, 128]
-    found = problems.errors(field, getattr(cfjax, name)(), 1.0, y0, args, answer, steps)
-    assert found.min() > 10 * problems.REFERENCE_ERROR
-    assert abs(problems.slope(steps, found) - METHODS[name].order) < 0.15
+    for name, steps in {"BWRRK33": [16, 32, 64, 128], "YRK135": [6, 8, 12, 16]}.items():
+        found = problems.errors(field, getattr(cfjax, name)(), 1.0, y0, args, answer, steps)
+        assert found.min() > 10 * problems.REFERENCE_ERROR
+        assert abs(problems.slope(steps, found) - METHODS[name].order) < 0.15
 
 
 @pytest.mark.slow
@@ -77,7 +64,7 @@ def test_a_frame_in_coordinates_of_its_own_takes_every_stage(no_shape_hook):
 
 
 @pytest.mark.representatives(2)
-@names
+@pytest.mark.parametrize("name", METHODS)
 def test_memory_is_that_of_two_states(name):
     """As the compiler plans it: the point and the sum, and what one evaluation needs."""
     n = 1_000_000
@@ -86,34 +73,9 @@ def test_memory_is_that_of_two_states(name):
         # Not entry by entry, so the stages cannot be computed one entry after another.
         return jnp.cumsum(y) / n - y
 
-    def run(solver):
-        def end(y0):
-            return cfjax.integrate(cfjax.LieTerm(field), solver, 0.0, 1.0, y0, num_steps=10).ys
+    def end(y0):
+        solver = getattr(cfjax, name)()
+        return cfjax.integrate(cfjax.LieTerm(field), solver, 0.0, 1.0, y0, num_steps=10).ys
 
-        compiled = jax.jit(end, donate_argnums=0).lower(jnp.zeros(n)).compile()
-        return compiled.memory_analysis().temp_size_in_bytes / (8 * n)
-
-    used = run(getattr(cfjax, name)())
-    assert used < 4.5
-
-
-@pytest.mark.representatives(1)
-@pytest.mark.parametrize("name", [name for name, row in METHODS.items() if row.embedded])
-def test_error_control(name):
-    y0, inertia = jnp.asarray(problems.MOMENTUM), jnp.asarray(problems.INERTIA)
-    answer = problems.reference(
-        lambda t, y: problems.driven_body_ode(t, y, problems.INERTIA), 0.0, 2.0, problems.MOMENTUM
-    )
-    controller = diffrax.PIDController(rtol=0.0, atol=1e-5)
-    sol = diffrax.diffeqsolve(
-        cfjax.LieTerm(problems.driven_body),
-        getattr(cfjax, name)(),
-        0.0,
-        2.0,
-        0.01,
-        y0,
-        inertia,
-        stepsize_controller=controller,
-        max_steps=10_000,
-    )
-    assert 1e-9 < np.linalg.norm(sol.ys[-1] - answer) < 1e-4
+    compiled = jax.jit(end, donate_argnums=0).lower(jnp.zeros(n)).compile()
+    assert compiled.memory_analysis().temp_size_in_bytes / (8 * n) < 4.5

@@ -24,11 +24,9 @@ GIVEN = paths.GivenStep(jnp.asarray(W), jnp.asarray(H))
 
 
 def step(solver, term, y0=Y0, h=0.25):
-    @jax.jit
-    def end(h):
-        return problems.first_step(solver, term, jnp.zeros_like(h), h, y0, None)[0]
-
-    return end(jnp.asarray(h))
+    end = lambda h: problems.first_step(solver, term, 0.0 * h, h, y0, None)[0]  # noqa: E731
+    with cfjax.rewriting(False):
+        return problems.op_by_op(end, h)
 
 
 # The parts of the time, of the increment W and of the area H in each piece, as published.
@@ -42,8 +40,7 @@ PUBLISHED = {
 }
 
 
-@pytest.mark.parametrize("solver", PIECES, ids=lambda x: type(x).__name__)
-def test_a_step_along_constant_fields_is_a_product_of_exponentials(solver):
+def test_a_step_along_constant_fields_is_a_product_of_exponentials(subtests):
     """Along a piece the field is constant, so every method follows it exactly."""
     drift, noise = np.array([0.5, -0.2, 0.7]), np.array([[0.3, -0.8], [1.1, 0.4], [-0.6, 0.9]])
     term = diffrax.MultiTerm(
@@ -51,36 +48,42 @@ def test_a_step_along_constant_fields_is_a_product_of_exponentials(solver):
         cfjax.LieControlTerm(lambda t, y, args, dw: cfjax.Rotation(noise @ dw), GIVEN),
     )
     y0, h = np.array([0.6, 0.0, 0.8]), 0.25
-    expected = y0
-    for time, increment, area in PUBLISHED[type(solver).__name__]:
-        omega = time * h * drift + noise @ (increment * W + area * H)
-        expected = scipy.linalg.expm(np.cross(omega, np.eye(3)).T) @ expected
-    # Ten flows of a few roundings.
-    np.testing.assert_allclose(step(solver, term, jnp.asarray(y0), h), expected, rtol=0, atol=1e-14)
+    for solver in PIECES:
+        name = type(solver).__name__
+        expected = y0
+        for time, increment, area in PUBLISHED[name]:
+            omega = time * h * drift + noise @ (increment * W + area * H)
+            expected = scipy.linalg.expm(np.cross(omega, np.eye(3)).T) @ expected
+        with subtests.test(solver=name):
+            # Ten flows of a few roundings.
+            found = step(solver, term, jnp.asarray(y0), h)
+            np.testing.assert_allclose(found, expected, rtol=0, atol=1e-14)
 
 
-@pytest.mark.parametrize("solver", PIECES, ids=lambda x: type(x).__name__)
-def test_wrong_solvers_terms_and_paths(solver, no_shape_hook):
-    name = type(solver).__name__
-
-    def solve(term, solver=solver):
-        return cfjax.integrate(term, solver, 0.0, 1.0, Y0, num_steps=2)
-
-    with pytest.raises(TypeError, match=f"{name} is for equations with noise, and no term has a"):
-        solve(cfjax.LieTerm(paths.drift))
+def test_wrong_solvers_terms_and_paths(no_shape_hook, subtests):
     plain = diffrax.UnsafeBrownianPath((2,), jax.random.key(0))
-    with pytest.raises(TypeError, match="got levy_area=BrownianIncrement: write"):
-        solve(paths.terms(plain))
     smooth = diffrax.LinearInterpolation(jnp.arange(2.0), jnp.ones((2, 2)))
-    with pytest.raises(TypeError, match="got LinearInterpolation"):
-        solve(paths.terms(smooth))
-    with pytest.raises(ValueError, match="solver must have order 3 or more, got CF2"):
-        type(solver)(cfjax.CF2())
-    with pytest.raises(TypeError, match=f"{name} needs a solver of order 4 where the noise's"):
-        solve(paths.terms(GIVEN), type(solver)(cfjax.CF3()))
-    for wrong in (diffrax.Heun(), cfjax.Magnus4(), cfjax.Richardson(cfjax.CF4()), solver, None):
-        with pytest.raises(TypeError, match="solver must be a commutator-free or Munthe-Kaas"):
-            type(solver)(wrong)
+    for solver in PIECES:
+        cls = type(solver)
+        name = cls.__name__
+        wrong = diffrax.Heun(), cfjax.Magnus4(), cfjax.Richardson(cfjax.CF4()), solver, None
+        cases: list[Any] = [
+            (solver, cfjax.LieTerm(paths.drift), f"{name} is for equations with noise, and no ter"),
+            (solver, paths.terms(plain), "got levy_area=BrownianIncrement: write"),
+            (solver, paths.terms(smooth), "got LinearInterpolation"),
+            (cls(cfjax.CF3()), paths.terms(GIVEN), f"{name} needs a solver of order 4 where the n"),
+        ]
+        for made, term, message in cases:
+            with subtests.test(case=(name, message)), pytest.raises(TypeError, match=message):
+                cfjax.integrate(term, made, 0.0, 1.0, Y0, num_steps=2)
+        with pytest.raises(ValueError, match="solver must have order 3 or more, got CF2"):
+            cls(cfjax.CF2())
+        for inner in wrong:
+            with (
+                subtests.test(case=(name, repr(inner))),
+                pytest.raises(TypeError, match="solver must be a commutator-free or Munthe-Kaas"),
+            ):
+                cls(inner)
 
 
 def test_the_noise_solver_of_shifted_noise(no_shape_hook):

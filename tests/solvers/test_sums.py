@@ -33,11 +33,6 @@ def test_the_length_of_the_momentum_over_a_million_steps():
     assert np.abs(length - np.linalg.norm(problems.MOMENTUM)).max() < 1.2e-14
 
 
-def hat(omega):
-    x, y, z = omega
-    return np.array([[0, -z, y], [z, 0, -x], [-y, x, 0]])
-
-
 def doubled(a):
     """Two copies of a matrix, as one of twice the size."""
     return np.kron(np.eye(2), a)
@@ -52,12 +47,15 @@ FRAME = np.linalg.qr(np.random.default_rng(4).standard_normal((3, 3)))[0]
 STEADY = {
     "(3,)": (cfjax.Rotation(AXIS), FRAME[0], 3e-14),
     "(3, 3)": (cfjax.Rotation(AXIS), FRAME, 3e-14),
-    "(3, 1)": (cfjax.Rotation(AXIS), FRAME[:, :1], 3e-14),
-    "left (3, 3)": (cfjax.LeftMatrix(hat(AXIS)), FRAME, 5.6e-13),
-    "right (3, 3)": (cfjax.RightMatrix(hat(AXIS)), FRAME, 5.6e-13),
-    "left (3,)": (cfjax.LeftMatrix(hat(AXIS)), FRAME[0], 5.6e-13),
-    "left (6,)": (cfjax.LeftMatrix(doubled(hat(AXIS))), doubled(FRAME)[0], 5.6e-13),
-    "left (9,)": (cfjax.LeftMatrix(np.kron(np.eye(3), hat(AXIS))), np.tile(FRAME[0], 3), 5.6e-13),
+    "left (3, 3)": (cfjax.LeftMatrix(problems.hat(AXIS)), FRAME, 5.6e-13),
+    "right (3, 3)": (cfjax.RightMatrix(problems.hat(AXIS)), FRAME, 5.6e-13),
+    "left (3,)": (cfjax.LeftMatrix(problems.hat(AXIS)), FRAME[0], 5.6e-13),
+    "left (6,)": (cfjax.LeftMatrix(doubled(problems.hat(AXIS))), doubled(FRAME)[0], 5.6e-13),
+    "left (9,)": (
+        cfjax.LeftMatrix(np.kron(np.eye(3), problems.hat(AXIS))),
+        np.tile(FRAME[0], 3),
+        5.6e-13,
+    ),
 }
 
 
@@ -83,28 +81,6 @@ def orthogonality(q) -> np.ndarray:
     """The largest entry of Q^T Q - I for each matrix of a sequence."""
     q = np.asarray(q)
     return np.abs(np.swapaxes(q, 1, 2) @ q - np.eye(q.shape[-1])).max(axis=(1, 2))
-
-
-@pytest.mark.slow
-def test_an_attitude_stays_a_rotation_over_a_million_steps():
-    matrix = np.random.default_rng(0).standard_normal((3, 3))
-
-    def field(t, y, args):
-        push = jnp.stack([jnp.sin(t), jnp.cos(1.3 * t), jnp.full_like(t, 0.3)])
-        return cfjax.Rotation(args @ y[:, 0] + push)
-
-    sol = cfjax.integrate(
-        cfjax.LieTerm(field),
-        cfjax.CF4(),
-        0.0,
-        1e4,
-        jnp.eye(3),
-        jnp.asarray(matrix),
-        num_steps=1_000_000,
-        save_every=1000,
-    )
-    # 2^-53 * 0.02 * 10^3 = 2e-15, and 1.9e-15 measured. Without compensation: 1.2e-13.
-    assert orthogonality(sol.ys).max() < 1e-14
 
 
 @pytest.mark.slow
