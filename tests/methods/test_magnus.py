@@ -63,12 +63,17 @@ def rows_at(tableau, theta):
 
 
 @pytest.mark.parametrize("name", TABLEAUS)
-def test_the_order_by_every_word(name):
-    tableau, order = TABLEAUS[name], METHODS[name].order
-    found = defects(tableau.nodes, tableau.rows, order + 1)
-    assert found[: order + 1].max() < ROUNDING
-    assert found[order + 1] > 1e-8
-    assert tableau.order == order
+def test_the_order_and_that_within_a_step_by_every_word(name):
+    tableau, row = TABLEAUS[name], METHODS[name]
+    found = defects(tableau.nodes, tableau.rows, row.order + 1)
+    assert found[: row.order + 1].max() < ROUNDING
+    assert found[row.order + 1] > 1e-8
+    assert tableau.order == row.order
+    for theta in (0.25, 0.9):
+        found = defects(tableau.nodes, rows_at(tableau, theta), row.output + 1, theta)
+        # The coefficients are up to 3000, of both signs.
+        assert found[: row.output + 1].max() < 1e-12
+        assert found[row.output + 1] > 1e-9
 
 
 @pytest.mark.parametrize("name", [name for name, row in METHODS.items() if row.embedded])
@@ -80,62 +85,38 @@ def test_the_order_of_the_embedded_method_by_every_word(name):
     assert tableau.embedded_order == order
     # It sees what quadrature on all nodes does not: a single letter of that degree, or the nodes'
     # own weights would be those of every method.
-    single = weights(tableau.nodes, tableau.embedded, order + 1)[order + 1,]
-    assert abs(single - exact_weight((order + 1,))) > 1e-4
+    other = weights(tableau.nodes, tableau.embedded, order + 1)
+    assert abs(other[order + 1,] - exact_weight((order + 1,))) > 1e-4
     # Nor do fields that are linear in time go unseen, as they would if one row alone were another.
     linear = [w for w in words(order + 1) if sum(w) == order + 1 and max(w) == 2]
     ours = weights(tableau.nodes, tableau.rows, order + 1)
-    other = weights(tableau.nodes, tableau.embedded, order + 1)
     assert max(abs(ours[w] - other[w]) for w in linear) > 1e-7
 
 
-@pytest.mark.parametrize("theta", [0.25, 0.9])
-@pytest.mark.parametrize("name", TABLEAUS)
-def test_the_order_within_a_step_by_every_word(name, theta):
-    tableau, order = TABLEAUS[name], METHODS[name].output
-    found = defects(tableau.nodes, rows_at(tableau, theta), order + 1, theta)
-    # The coefficients are up to 3000, of both signs.
-    assert found[: order + 1].max() < 1e-12
-    assert found[order + 1] > 1e-9
-
-
-@pytest.mark.parametrize("name", TABLEAUS)
-def test_the_continuous_extension_ends_where_the_step_does(name):
-    tableau = TABLEAUS[name]
-    np.testing.assert_allclose(rows_at(tableau, 1.0), tableau.rows, rtol=0, atol=1e-12)
-
-
-@pytest.mark.parametrize("name", TABLEAUS)
-def test_steps_back_undo_steps(name):
-    tableau = TABLEAUS[name]
-    rows = np.array(tableau.rows)
-    np.testing.assert_allclose(rows, rows[::-1, ::-1], rtol=0, atol=1e-16)
-    np.testing.assert_allclose(np.add(tableau.nodes, tableau.nodes[::-1]), 1, rtol=0, atol=1e-16)
-
-
-@pytest.mark.parametrize("name", TABLEAUS)
-def test_sums_of_rows(name):
+def test_ends_symmetry_and_sums_of_rows(subtests):
     """How far each flow goes: forwards alone up to order 4, and in embedded methods of those."""
-    tableau = TABLEAUS[name]
-    sums = np.sum(tableau.rows, axis=1)
-    assert sums.sum() == pytest.approx(1, abs=ROUNDING)
+    # As their docstrings say.
     back = {"Magnus6": -0.0936518, "Magnus8": -0.435723, "Magnus10": -0.312166}
-    if name in back:
-        # As their docstrings say.
-        assert sums.min() == pytest.approx(back[name], abs=1e-6)
-    else:
-        assert sums.min() > 0
-    if tableau.embedded:
-        assert np.sum(tableau.embedded) == pytest.approx(1, abs=ROUNDING)
+    for name, tableau in TABLEAUS.items():
+        rows = np.array(tableau.rows)
+        with subtests.test(name=name):
+            # The continuous extension ends where the step does, and steps back undo steps.
+            np.testing.assert_allclose(rows_at(tableau, 1.0), rows, rtol=0, atol=1e-12)
+            np.testing.assert_allclose(rows, rows[::-1, ::-1], rtol=0, atol=1e-16)
+            nodes = np.add(tableau.nodes, tableau.nodes[::-1])
+            np.testing.assert_allclose(nodes, 1, rtol=0, atol=1e-16)
+            least = rows.sum(axis=1).min()
+            assert least == pytest.approx(back[name], abs=1e-6) if name in back else least > 0
+            for some in (tableau.rows, tableau.embedded) if tableau.embedded else (tableau.rows,):
+                assert np.sum(some) == pytest.approx(1, abs=ROUNDING)
 
 
-@pytest.mark.parametrize("size", [3, 5, 7, 9])
-def test_nodes_of_lobatto(size):
-    tableau = {3: "Magnus4Lobatto", 5: "Magnus6", 7: "Magnus8", 9: "Magnus10"}[size]
-    inner = np.polynomial.Legendre.basis(size - 1).deriv().roots()
-    expected = (1 + np.concatenate([[-1.0], np.sort(inner.real), [1.0]])) / 2
-    np.testing.assert_allclose(TABLEAUS[tableau].nodes, expected, rtol=0, atol=1e-14)
-    assert TABLEAUS[tableau].shares_ends
+def test_nodes_of_lobatto():
+    for size, name in {3: "Magnus4Lobatto", 5: "Magnus6", 7: "Magnus8", 9: "Magnus10"}.items():
+        inner = np.polynomial.Legendre.basis(size - 1).deriv().roots()
+        expected = (1 + np.concatenate([[-1.0], np.sort(inner.real), [1.0]])) / 2
+        np.testing.assert_allclose(TABLEAUS[name].nodes, expected, rtol=0, atol=1e-14)
+        assert TABLEAUS[name].shares_ends
 
 
 def test_nodes_of_gauss():

@@ -1,6 +1,7 @@
 """Orders of exponential Runge-Kutta methods: those in print, ours, and what a wrong digit does."""
 
 from fractions import Fraction as F
+from typing import Any
 
 import diffrax
 import pytest
@@ -60,27 +61,22 @@ def orders(tableau):
     return cfjax.stiff_order(tableau), cfjax.order(tableau)
 
 
-@pytest.mark.parametrize("name", PUBLISHED)
-def test_orders_of_known_methods(name):
-    tableau, expected = PUBLISHED[name]
-    assert orders(tableau) == expected
-
-
-@pytest.mark.parametrize(
-    "solver, expected, embedded",
-    [
+def test_orders_of_known_and_of_named_methods(subtests):
+    for name, (tableau, expected) in PUBLISHED.items():
+        with subtests.test(name=name):
+            assert orders(tableau) == expected
+    for solver, expected, embedded in (
         (cfjax.ETDRK4(), (2, 4), None),
         (cfjax.ETD43(), (4, 4), (3, 3)),
         (cfjax.ETD54(), (5, 5), (4, 4)),
-    ],
-)
-def test_orders_of_named_methods(solver, expected, embedded):
-    assert orders(solver.tableau) == expected
-    # What a solve takes from a table.
-    assert solver.order(None) == expected[1]
-    if embedded is not None:
-        assert orders(solver.tableau.embedded_method) == embedded
-        assert solver.error_order(None) == embedded[1] + 1
+    ):
+        with subtests.test(name=type(solver).__name__):
+            assert orders(solver.tableau) == expected
+            # What a solve takes from a table.
+            assert solver.order(None) == expected[1]
+            if embedded is not None:
+                assert orders(solver.tableau.embedded_method) == embedded
+                assert solver.error_order(None) == embedded[1] + 1
 
 
 @pytest.mark.parametrize("solver", [cfjax.ETD43(), cfjax.ETD54()])
@@ -103,42 +99,44 @@ def test_every_coefficient_counts(solver):
                 assert cfjax.stiff_order(wrong) < cfjax.stiff_order(tableau), (place, j, n)
 
 
-@pytest.mark.parametrize("solver", [cfjax.ETDRK4(), cfjax.ETD43(), cfjax.ETD54()])
-def test_output_is_of_order_one_less(solver):
+def test_output_is_of_order_one_less():
     """Its polynomial reproduces powers of the time, as far as that order asks."""
-    tableau = solver.tableau
-    order = 4 if isinstance(solver, cfjax.ETD54) else 3
-    for power in range(1, order):
-        for m, weights in enumerate(tableau.powers, 1):
-            found = sum(w * tableau.c[j - 1] ** power for j, w in weights)
-            assert found == (m == power)
+    for solver, order in ((cfjax.ETDRK4(), 3), (cfjax.ETD43(), 3), (cfjax.ETD54(), 4)):
+        tableau = solver.tableau
+        for power in range(1, order):
+            for m, weights in enumerate(tableau.powers, 1):
+                found = sum(w * tableau.c[j - 1] ** power for j, w in weights)
+                assert found == (m == power), (solver, power, m)
 
 
-@pytest.mark.parametrize(
-    "make, text",
-    [
-        (lambda T: T([HALF], {}, {}), "c must begin with the node 0"),
-        (lambda T: T([0, 1], {2: {2: {1: 1}}}, {}), r"a\[2\] must have columns 2 to 1, got column"),
-        (lambda T: T([0, 1], {3: {}}, {}), "a must have rows of stages 2 to 2, got row 3"),
-        (lambda T: T([0, 1], {}, {2: {6: 1}}), r"b\[2\] must be made of phi_1 to phi_5, got phi_6"),
-        (lambda T: T([0, 1], {}, {2: {(2, HALF): 1}}), "b must be made only of phi_2"),
-        (lambda T: T([0, 1], {}, {2: {1: 1}}), "b must be made only of phi_2"),
-        (lambda T: T([0, 1], {}, {3: {2: 1}}), "b must have columns 2 to 2, got column 3"),
-    ],
-)
-def test_tableaus_that_are_none(make, text):
-    with pytest.raises(ValueError, match=text):
-        make(cfjax.ExponentialTableau)
-
-
-def test_coefficients_are_exact(no_shape_hook):
-    with pytest.raises(TypeError, match=r"b\[2\]\[2\] must be an int or a Fraction, got 0.5"):
-        cfjax.ExponentialTableau([0, 1], {}, {2: {2: 0.5}})
-    with pytest.raises(TypeError, match=r"tableau must be a cfjax\.ExponentialTableau"):
-        cfjax.stiff_order(cfjax.CF4.tableau)  # pyright: ignore[reportArgumentType]
-    with pytest.raises(TypeError, match=r"tableau must be a cfjax\.ExponentialTableau"):
-        cfjax.stiff_order(diffrax.Dopri5.tableau)  # pyright: ignore[reportArgumentType]
-    with pytest.raises(TypeError, match=r"tableau must be a cfjax\.Tableau"):
-        cfjax.order("CF4")  # pyright: ignore[reportArgumentType]
-    with pytest.raises(TypeError, match=r"tableau must be a cfjax\.ExponentialTableau"):
-        cfjax.ExponentialRungeKutta(cfjax.CF4.tableau)  # pyright: ignore[reportArgumentType]
+def test_tableaus_that_are_none_and_coefficients_that_are_not_exact(no_shape_hook, subtests):
+    api: Any = cfjax
+    exponential = r"tableau must be a cfjax\.ExponentialTableau"
+    others = cfjax.CF4.tableau, diffrax.Dopri5.tableau
+    values = (
+        ((HALF,), {}, {}, "c must begin with the node 0"),
+        ((0, 1), {2: {2: {1: 1}}}, {}, r"a\[2\] must have columns 2 to 1, got column"),
+        ((0, 1), {3: {}}, {}, "a must have rows of stages 2 to 2, got row 3"),
+        ((0, 1), {}, {2: {6: 1}}, r"b\[2\] must be made of phi_1 to phi_5, got phi_6"),
+        ((0, 1), {}, {2: {(2, HALF): 1}}, "b must be made only of phi_2"),
+        ((0, 1), {}, {2: {1: 1}}, "b must be made only of phi_2"),
+        ((0, 1), {}, {3: {2: 1}}, "b must have columns 2 to 2, got column 3"),
+    )
+    types = (
+        (
+            r"b\[2\]\[2\] must be an int or a Fraction, got 0.5",
+            api.ExponentialTableau,
+            [0, 1],
+            {},
+            {2: {2: 0.5}},
+        ),
+        *((exponential, api.stiff_order, other) for other in others),
+        (r"tableau must be a cfjax\.Tableau", api.order, "CF4"),
+        (exponential, api.ExponentialRungeKutta, others[0]),
+    )
+    for c, a, b, text in values:
+        with subtests.test(case=text), pytest.raises(ValueError, match=text):
+            api.ExponentialTableau(c, a, b)
+    for text, call, *arguments in types:
+        with subtests.test(case=text), pytest.raises(TypeError, match=text):
+            call(*arguments)

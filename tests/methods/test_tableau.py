@@ -1,5 +1,6 @@
 import dataclasses
 from fractions import Fraction
+from typing import Any
 
 import hypothesis
 import hypothesis.strategies as st
@@ -16,7 +17,6 @@ NAMED = {name: row.make().tableau for name, row in named_solvers("commutator-fre
 LIE_EULER, CF2, CF3, CF4, CG3, CG4 = (
     NAMED[name] for name in ("LieEuler", "CF2", "CF3", "CF4", "CG3", "CG4")
 )
-named = pytest.mark.parametrize("tableau", NAMED.values(), ids=NAMED.keys())
 
 
 # Normal form
@@ -52,18 +52,14 @@ def test_numpy_float32_is_converted_without_loss():
     assert tableau.alpha[1][0][0] == float(third) != 1 / 3
 
 
-@named
-def test_is_compared_and_hashed_by_value(tableau):
-    again = Tableau(
-        [list(map(list, rows)) for rows in tableau.alpha],
-        tableau.beta,
-        tableau.embedded,
-        tableau.continuous_extension,
-    )
-    assert again is not tableau
-    assert again == tableau
-    assert hash(again) == hash(tableau)
-    assert {again: 1}[tableau] == 1
+def test_is_compared_and_hashed_by_value():
+    for tableau in NAMED.values():
+        alpha = [list(map(list, rows)) for rows in tableau.alpha]
+        again = Tableau(alpha, tableau.beta, tableau.embedded, tableau.continuous_extension)
+        assert again is not tableau
+        assert again == tableau
+        assert hash(again) == hash(tableau)
+        assert {again: 1}[tableau] == 1
 
 
 def test_named_tableaus_differ():
@@ -97,11 +93,23 @@ def test_repr_is_short():
 # Derived facts
 
 
-@named
-def test_stage_times_are_row_sums(tableau):
-    assert len(tableau.c) == tableau.num_stages == tableau.num_evaluations
-    for c, rows in zip(tableau.c, tableau.alpha, strict=True):
-        assert c == pytest.approx(float(sum(map(sum, rows))), abs=1e-15)
+def test_stage_times_and_flows(subtests):
+    flows = {"LieEuler": 1, "CF2": 2, "CF3": 3, "CF4": 5, "CF43": 6, "CF54": 9}
+    flows |= {"CG3": 6, "CG4": 15, "CG5": 43}
+    assert flows.keys() <= NAMED.keys()
+    for name, tableau in NAMED.items():
+        with subtests.test(name=name):
+            assert len(tableau.c) == tableau.num_stages == tableau.num_evaluations
+            for c, rows in zip(tableau.c, tableau.alpha, strict=True):
+                assert c == pytest.approx(float(sum(map(sum, rows))), abs=1e-15)
+            assert tableau.num_flows == len(tableau.prefixes) == flows.get(name)
+            # Prefixes come after their own beginning.
+            known = {()}
+            for prefix in tableau.prefixes:
+                assert prefix not in known
+                assert prefix[:-1] in known
+                known.add(prefix)
+            assert {*tableau.alpha, tableau.beta} <= known
 
 
 def test_stage_times_are_exact():
@@ -115,28 +123,6 @@ def test_stage_times_are_exact():
     tableau = Tableau([[], [[1e16]], [[1e16, 1], [-1e16]]], [[0, 0, 1]])
     assert tableau.c == (0, 1e16, 1)
     assert [type(c) for c in tableau.c] == [Fraction, float, float]
-
-
-@pytest.mark.parametrize(
-    "name, flows",
-    [
-        *[("LieEuler", 1), ("CF2", 2), ("CF3", 3), ("CF4", 5), ("CF43", 6), ("CF54", 9)],
-        *[("CG3", 6), ("CG4", 15), ("CG5", 43)],
-    ],
-)
-def test_num_flows(name, flows):
-    assert NAMED[name].num_flows == flows
-    assert len(NAMED[name].prefixes) == flows
-
-
-@named
-def test_prefixes_come_after_their_own_beginning(tableau):
-    known = {()}
-    for prefix in tableau.prefixes:
-        assert prefix not in known
-        assert prefix[:-1] in known
-        known.add(prefix)
-    assert {*tableau.alpha, tableau.beta} <= known
 
 
 def test_rows_share_flows_only_from_the_start():
@@ -156,47 +142,31 @@ def test_is_exact():
 # Embedded method and continuous extension
 
 
-@pytest.mark.parametrize(
-    "name, embedded_flows, last", [("CF3", 1, False), ("CF4", 1, True), ("CG3", 3, False)]
-)
-def test_what_an_embedded_method_costs(name, embedded_flows, last):
-    tableau = NAMED[name]
-    assert tableau.num_embedded_flows == embedded_flows
-    assert tableau.uses_last(tableau.embedded) is last
-    assert tableau.embedded_method.alpha[-1][0][: tableau.num_stages] == tableau.beta[0]
-
-
-def test_without_an_embedded_method_there_is_no_method():
+def test_what_an_embedded_method_costs():
+    for name, embedded_flows, last in (("CF3", 1, False), ("CF4", 1, True), ("CG3", 3, False)):
+        tableau = NAMED[name]
+        assert tableau.num_embedded_flows == embedded_flows
+        assert tableau.uses_last(tableau.embedded) is last
+        assert tableau.embedded_method.alpha[-1][0][: tableau.num_stages] == tableau.beta[0]
     assert CG4.embedded_method is None and CG4.num_embedded_flows == 0
 
 
-@pytest.mark.parametrize(
-    "more, message",
-    [
-        ({"embedded": [[HALF]]}, r"embedded must sum to 1 .* got a sum of 1/2"),
-        ({"embedded": [[0, 0, 0, 1]]}, r"embedded\[0\] must have at most 3 entries"),
-        ({"embedded": [[float("nan"), 1]]}, r"embedded\[0\]\[0\] must be finite"),
-        (
-            {"continuous_extension": [[[1]]]},
-            r"continuous_extension must lead to the end.* stage 0 sum to 1, .* to 0",
-        ),
-        (
-            {"continuous_extension": [[[0, 0, 0, 1]]]},
-            r"continuous_extension\[0\]\[0\] must have at most 3 entries",
-        ),
-    ],
-)
-def test_a_mistaken_embedded_method_or_continuous_extension(more, message):
-    with pytest.raises(ValueError, match=message):
-        Tableau([[], [[HALF]]], [[0, 1]], **more)
-
-
-@pytest.mark.parametrize(
-    "more", [{"embedded": 1}, {"continuous_extension": [1]}, {"continuous_extension": "ab"}]
-)
-def test_an_embedded_method_or_continuous_extension_of_wrong_type(more, no_shape_hook):
-    with pytest.raises(TypeError, match=f"{next(iter(more))}.* must be a"):
-        Tableau([[], [[HALF]]], [[0, 1]], **more)
+def test_a_mistaken_embedded_method_or_continuous_extension(no_shape_hook, subtests):
+    both = "embedded", "continuous_extension"
+    for error, name, given, message in (
+        (ValueError, both[0], [[HALF]], r"embedded must sum to 1 .* got a sum of 1/2"),
+        (ValueError, both[0], [[0, 0, 0, 1]], r"embedded\[0\] must have at most 3 entries"),
+        (ValueError, both[0], [[float("nan"), 1]], r"embedded\[0\]\[0\] must be finite"),
+        (ValueError, both[0], [[0, 1]], "another end point than beta"),
+        (ValueError, both[1], [[[1]]], r"must lead to the end.* stage 0 sum to 1, .* to 0"),
+        (ValueError, both[1], [[[0, 0, 0, 1]]], r"extension\[0\]\[0\] must have at most 3 entries"),
+        (TypeError, both[0], 1, "embedded.* must be a"),
+        (TypeError, both[1], [1], "continuous_extension.* must be a"),
+        (TypeError, both[1], "ab", "continuous_extension.* must be a"),
+    ):
+        with subtests.test(case=message), pytest.raises(error, match=message):
+            Tableau([[], [[HALF]]], [[0, 1]], **{name: given})
+    Tableau([[], [[HALF]]], [[0, 1]], embedded=[[1]])
 
 
 # The two families
@@ -237,66 +207,53 @@ def test_families_at_known_members():
     assert third_order_b(0).c == (0, Fraction(2, 3), 0)
 
 
-@pytest.mark.parametrize("family", [third_order_a, third_order_b])
-def test_family_of_a_float_is_rounded_once(family):
-    exact, rounded = family(Fraction(0.7)), family(0.7)
-    assert not rounded.is_exact
-    assert rounded.c[2] == 0.7
-    assert [tuple(map(float, row)) for row in exact.beta] == list(rounded.beta)
-    assert family(np.float64(0.7)) == rounded
+def test_family_of_a_float_is_rounded_once():
+    for family in (third_order_a, third_order_b):
+        exact, rounded = family(Fraction(0.7)), family(0.7)
+        assert not rounded.is_exact
+        assert rounded.c[2] == 0.7
+        assert [tuple(map(float, row)) for row in exact.beta] == list(rounded.beta)
+        assert family(np.float64(0.7)) == rounded
 
 
-@pytest.mark.parametrize(
-    ("family", "alpha", "shown", "divisor"),
-    [
-        (third_order_a, 0, "0", "6 alpha"),
-        (third_order_a, 0.0, "0", "6 alpha"),
-        (third_order_a, -0.0, "0", "6 alpha"),
-        (third_order_a, THIRD, "1/3", "3 alpha - 1"),
-        (third_order_a, 1 / 3, "1/3", "3 alpha - 1"),
-        (third_order_b, 1, "1", "1 - alpha"),
-        (third_order_b, 1.0, "1", "1 - alpha"),
-        (third_order_b, THIRD, "1/3", "3 alpha - 1"),
-        (third_order_b, np.float64(1) / 3, "1/3", "3 alpha - 1"),
-    ],
-)
-def test_excluded_parameters_raise(family, alpha, shown, divisor):
-    expected = f"alpha must not be {shown}, got .*divide by {divisor}, which is zero there"
-    with pytest.raises(ValueError, match=expected):
-        family(alpha)
-
-
-@pytest.mark.parametrize("family", [third_order_a, third_order_b])
-@pytest.mark.usefixtures("no_shape_hook")
-def test_other_bad_parameters_raise(family):
-    with pytest.raises(ValueError, match="alpha must be finite, got nan"):
-        family(float("nan"))
-    with pytest.raises(TypeError, match="alpha must be an int, a Fraction or a float, got '1/2'"):
-        family("1/2")
-    with pytest.raises(TypeError, match=r"alpha must be .*, got True of type bool"):
-        family(True)
-
-
-def test_overflow_raises():
-    with pytest.raises(ValueError, match=r"alpha = 5e-324 is out of range"):
-        third_order_a(5e-324)
-    with pytest.raises(ValueError, match=r"alpha = 1e\+308 is out of range"):
-        third_order_a(1e308)
+def test_bad_parameters_raise(no_shape_hook, subtests):
+    a, b = third_order_a, third_order_b
+    excluded = (
+        *((a, alpha, "0", "6 alpha") for alpha in (0, 0.0, -0.0)),
+        *((a, alpha, "1/3", "3 alpha - 1") for alpha in (THIRD, 1 / 3)),
+        *((b, alpha, "1", "1 - alpha") for alpha in (1, 1.0)),
+        *((b, alpha, "1/3", "3 alpha - 1") for alpha in (THIRD, np.float64(1) / 3)),
+    )
+    others = (
+        (ValueError, float("nan"), "alpha must be finite, got nan"),
+        (TypeError, "1/2", "alpha must be an int, a Fraction or a float, got '1/2'"),
+        (TypeError, True, r"alpha must be .*, got True of type bool"),
+    )
+    cases: list[Any] = [
+        *(
+            (ValueError, family, alpha, f"alpha must not be {shown}, got .*divide by {divisor}, ")
+            for family, alpha, shown, divisor in excluded
+        ),
+        *((error, family, *rest) for error, *rest in others for family in (a, b)),
+        (ValueError, a, 5e-324, r"alpha = 5e-324 is out of range"),
+        (ValueError, a, 1e308, r"alpha = 1e\+308 is out of range"),
+    ]
+    for error, family, alpha, text in cases:
+        with subtests.test(case=f"{alpha!r}: {text}"), pytest.raises(error, match=text) as raised:
+            family(alpha)
+        if "divide" in text:
+            assert "which is zero there" in str(raised.value)
 
 
 # Errors
 
 
-@pytest.mark.parametrize(
-    ("alpha", "beta", "message"),
-    [
+def test_bad_values_raise(subtests):
+    more = r"got a sum of"
+    for alpha, beta, message in (
         ([], [[1]], r"alpha must have at least one stage, got none"),
         ([[]], [[1, 0]], r"beta\[0\] must have at most 1 entries, .*, got 2"),
-        (
-            [[], [[1], [0, 0, 0]]],
-            [[1]],
-            r"alpha\[1\]\[1\] must have at most 2 entries, .*, got 3",
-        ),
+        ([[], [[1], [0, 0, 0]]], [[1]], r"alpha\[1\]\[1\] must have at most 2 entries, .*, got 3"),
         (
             [[], [[HALF], [0, HALF]]],
             [[1]],
@@ -306,49 +263,38 @@ def test_overflow_raises():
         ([[[1]]], [[1]], r"alpha\[0\]\[0\]\[0\] is 1, .* alpha\[0\] may use no stage"),
         ([[], [[float("nan")]]], [[1]], r"alpha\[1\]\[0\]\[0\] must be finite, got nan"),
         ([[]], [[float("-inf")]], r"beta\[0\]\[0\] must be finite, got -inf"),
-        ([[]], [], r"beta must sum to 1 over all its rows \(consistency\), got a sum of 0\."),
-        ([[]], [[HALF], [THIRD]], r"beta must sum to 1 .*, got a sum of 5/6\."),
-        ([[]], [[0.5], [THIRD]], r"beta must sum to 1 .*, got a sum of 0.8333"),
-        ([[]], [[1 + 1e-14]], r"beta must sum to 1 .*, got a sum of 1.00000000000001\."),
+        ([[]], [], rf"beta must sum to 1 over all its rows \(consistency\), {more} 0\."),
+        ([[]], [[HALF], [THIRD]], rf"beta must sum to 1 .*, {more} 5/6\."),
+        ([[]], [[0.5], [THIRD]], rf"beta must sum to 1 .*, {more} 0.8333"),
+        ([[]], [[1 + 1e-14]], rf"beta must sum to 1 .*, {more} 1.00000000000001\."),
         ([[]], [[1 + Fraction(1, 10**30)]], r"beta must sum to 1 .* 10{29}1/10{30}\."),
-    ],
-)
-def test_bad_values_raise(alpha, beta, message):
-    with pytest.raises(ValueError, match=message):
-        Tableau(alpha, beta)
+    ):
+        with subtests.test(case=message), pytest.raises(ValueError, match=message):
+            Tableau(alpha, beta)
 
 
-def test_an_embedded_method_is_another_method():
-    with pytest.raises(ValueError, match="another end point than beta"):
-        Tableau([[], [[HALF]]], [[0, 1]], embedded=[[0, 1]])
-    Tableau([[], [[HALF]]], [[0, 1]], embedded=[[1]])
-
-
-@pytest.mark.parametrize(
-    ("alpha", "beta", "message"),
-    [
+def test_bad_types_raise(no_shape_hook, subtests):
+    row, number = r"must be a row .*, got", r"must be an int, .*, got"
+    for alpha, beta, message in (
         (1, [[1]], r"alpha must be a sequence with one list of flows .*, got 1 of type int"),
         (np.array(1.0), [[1]], r"alpha must be .*, got array\(1\.\) of type ndarray"),
         ([[], 1], [[1]], r"alpha\[1\] must be a sequence of rows, .*, got 1 of type int"),
-        ([[], [0.5]], [[1]], r"alpha\[1\]\[0\] must be a row .*, got 0.5 of type float"),
+        ([[], [0.5]], [[1]], rf"alpha\[1\]\[0\] {row} 0.5 of type float"),
         ([[]], 1, r"beta must be a sequence of rows, .*, got 1 of type int"),
-        ([[]], [1], r"beta\[0\] must be a row .*, got 1 of type int"),
-        ([[]], ["1"], r"beta\[0\] must be a row .*, got '1' of type str"),
+        ([[]], [1], rf"beta\[0\] {row} 1 of type int"),
+        ([[]], ["1"], rf"beta\[0\] {row} '1' of type str"),
         ([[]], {0: [1]}, r"beta must be a sequence of rows, .* of type dict"),
-        ([[]], [{1}], r"beta\[0\] must be a row .*, got \{1\} of type set"),
-        ([[]], [["1"]], r"beta\[0\]\[0\] must be an int, .*, got '1' of type str"),
-        ([[]], [[None]], r"beta\[0\]\[0\] must be an int, .*, got None of type NoneType"),
-        ([[]], [[1j]], r"beta\[0\]\[0\] must be an int, .*, got 1j of type complex"),
-        ([[]], [[True]], r"beta\[0\]\[0\] must be an int, .*, got True of type bool"),
-        ([[]], [[np.True_]], r"beta\[0\]\[0\] must be an int, .*, got (np\.)?True_? of type bool"),
-        ([[]], [[[1]]], r"beta\[0\]\[0\] must be an int, .*, got \[1\] of type list"),
-        ([[], [[[1]]]], [[1]], r"alpha\[1\]\[0\]\[0\] must be an int, .*, got \[1\] of type list"),
-    ],
-)
-@pytest.mark.usefixtures("no_shape_hook")
-def test_bad_types_raise(alpha, beta, message):
-    with pytest.raises(TypeError, match=message):
-        Tableau(alpha, beta)
+        ([[]], [{1}], rf"beta\[0\] {row} \{{1\}} of type set"),
+        ([[]], [["1"]], rf"beta\[0\]\[0\] {number} '1' of type str"),
+        ([[]], [[None]], rf"beta\[0\]\[0\] {number} None of type NoneType"),
+        ([[]], [[1j]], rf"beta\[0\]\[0\] {number} 1j of type complex"),
+        ([[]], [[True]], rf"beta\[0\]\[0\] {number} True of type bool"),
+        ([[]], [[np.True_]], rf"beta\[0\]\[0\] {number} (np\.)?True_? of type bool"),
+        ([[]], [[[1]]], rf"beta\[0\]\[0\] {number} \[1\] of type list"),
+        ([[], [[[1]]]], [[1]], rf"alpha\[1\]\[0\]\[0\] {number} \[1\] of type list"),
+    ):
+        with subtests.test(case=message), pytest.raises(TypeError, match=message):
+            Tableau(alpha, beta)
 
 
 def test_a_number_that_would_lose_digits_raises():

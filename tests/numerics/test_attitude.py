@@ -58,27 +58,26 @@ to_matrix = eqx.filter_jit(partial(quaternion_to_matrix, layout="wxyz"))
 from_matrix = eqx.filter_jit(partial(quaternion_from_matrix, layout="wxyz"))
 
 
-def test_matrices():
+def test_matrices_and_back():
+    matrices, found = to_matrix(QS), np.asarray(from_matrix(MATRICES))
     # Sums of few products of at most 1, and a length that is rounded.
-    np.testing.assert_allclose(to_matrix(QS), MATRICES, rtol=0, atol=4 * EPS)
-    np.testing.assert_array_equal(to_matrix(-QS), to_matrix(QS))
-    last = quaternion_to_matrix(jnp.asarray(np.roll(QS[7], -1)), layout="xyzw")
-    np.testing.assert_array_equal(last, to_matrix(QS)[7])
-
-
-def test_from_matrices():
-    found = np.asarray(from_matrix(MATRICES))
+    np.testing.assert_allclose(matrices, MATRICES, rtol=0, atol=4 * EPS)
+    np.testing.assert_array_equal(to_matrix(-QS), matrices)
     # The length of what is divided by is 2 at least, each entry a sum of four that are rounded.
     np.testing.assert_allclose(found, QS, rtol=0, atol=4 * EPS)
     np.testing.assert_allclose(np.linalg.norm(found, axis=-1), np.ones(len(QS)), rtol=0, atol=EPS)
+    last = quaternion_to_matrix(jnp.asarray(np.roll(QS[7], -1)), layout="xyzw")
+    np.testing.assert_array_equal(last, matrices[7])
     last = quaternion_from_matrix(jnp.asarray(MATRICES[7]), layout="xyzw")
     np.testing.assert_array_equal(last, np.roll(found[7], -1))
-
-
-def test_from_matrices_in_float32():
-    found = from_matrix(MATRICES.astype(np.float32))
-    assert found.dtype == np.float32
-    np.testing.assert_allclose(found, QS, rtol=0, atol=4 * 2.0**-23)
+    single = from_matrix(MATRICES.astype(np.float32))
+    assert single.dtype == np.float32
+    np.testing.assert_allclose(single, QS, rtol=0, atol=4 * 2.0**-23)
+    # Leading axes.
+    q = jnp.asarray(QS[:6]).reshape(2, 3, 4)
+    some = to_matrix(q)
+    np.testing.assert_array_equal(some.reshape(6, 3, 3), matrices[:6])
+    np.testing.assert_allclose(from_matrix(some), q, rtol=0, atol=4 * EPS)
 
 
 def test_half_turns():
@@ -118,105 +117,91 @@ def test_derivatives_along_rotations():
     np.testing.assert_allclose(second, -(v @ v) * QS / 4, rtol=0, atol=20 * EPS)
 
 
-def test_gradients_of_all_three():
-    q, x = jnp.asarray(RANDOM[0]), jnp.asarray(RNG.normal(size=3))
-    weights = jnp.asarray(RNG.normal(size=3))
-
-    def by_matrix(q, x):
-        return weights @ (quaternion_to_matrix(q, layout="wxyz") @ x)
-
-    def by_rotate(q, x):
-        return weights @ quaternion_rotate(q, x, layout="wxyz")
-
-    @jax.jit
-    def gradients(q, x):
-        return [jax.grad(f, argnums=(0, 1))(q, x) for f in (by_matrix, by_rotate)]
-
-    ones, others = gradients(q, x)
-    # One polynomial in two ways.
-    for a, b in zip(ones, others, strict=True):
-        np.testing.assert_allclose(a, b, rtol=0, atol=40 * EPS)
-
-
-@pytest.mark.parametrize("layout", ["wxyz", "xyzw"])
-def test_rotate(layout):
-    q = jnp.asarray(QS if layout == "wxyz" else np.roll(QS, -1, axis=-1))
+def test_rotate():
     x = jnp.asarray(RNG.normal(size=(len(QS), 3)))
-    rotate = jax.jit(partial(quaternion_rotate, layout=layout))
-    # Few terms of size three.
-    for a, b in [(q, x), (q[3:4], x), (q, x[5:6])]:
-        matrices = MATRICES if len(a) > 1 else MATRICES[3:4]
-        want = np.sum(matrices * np.asarray(b)[:, None, :], axis=-1)
-        np.testing.assert_allclose(rotate(a, b), want, rtol=0, atol=30 * EPS)
-
-
-def test_leading_axes():
-    q = jnp.asarray(QS[:6]).reshape(2, 3, 4)
-    matrices = to_matrix(q)
-    assert matrices.shape == (2, 3, 3, 3)
-    np.testing.assert_array_equal(matrices.reshape(6, 3, 3), to_matrix(QS)[:6])
-    np.testing.assert_allclose(from_matrix(matrices), q, rtol=0, atol=4 * EPS)
+    for layout in ("wxyz", "xyzw"):
+        q = jnp.asarray(QS if layout == "wxyz" else np.roll(QS, -1, axis=-1))
+        rotate = jax.jit(partial(quaternion_rotate, layout=layout))
+        for a, b in [(q, x), (q[3:4], x), (q, x[5:6])]:
+            matrices = MATRICES if len(a) > 1 else MATRICES[3:4]
+            want = np.sum(matrices * np.asarray(b)[:, None, :], axis=-1)
+            # Few terms of size three.
+            np.testing.assert_allclose(rotate(a, b), want, rtol=0, atol=30 * EPS)
 
 
 # Lengths other than 1, as solvers of linear spaces make them
 
 
-@pytest.mark.parametrize("dtype", [np.float32, np.float64])
-@pytest.mark.parametrize("length", [0.96, 1 - 1e-3, 1 + 1e-3, 1.04])
-def test_the_length_of_a_quaternion_does_not_count(dtype, length):
-    eps = np.finfo(dtype).eps
-    q, x = (length * QS).astype(dtype), np.ones((len(QS), 3), dtype)
-    matrices, turned = to_matrix(q), quaternion_rotate(jnp.asarray(q), x, layout="wxyz")
-    # The entries of q are rounded, and then as in the tests of those of length 1.
-    np.testing.assert_allclose(matrices, MATRICES, rtol=0, atol=6 * eps)
-    np.testing.assert_allclose(turned, MATRICES.sum(axis=-1), rtol=0, atol=12 * eps)
-    # So lengths of vectors stay: 3 here.
-    np.testing.assert_allclose(np.sum(np.asarray(turned) ** 2, axis=-1), 3, rtol=0, atol=20 * eps)
+def test_the_length_of_a_quaternion_does_not_count():
+    lengths = np.repeat([0.96, 1 - 1e-3, 1 + 1e-3, 1.04], len(QS))[:, None]
+    want = np.concatenate([MATRICES] * 4)
+    for dtype in (np.float32, np.float64):
+        eps, q = np.finfo(dtype).eps, (lengths * np.concatenate([QS] * 4)).astype(dtype)
+        turned = quaternion_rotate(jnp.asarray(q), np.ones((len(q), 3), dtype), layout="wxyz")
+        # The entries of q are rounded, and then as in the tests of those of length 1.
+        np.testing.assert_allclose(to_matrix(q), want, rtol=0, atol=6 * eps)
+        np.testing.assert_allclose(turned, want.sum(axis=-1), rtol=0, atol=12 * eps)
+        # So lengths of vectors stay: 3 here.
+        squares = np.sum(np.asarray(turned) ** 2, axis=-1)
+        np.testing.assert_allclose(squares, 3, rtol=0, atol=20 * eps)
 
 
 def test_the_derivative_along_a_quaternion_is_zero_and_that_across_is_of_its_direction():
+    """By the matrix, by the rotation, and by the matrix of the direction."""
     q = jnp.asarray(1.001 * RANDOM[0])
     x, weights = jnp.asarray(RNG.normal(size=3)), jnp.asarray(RNG.normal(size=3))
+    matrix = partial(quaternion_to_matrix, layout="wxyz")
 
-    def fun(q):
-        return weights @ quaternion_rotate(q, x, layout="wxyz")
+    @jax.jit
+    def derivatives(q, x):
+        functions = (
+            lambda q, x: weights @ (matrix(q / jnp.linalg.norm(q)) @ x),
+            lambda q, x: weights @ (matrix(q) @ x),
+            lambda q, x: weights @ quaternion_rotate(q, x, layout="wxyz"),
+        )
+        gradients = [jax.grad(f, argnums=(0, 1))(q, x) for f in functions]
+        return gradients, jax.jvp(matrix, (q,), (q,))[1]
 
-    def of_direction(q):
-        return weights @ (quaternion_to_matrix(q / jnp.linalg.norm(q), layout="wxyz") @ x)
+    (expected, *others), along = derivatives(q, x)
+    for found in others:
+        for a, b in zip(found, expected, strict=True):
+            # Some 40 products of numbers below 3.
+            np.testing.assert_allclose(a, b, rtol=0, atol=100 * EPS)
+        assert abs(found[0] @ q) < 100 * EPS
+    for a, b in zip(*others, strict=True):
+        # One polynomial in two ways.
+        np.testing.assert_allclose(a, b, rtol=0, atol=40 * EPS)
+    assert np.abs(expected[0]).max() > 0.1
+    np.testing.assert_allclose(along, np.zeros((3, 3)), rtol=0, atol=20 * EPS)
 
-    found, expected = jax.grad(fun)(q), jax.grad(of_direction)(q)
-    # Some 40 products of numbers below 3.
-    np.testing.assert_allclose(found, expected, rtol=0, atol=100 * EPS)
-    assert abs(found @ q) < 100 * EPS
-    assert np.abs(found).max() > 0.1
-    matrices = jax.jvp(partial(quaternion_to_matrix, layout="wxyz"), (q,), (q,))[1]
-    np.testing.assert_allclose(matrices, np.zeros((3, 3)), rtol=0, atol=20 * EPS)
 
-
-@pytest.mark.parametrize("length", [0.0, 0.94, 1.06, 30.0, np.nan])
-def test_a_quaternion_of_quite_another_length_is_no_attitude(length):
+def test_a_quaternion_of_quite_another_length_is_no_attitude(subtests):
     text = r"q must have length 1, and is off by more than 0.1 in q @ q\. Divide it"
-    q = jnp.asarray(length * RANDOM[:2])
-    with pytest.raises(RuntimeError, match=text):
-        quaternion_to_matrix(q, layout="wxyz")
-    with pytest.raises(RuntimeError, match=text):
-        quaternion_rotate(q, jnp.ones((2, 3)), layout="wxyz")
-    assert np.isnan(to_matrix(q)).any(axis=(1, 2)).all()
+    for length in (0.0, 0.94, 1.06, 30.0, np.nan):
+        q = jnp.asarray(length * RANDOM[:2])
+        with subtests.test(length=str(length)):
+            with pytest.raises(RuntimeError, match=text):
+                quaternion_to_matrix(q, layout="wxyz")
+            with pytest.raises(RuntimeError, match=text):
+                quaternion_rotate(q, jnp.ones((2, 3)), layout="wxyz")
+            assert np.isnan(to_matrix(q)).any(axis=(1, 2)).all()
 
 
 def spiral(rewrite, rate):
     """A quaternion whose length grows at this rate while it turns, and a vector that it moves."""
 
-    def field(t, y, args):
+    def field(t, y, rate):
         q = y["q"]
         grows = rate * q + jnp.stack([-q[1], q[0], -q[3], q[2]]) / 2
         return {"q": grows, "x": quaternion_rotate(q, jnp.array([0.0, 1.0, 0.0]), layout="wxyz")}
 
     y0 = {"q": jnp.asarray([1.0, 0.0, 0.0, 0.0]), "x": jnp.zeros(3)}
     with cfjax.rewriting(rewrite):
-        return cfjax.integrate(cfjax.LieTerm(field), cfjax.CF4(), 0.0, 2.0, y0, num_steps=50).ys
+        term, rate = cfjax.LieTerm(field), jnp.asarray(rate)
+        return cfjax.integrate(term, cfjax.CF4(), 0.0, 2.0, y0, rate, num_steps=50).ys
 
 
+@pytest.mark.representatives(1)
 @pytest.mark.parametrize("rewrite", [True, False])
 def test_an_attitude_that_a_solver_of_linear_spaces_lets_drift(rewrite):
     """In a step that is rewritten as in one that is not."""
@@ -228,6 +213,7 @@ def test_an_attitude_that_a_solver_of_linear_spaces_lets_drift(rewrite):
         jax.block_until_ready(spiral(rewrite, 0.1))
 
 
+@pytest.mark.representatives(1)
 @pytest.mark.parametrize("rewrite", [True, False])
 def test_a_wrong_matrix_within_a_field(rewrite):
     """It gives NaN, which ends a solve."""
@@ -236,16 +222,9 @@ def test_a_wrong_matrix_within_a_field(rewrite):
         return cfjax.Rotation(quaternion_from_matrix(matrix, layout="wxyz")[1:] + y)
 
     def end(matrix):
+        given = cfjax.LieTerm(vector_field), cfjax.CF4(), 0.0, 1.0, jnp.array([0.0, 0.6, 0.8])
         with cfjax.rewriting(rewrite):
-            return cfjax.integrate(
-                cfjax.LieTerm(vector_field),
-                cfjax.CF4(),
-                0.0,
-                1.0,
-                jnp.array([0.0, 0.6, 0.8]),
-                matrix,
-                num_steps=20,
-            ).ys
+            return cfjax.integrate(*given, matrix, num_steps=20).ys
 
     assert np.isfinite(end(jnp.asarray(MATRICES[0]))).all()
     with pytest.raises(RuntimeError, match="Nonfinite"):
@@ -277,27 +256,28 @@ def test_matrices_that_are_no_rotations():
     np.testing.assert_allclose(from_matrix(u @ vh), QS[:2], rtol=0, atol=1e-6)
 
 
-def test_wrong_shapes_types_and_layouts(no_shape_hook):
-    q, x, m = np.array([1.0, 0, 0, 0]), np.ones(3), np.eye(3)
-    with pytest.raises(ValueError, match=r"q must have shape \(4,\) or \(\*batch, 4\), got \(3,\)"):
-        quaternion_to_matrix(x, layout="wxyz")
-    with pytest.raises(ValueError, match=r"x must have shape \(3,\) or \(\*batch, 3\), got \(4,\)"):
-        quaternion_rotate(q, q, layout="wxyz")
-    with pytest.raises(ValueError, match=r"matrix must have shape \(3, 3\) or .* got \(3,\)"):
-        quaternion_from_matrix(x, layout="wxyz")
-    with pytest.raises(ValueError, match=r"must agree or be 1, got q \(4,\) and x \(5, 3\)"):
-        quaternion_rotate(q, np.ones((5, 3)), layout="wxyz")
-    with pytest.raises(ValueError, match=r"must agree or be 1, got q \(2, 4\) and x \(5, 3\)"):
-        quaternion_rotate(np.stack([q, q]), np.ones((5, 3)), layout="wxyz")
-    with pytest.raises(TypeError, match="q must be float32 or float64, got complex128"):
-        quaternion_to_matrix(q + 0j, layout="wxyz")
-    with pytest.raises(TypeError, match="matrix must be float32 or float64, got int64"):
-        quaternion_from_matrix(m.astype(int), layout="wxyz")
-    with pytest.raises(TypeError, match="x must have the dtype of q, float64, got float32"):
-        quaternion_rotate(q, x.astype(np.float32), layout="wxyz")
-    functions = [quaternion_to_matrix, quaternion_from_matrix, partial(quaternion_rotate, x=x)]
-    for function, argument in zip(functions, (q, m, q), strict=True):
-        with pytest.raises(TypeError, match="'layout'"):
-            function(argument)
-        with pytest.raises(ValueError, match="layout must be 'wxyz' or 'xyzw', got 'zyxw'"):
-            function(argument, layout="zyxw")
+def test_wrong_shapes_types_and_layouts(no_shape_hook, subtests):
+    q, x, m, five = np.array([1.0, 0, 0, 0]), np.ones(3), np.eye(3), np.ones((5, 3))
+    plain = quaternion_to_matrix, quaternion_from_matrix, quaternion_rotate
+    to, of, rotate = (partial(f, layout="wxyz") for f in plain)
+    fit = "must agree or be 1, got q"
+    values = [
+        (lambda: to(x), r"q must have shape \(4,\) or \(\*batch, 4\), got \(3,\)"),
+        (lambda: rotate(q, q), r"x must have shape \(3,\) or \(\*batch, 3\), got \(4,\)"),
+        (lambda: of(x), r"matrix must have shape \(3, 3\) or .* got \(3,\)"),
+        (lambda: rotate(q, five), rf"{fit} \(4,\) and x \(5, 3\)"),
+        (lambda: rotate(np.stack([q, q]), five), rf"{fit} \(2, 4\) and x \(5, 3\)"),
+    ]
+    types = [
+        (lambda: to(q + 0j), "q must be float32 or float64, got complex128"),
+        (lambda: of(m.astype(int)), "matrix must be float32 or float64, got int64"),
+        (lambda: rotate(q, np.float32(x)), "x must have the dtype of q, float64, got float32"),
+    ]
+    for f, given in zip(plain, ((q,), (m,), (q, x)), strict=True):
+        types.append((lambda f=f, given=given: f(*given), "'layout'"))
+        text = "layout must be 'wxyz' or 'xyzw', got 'zyxw'"
+        values.append((lambda f=f, given=given: f(*given, layout="zyxw"), text))
+    for error, cases in ((ValueError, values), (TypeError, types)):
+        for call, text in cases:
+            with subtests.test(case=text), pytest.raises(error, match=text):
+                call()

@@ -8,7 +8,7 @@ import pytest
 import scipy.linalg
 from matrices import DTYPES, POSE, backward_error, exact_expm, random, small, to_numpy
 
-from cfjax import Conjugation, LeftMatrix, expm
+from cfjax import LeftMatrix, expm
 from cfjax._numerics import cayley_hamilton
 
 mapped = jax.jit(jax.vmap(expm))
@@ -33,7 +33,9 @@ def test_accuracy(n, dtype):
     wide = np.promote_types(dtype, np.float64)
     for case, x, e in zip(CASES, a, np.asarray(mapped(a)), strict=True):
         kind, norm, _ = case
-        exact = to_numpy(exact_expm(x))
+        # SciPy's double precision is exact enough for single.
+        is_single = np.finfo(dtype).bits == 32
+        exact = scipy.linalg.expm(x.astype(wide)) if is_single else to_numpy(exact_expm(x))
         condition = 1.0
         if kind not in ("skew", "negative"):
             condition = scipy.linalg.expm_cond(x.astype(wide)) if norm else 1.0
@@ -45,14 +47,14 @@ def test_accuracy(n, dtype):
         assert error <= bound, (case, error / bound)
 
 
-@pytest.mark.parametrize("n", [2, 3])
-def test_a_change_of_units_changes_no_digit(n):
+def test_a_change_of_units_changes_no_digit():
     """Powers of two are exact. A norm would ask for 40 squarings."""
-    a = np.stack([small(kind, n, 0.5) for kind in KINDS if kind != "nilpotent"])
-    units = 2.0 ** np.array([40, 0, -7])[:n]
-    e = np.asarray(mapped(a))
-    moved = np.asarray(mapped(a * units[:, None] / units))
-    np.testing.assert_array_equal(moved, e * units[:, None] / units)
+    for n in (2, 3):
+        a = np.stack([small(kind, n, 0.5) for kind in KINDS if kind != "nilpotent"])
+        units = 2.0 ** np.array([40, 0, -7])[:n]
+        e = np.asarray(mapped(a))
+        moved = np.asarray(mapped(a * units[:, None] / units))
+        np.testing.assert_array_equal(moved, e * units[:, None] / units)
 
 
 def test_the_motion_of_a_pose_far_away():
@@ -145,18 +147,8 @@ def test_a_million_products_stay_unitary(norm):
     assert np.linalg.norm(y.conj().T @ y - np.eye(3)) <= 5e-13
 
 
-def test_a_conjugation_keeps_eigenvalues():
-    a, x = small("general", 3, 2.0), random((3, 3), 1, complex)
-    y = Conjugation(jnp.asarray(a)).flow(jnp.asarray(x))
-    e = scipy.linalg.expm(a)
-    # Units of rounding, as large as the factors are.
-    atol = 40 * 2.0**-52 * np.linalg.cond(e) * np.linalg.norm(x)
-    np.testing.assert_allclose(y, e @ x @ np.linalg.inv(e), rtol=0, atol=atol)
-
-
-@pytest.mark.parametrize(("precision", "norm"), [("float32", 1.7), ("float64", 1.8)])
-def test_degrees_of_sizes_2_and_3_are_enough(precision, norm):
-    degree = cayley_hamilton._DEGREE[precision]
-    log = backward_error([0] * (degree + 1), degree)
-    unit = 2.0**-24 if precision == "float32" else 2.0**-53
-    assert sum(c * norm ** (k - 1) for k, c in enumerate(log)) <= unit
+def test_degrees_of_sizes_2_and_3_are_enough():
+    for precision, norm, unit in (("float32", 1.7, 2.0**-24), ("float64", 1.8, 2.0**-53)):
+        degree = cayley_hamilton._DEGREE[precision]
+        log = backward_error([0] * (degree + 1), degree)
+        assert sum(c * norm ** (k - 1) for k, c in enumerate(log)) <= unit

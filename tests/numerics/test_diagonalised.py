@@ -6,7 +6,6 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
-import problems
 import pytest
 import scipy.linalg
 
@@ -60,25 +59,49 @@ def points(shape, is_complex, seed=0):
 
 @matrices
 def test_the_operator_is_diagonal(name):
+    """For points alone and in columns; and the flow, where the matrix is not normal."""
     a, kind = MATRICES[name]
     n = len(a)
     spectrum, transform = cfjax.diagonalised(a)
     assert np.iscomplexobj(spectrum) == (kind != "real" and name != "Hermitian")
-    for columns in ((), (3,), (2, 2)):
-        for is_complex in {"real": (False, True), "complex": (True,)}.get(kind, (False,)):
-            x = jnp.asarray(points((n, *columns), is_complex))
-            c = transform.forward(x)
-            assert c.shape == (len(spectrum), *columns)
+    shapes = [(n,), (n, 2, 2)] if n > 1 else [(n, 3)]
+    for is_complex in {"real": (False, True), "complex": (True,)}.get(kind, (False,)):
+        given = [jnp.asarray(points(shape, is_complex)) for shape in shapes]
+
+        @jax.jit
+        def everything(xs):
+            return [(c := transform.forward(x), transform.inverse(c), scaled(c)) for x in xs]
+
+        def scaled(c):
+            factor = jnp.asarray(spectrum).reshape(-1, *[1] * (c.ndim - 1))
+            return transform.inverse(factor.astype(c.dtype) * c)
+
+        for x, (c, back, found) in zip(given, everything(given), strict=True):
+            assert c.shape == (len(spectrum), *x.shape[1:])
             assert jnp.iscomplexobj(c) == (is_complex or kind != "real")
-            factor = jnp.asarray(spectrum).reshape(-1, *[1] * len(columns)).astype(c.dtype)
-            found = transform.inverse(factor * c)
             assert found.dtype == x.dtype
             # Sums of n products, in vectors of a condition up to 1e3.
             atol = n * EPS * 1e3
-            np.testing.assert_allclose(transform.inverse(c), x, rtol=0, atol=atol)
-            wanted = np.tensordot(a, x, 1)
+            np.testing.assert_allclose(back, x, rtol=0, atol=atol)
             atol *= np.abs(a).max()
-            np.testing.assert_allclose(found, wanted, rtol=0, atol=atol)
+            np.testing.assert_allclose(found, np.tensordot(a, x, 1), rtol=0, atol=atol)
+    if name in ("complex eigenvalues", "odd", "complex", "real eigenvalues"):
+        b, u = (points((n,), kind == "complex", seed) for seed in (1, 2))
+        field = cfjax.Affine(b, spectrum, transform, alpha=0.3)
+        wanted = exact_flow(0.3 * a, b, u)
+        # The condition of the eigenvectors, up to 400, times some units of norms up to 7.
+        atol = 400 * 20 * EPS * np.abs(wanted).max()
+        np.testing.assert_allclose(field.flow(jnp.asarray(u)), wanted, rtol=0, atol=atol)
+        velocity = 0.3 * a @ u + b
+        np.testing.assert_allclose(field.tangent(jnp.asarray(u)), velocity, rtol=0, atol=10 * atol)
+
+
+def exact_flow(a, b, u):
+    """Where `x' = a x + b` leads u in unit time."""
+    n = len(a)
+    whole = np.zeros((n + 1, n + 1), np.result_type(a, b))
+    whole[:n, :n], whole[:n, n] = a, b
+    return (scipy.linalg.expm(whole) @ np.append(u, 1))[:n]
 
 
 def test_half_of_the_conjugate_eigenvalues():
@@ -89,40 +112,19 @@ def test_half_of_the_conjugate_eigenvalues():
     np.testing.assert_allclose(np.sort(np.real(spectrum)), np.sort(every[every.imag >= 0].real))
 
 
-@pytest.mark.parametrize("which", [0, 1])
-def test_heat_with_a_variable_coefficient_is_exact_in_one_step(which):
-    a = heat(49)[which]
+def test_heat_with_a_variable_coefficient_is_exact_in_one_step():
+    a = heat(49)[1]
     n, b = len(a), np.linspace(1, 2, len(a))
     spectrum, transform = cfjax.diagonalised(a)
     assert spectrum.dtype == np.float64 and spectrum.max() < 0
     term = cfjax.LieTerm(lambda t, u, args: cfjax.Affine(jnp.asarray(b), args, transform))
     u0 = 1 - np.abs(np.linspace(-1, 1, n + 2)[1:-1])
-    found = cfjax.integrate(term, cfjax.CF4(), 0.0, 0.5, jnp.asarray(u0), spectrum, num_steps=1).ys[
-        -1
-    ]
-    whole = np.zeros((n + 1, n + 1))
-    whole[:n, :n], whole[:n, n] = a, b
-    wanted = (scipy.linalg.expm(0.5 * whole) @ np.append(u0, 1))[:n]
+    given = term, cfjax.CF4(), 0.0, 0.5, jnp.asarray(u0), spectrum
+    found = cfjax.integrate(*given, num_steps=1).ys[-1]
+    wanted = exact_flow(0.5 * a, 0.5 * b, u0)
     # Eigenvalues are known to some units of the largest, 0.5 * 2500 here. The scaling that makes
     # `mu u_xx` symmetric has a condition of 4, and the squarings of expm lose as much again.
     np.testing.assert_allclose(found, wanted, rtol=0, atol=8 * 1250 * EPS)
-
-
-@pytest.mark.parametrize("name", ["complex eigenvalues", "odd", "complex", "real eigenvalues"])
-def test_a_flow_of_a_matrix_that_is_not_normal(name):
-    a, kind = MATRICES[name]
-    n = len(a)
-    spectrum, transform = cfjax.diagonalised(a)
-    b, u = (points((n,), kind == "complex", seed) for seed in (1, 2))
-    field = cfjax.Affine(b, spectrum, transform, alpha=0.3)
-    whole = np.zeros((n + 1, n + 1), b.dtype)
-    whole[:n, :n], whole[:n, n] = 0.3 * a, b
-    wanted = (scipy.linalg.expm(whole) @ np.append(u, 1))[:n]
-    # The condition of the eigenvectors, up to 400, times some units of norms up to 7.
-    atol = 400 * 20 * EPS * np.abs(wanted).max()
-    np.testing.assert_allclose(field.flow(jnp.asarray(u)), wanted, rtol=0, atol=atol)
-    velocity = 0.3 * a @ u + b
-    np.testing.assert_allclose(field.tangent(jnp.asarray(u)), velocity, rtol=0, atol=10 * atol)
 
 
 GRIDS: dict[str, Any] = {
@@ -150,36 +152,11 @@ def test_one_axis_of_a_grid(name):
     b, u = (points((len(m1), len(m2)), False, seed) for seed in (1, 2))
     grid = cfjax.TensorTransform((t1, t2))
     field = cfjax.Affine(b, np.add.outer(s1, s2), grid, alpha=0.1)
-    size = b.size
-    whole = np.zeros((size + 1, size + 1))
-    whole[:size, :size], whole[:size, size] = 0.1 * operator, b.ravel()
-    wanted = (scipy.linalg.expm(whole) @ np.append(u, 1))[:size].reshape(u.shape)
+    wanted = exact_flow(0.1 * operator, b.ravel(), u.ravel()).reshape(u.shape)
     found = eqx.filter_jit(field.flow)(jnp.asarray(u))
     assert found.dtype == u.dtype
     # The condition of the eigenvectors, up to 60, times some units of norms up to 5.
     np.testing.assert_allclose(found, wanted, rtol=0, atol=60 * 20 * EPS * np.abs(wanted).max())
-
-
-@pytest.mark.slow
-def test_derivative_of_a_solve_with_respect_to_a_factor_of_the_spectrum():
-    spectrum, transform = cfjax.diagonalised(advection() / 10)
-    u0 = jnp.asarray(points((12,), False))
-
-    def loss(factor):
-        def field(t, u, args):
-            return cfjax.Affine(u - u**3, args * spectrum, transform)
-
-        factor = factor.astype(complex)
-        end = cfjax.integrate(
-            cfjax.LieTerm(field), cfjax.CF4(), 0.0, 1.0, u0, factor, num_steps=4
-        ).ys[-1]
-        return jnp.sum(end**2)
-
-    one = jnp.asarray(1.0)
-    wanted = problems.central_difference(jax.jit(loss), one, one, 1e-3)
-    # Differences leave 1e-12 of the fifth derivative, and rounding some units over 1e-3.
-    assert float(jax.jit(jax.grad(loss))(one)) == pytest.approx(float(wanted), rel=1e-10)
-    assert float(jax.jvp(loss, (one,), (one,))[1]) == pytest.approx(float(wanted), rel=1e-10)
 
 
 @pytest.mark.parametrize("name", ["symmetrisable", "complex eigenvalues", "complex"])
@@ -295,71 +272,46 @@ def test_the_bound_on_the_condition_belongs_to_the_precision():
         cfjax.diagonalised((np.eye(5, k=1) + 100 * np.eye(5, k=-1)).astype(np.float32))
 
 
-@pytest.mark.parametrize(
-    "call, error, message",
-    [
+def test_wrong_matrices_and_points(no_shape_hook, subtests):
+    made = cfjax.diagonalised
+    _, three = made(np.eye(3))
+    _, twelve = made(advection())
+    ones, shape = jnp.ones, r"matrix must have the shape"
+    values = (
+        (lambda: made(np.ones((2, 3))), rf"{shape} \(n, n\) with n >= 1, got \(2, 3\)"),
+        (lambda: made(np.ones((0, 0))), rf"{shape} .* got \(0, 0\)"),
+        (lambda: made(np.ones(3)), rf"{shape} .* got \(3,\)"),
         (
-            lambda: cfjax.diagonalised(np.ones((2, 3))),
-            ValueError,
-            r"matrix must have the shape \(n, n\) with n >= 1, got \(2, 3\)",
-        ),
-        (
-            lambda: cfjax.diagonalised(np.ones((0, 0))),
-            ValueError,
-            r"matrix must have the shape .* got \(0, 0\)",
-        ),
-        (
-            lambda: cfjax.diagonalised(np.ones(3)),
-            ValueError,
-            r"matrix must have the shape .* got \(3,\)",
-        ),
-        (
-            lambda: cfjax.diagonalised(np.eye(3, dtype=int)),
-            TypeError,
-            "matrix must be one of float32, .*, got int64",
-        ),
-        (
-            lambda: cfjax.diagonalised(np.diag([1.0, np.nan, np.inf])),
-            ValueError,
+            lambda: made(np.diag([1.0, np.nan, np.inf])),
             "matrix must be finite, got 2 entries that are not",
         ),
         (
-            lambda: jax.jit(lambda a: cfjax.diagonalised(a)[0])(jnp.eye(3)),
-            TypeError,
+            lambda: three.forward(ones(4)),
+            "cfjax.diagonalised, .* got length 4 along its axis, expected 3",
+        ),
+        (lambda: twelve.inverse(ones(7, complex)), "got 7 coefficients along its axis, expected 6"),
+        (
+            lambda: cfjax.TensorTransform([twelve] * 2),
+            r"at most one RealFourierTransform, or .* diagonalised\(matrix.astype\(complex\)\)",
+        ),
+    )
+    types = (
+        (lambda: made(np.eye(3, dtype=int)), "matrix must be one of float32, .*, got int64"),
+        (
+            lambda: jax.jit(lambda a: made(a)[0])(jnp.eye(3)),
             r"matrix must be known before .* got a traced array, float64 of shape \(3, 3\)",
         ),
         (
-            lambda: cfjax.diagonalised(np.eye(3))[1].forward(jnp.ones(4)),
-            ValueError,
-            "cfjax.diagonalised, .* got length 4 along its axis, expected 3",
-        ),
-        (
-            lambda: cfjax.diagonalised(advection())[1].inverse(jnp.ones(7, complex)),
-            ValueError,
-            "got 7 coefficients along its axis, expected 6",
-        ),
-        (
-            lambda: cfjax.diagonalised(advection())[1].forward(jnp.ones(12, complex)),
-            TypeError,
+            lambda: twelve.forward(ones(12, complex)),
             "takes real points, got complex128. For complex points take",
         ),
         (
-            lambda: cfjax.diagonalised(hermitian())[1].forward(jnp.ones(6)),
-            TypeError,
+            lambda: made(hermitian())[1].forward(ones(6)),
             "of a complex matrix takes complex points, got float64",
         ),
-        (
-            lambda: cfjax.TensorTransform([cfjax.diagonalised(advection())[1]] * 2),
-            ValueError,
-            r"at most one RealFourierTransform, or .* diagonalised\(matrix.astype\(complex\)\)",
-        ),
-        (
-            lambda: cfjax.diagonalised(np.eye(3))[1].forward(jnp.arange(3)),
-            TypeError,
-            "takes arrays of float32, .*, got int64",
-        ),
-    ],
-)
-def test_wrong_matrices_and_points(call, error, message, no_shape_hook):
-    with pytest.raises(error, match=message):
-        call()
+        (lambda: three.forward(jnp.arange(3)), "takes arrays of float32, .*, got int64"),
+    )
+    for error, cases in ((ValueError, values), (TypeError, types)):
+        for call, message in cases:
+            with subtests.test(case=message), pytest.raises(error, match=message):
+                call()

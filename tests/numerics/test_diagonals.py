@@ -1,11 +1,11 @@
 """Matrices of few diagonals: what is stored of them, and their products."""
 
+from functools import partial
 from typing import Any
 
 import jax
 import jax.numpy as jnp
 import numpy as np
-import pytest
 from matrices import DTYPES, random
 
 from cfjax._numerics.diagonals import Diagonals, adjoint, compact, dense, gram, times, times_adjoint
@@ -31,32 +31,38 @@ KINDS = {
 }
 
 
-@pytest.mark.parametrize("kind", KINDS)
-@pytest.mark.parametrize("dtype", [float, complex])
-def test_products_are_those_of_the_dense_matrix(kind, dtype):
-    a, x = KINDS[kind], random((N, N), 2, dtype)
-    stored = compact(a)
-    assert isinstance(stored, Diagonals) == (kind != "dense")
-    np.testing.assert_array_equal(dense(stored), a)
-    np.testing.assert_array_equal(dense(adjoint(stored)), a.conj().T)
-    assert stored.shape == a.shape and stored.dtype == a.dtype
-    # Sums of six products of numbers of size 1 to 10.
-    close = lambda found, expected: np.testing.assert_allclose(found, expected, 0, 1e-14)  # noqa: E731
-    for known in (True, False):
+def products(stored, x):
+    return times(stored, x), times_adjoint(x, stored), gram(stored), gram(adjoint(stored))
+
+
+def test_products_are_those_of_the_dense_matrix(subtests):
+    for kind, a in KINDS.items():
+        stored = compact(a)
         # Entries that are arguments of a program are not known in it, and their places are.
-        found = (lambda f: f) if known else jax.jit
-        close(found(times)(stored, jnp.asarray(x)), a @ x)
-        close(found(times_adjoint)(jnp.asarray(x), stored), x @ a.conj().T)
-        close(found(gram)(stored), a.conj().T @ a)
-        close(found(gram)(adjoint(stored)), a @ a.conj().T)
+        programs = jax.jit(products), jax.jit(partial(products, stored))
+        for dtype in (float, complex):
+            x = random((N, N), 2, dtype)
+            wants = a @ x, x @ a.conj().T, a.conj().T @ a, a @ a.conj().T
+            for found in (programs[0](stored, jnp.asarray(x)), programs[1](jnp.asarray(x))):
+                with subtests.test(case=f"{kind} {dtype}"):
+                    for got, want in zip(found, wants, strict=True):
+                        # Sums of six products of numbers of size 1 to 10.
+                        np.testing.assert_allclose(got, want, 0, 1e-14)
+        with subtests.test(case=f"{kind}, stored"):
+            assert isinstance(stored, Diagonals) == (kind != "dense")
+            np.testing.assert_array_equal(dense(stored), a)
+            np.testing.assert_array_equal(dense(adjoint(stored)), a.conj().T)
+            assert stored.shape == a.shape and stored.dtype == a.dtype
 
 
-@pytest.mark.parametrize("dtype", DTYPES)
-def test_the_precision_of_a_product(dtype):
-    a = compact(of_diagonals(1, -1, dtype=dtype))
-    assert times(a, jnp.ones((N, N), dtype)).dtype == gram(a).dtype == dtype
-    wide = np.result_type(dtype, np.complex64)
-    assert times(a, jnp.ones((N, N), wide)).dtype == wide
+def test_the_precision_of_a_product():
+    for dtype in DTYPES:
+        a = compact(of_diagonals(1, -1, dtype=dtype))
+        wide = np.result_type(dtype, np.complex64)
+        for other in (dtype, wide):
+            x = jax.ShapeDtypeStruct((N, N), other)
+            assert jax.eval_shape(lambda x, a=a: times(a, x), x).dtype == other
+        assert gram(a).dtype == dtype
 
 
 def test_a_matrix_of_other_columns():

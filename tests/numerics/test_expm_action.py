@@ -9,7 +9,6 @@ import scipy.linalg
 
 from cfjax._numerics.expm_action import _polynomials, phi_1_action
 
-dtypes = pytest.mark.parametrize("dtype", [np.float32, np.float64])
 EPS = {np.float32: 2.0**-23, np.float64: 2.0**-52}
 
 
@@ -28,44 +27,38 @@ def exact(a, b):
     return scipy.linalg.expm(np.block([[a, b], [np.zeros((k, m + k))]]))[:m, m:]
 
 
-@pytest.mark.parametrize("eps", EPS.values())
-def test_polynomials_are_exp_to_half_a_unit_on_their_interval(eps):
-    intervals, table = _polynomials(eps)
-    assert np.all(np.diff(intervals) > 0) and intervals[-1] > 2
-    with mp.workdps(40):
-        for length, row in zip(intervals, table, strict=True):
-            for y in np.linspace(0, length, 25):
-                z = mp.mpc(0, y)
-                p = 1 + z + sum(mp.mpf(c) * z ** (k + 2) for k, c in enumerate(row))
-                # Half a unit, and the rounding of each coefficient in float64.
-                rounding = 2.0**-53 * (np.cosh(y) - 1)
-                assert abs(p - mp.exp(z)) <= eps / 2 * 1.05 + rounding
-
-
-@pytest.mark.parametrize("eps", EPS.values())
-def test_polynomials_use_few_terms(eps):
+def test_polynomials_are_exp_to_half_a_unit_on_their_interval_and_use_few_terms(subtests):
     """No more than two terms more than what bounds every polynomial of that degree from below."""
-    intervals, table = _polynomials(eps)
-    for length, row in zip(intervals, table, strict=True):
-        degree = np.count_nonzero(row) + 1
-        # The best error on an interval is about the first Chebyshev coefficient left out.
-        fewer = 2 * mp.besselj(degree - 1, length)
-        assert fewer > eps / 2
+    for eps in EPS.values():
+        intervals, table = _polynomials(eps)
+        assert np.all(np.diff(intervals) > 0) and intervals[-1] > 2
+        for length, row in zip(intervals, table, strict=True):
+            with subtests.test(case=f"{eps} {length}"), mp.workdps(40):
+                for y in np.linspace(0, length, 25):
+                    z = mp.mpc(0, y)
+                    p = 1 + z + sum(mp.mpf(c) * z ** (k + 2) for k, c in enumerate(row))
+                    # Half a unit, and the rounding of each coefficient in float64.
+                    rounding = 2.0**-53 * (np.cosh(y) - 1)
+                    assert abs(p - mp.exp(z)) <= eps / 2 * 1.05 + rounding
+                degree = np.count_nonzero(row) + 1
+                # The best error on an interval is about the first Chebyshev coefficient left out.
+                assert 2 * mp.besselj(degree - 1, length) > eps / 2
 
 
-@pytest.mark.representatives(6)
-@dtypes
-@pytest.mark.parametrize("norm", [0.0, 1e-3, 0.1, 0.5, 1.0, 2.0, 2.3, 2.6, 7.0, 300.0])
-def test_phi_1_action_at_every_norm(dtype, norm):
-    a, b = skew(6, norm).astype(dtype), np.random.default_rng(1).standard_normal((6, 2))
-    b = b.astype(dtype)
-    # The 2-norm with what rounding may add.
-    got = action(a, b, dtype(norm * (1 + 1e-6)))
-    assert got.dtype == dtype
-    # Ten units for sums of products, cosh(2.5) = 6 where powers cancel, and the norm for the
-    # condition of exp, doubled by squarings.
-    atol = 60 * EPS[dtype] * (1 + norm)
-    np.testing.assert_allclose(got, exact(a.astype(float), b.astype(float)), rtol=0, atol=atol)
+@pytest.mark.parametrize("dtype", EPS)
+def test_phi_1_action_at_every_norm(dtype, subtests):
+    b = np.random.default_rng(1).standard_normal((6, 2)).astype(dtype)
+    for norm in (0.0, 1e-3, 0.1, 0.5, 1.0, 2.0, 2.3, 2.6, 7.0, 300.0):
+        a = skew(6, norm).astype(dtype)
+        # The 2-norm with what rounding may add.
+        got = action(a, b, dtype(norm * (1 + 1e-6)))
+        # Ten units for sums of products, cosh(2.5) = 6 where powers cancel, and the norm for the
+        # condition of exp, doubled by squarings.
+        atol = 60 * EPS[dtype] * (1 + norm)
+        with subtests.test(norm=str(norm)):
+            assert got.dtype == dtype
+            want = exact(a.astype(float), b.astype(float))
+            np.testing.assert_allclose(got, want, rtol=0, atol=atol)
 
 
 def test_phi_1_action_with_scales_at_a_large_norm():
@@ -90,22 +83,26 @@ def test_infinite_and_nan_give_nan():
         assert np.all(np.isnan(action(a, b, bad)))
 
 
-@pytest.mark.representatives(1)
-@pytest.mark.parametrize("norm", [0.0, 0.3, 2.0, 12.0])
-def test_derivatives_of_phi_1_action(norm):
+def test_derivatives_of_phi_1_action():
     """Against the exponential of the block matrix `[[a, d], [0, a]]`, and between the modes."""
-    a, b, d, w = (np.random.default_rng(s).standard_normal((4, 4)) for s in range(4))
-    a, d = skew(4, norm), skew(4, 1.0, seed=5)
-    bound = norm * 1.0001
+    b, w, d = *(np.random.default_rng(s).standard_normal((4, 4)) for s in (1, 3)), skew(4, 1.0, 5)
+
+    @jax.jit
+    def both_modes(a, bound):
+        pushed = jax.jvp(lambda a: action(a, b, bound), (a,), (d,))[1]
+        return pushed, jax.grad(lambda a: jnp.vdot(w, action(a, b, bound)))(a)
+
     # exp(a) z = z + phi_1(a) a z, so the derivative of phi_1(a) b follows from that of exp.
     full = lambda a: np.block([[a, b], [np.zeros((4, 8))]])  # noqa: E731
-    expected = scipy.linalg.expm_frechet(full(a), full(d) - full(0 * a))[1][:4, 4:]
-    found = jax.jvp(lambda a: action(a, b, bound), (a,), (d,))[1]
-    # 100 units, doubled by four squarings for the largest.
-    atol = 2e-14 * (1 + norm)
-    np.testing.assert_allclose(found, expected, rtol=0, atol=atol)
-    gradient = jax.grad(lambda a: jnp.vdot(w, action(a, b, bound)))(a)
-    np.testing.assert_allclose(np.vdot(gradient, d), np.vdot(w, expected), rtol=0, atol=10 * atol)
+    for norm in (0.0, 0.3, 2.0, 12.0):
+        a = skew(4, norm)
+        found, gradient = both_modes(a, norm * 1.0001)
+        expected = scipy.linalg.expm_frechet(full(a), full(d) - full(0 * a))[1][:4, 4:]
+        # 100 units, doubled by four squarings for the largest.
+        atol = 2e-14 * (1 + norm)
+        np.testing.assert_allclose(found, expected, rtol=0, atol=atol)
+        paired = np.vdot(gradient, d)
+        np.testing.assert_allclose(paired, np.vdot(w, expected), rtol=0, atol=10 * atol)
 
 
 def test_a_batch_of_phi_1_action_of_all_norms():

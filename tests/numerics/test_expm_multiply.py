@@ -1,6 +1,7 @@
 """`exp(A) x - x` by products with A alone: its series, every norm, derivatives, memory."""
 
 import functools
+import itertools
 
 import jax
 import jax.numpy as jnp
@@ -46,20 +47,32 @@ def moved(a, x, norm, is_skew):
     return expm_minus_one_multiply(lambda x: a @ x, x, norm, is_skew=is_skew)
 
 
+def partial_sums(series, n, z):
+    """The series of one interval at z, and its largest term."""
+    before, last, total = mp.mpf(0), mp.mpf(1), mp.mpf(series.weights[n, 0])
+    largest = abs(series.weights[n, 0])
+    for k in range(series.degrees[n]):
+        last, before = last * z / series.divisors[n, k] + before, last
+        total += last * series.weights[n, k + 1]
+        largest = max(largest, abs(last * series.weights[n, k + 1]))
+    return total, largest
+
+
+def assert_ordered(series):
+    assert np.all(np.diff(series.lengths) > 0) and np.all(np.diff(series.degrees) >= 0)
+    assert series.degrees[-1] <= _ROOT_OF_LONGEST**2
+
+
 @pytest.mark.parametrize("precision", UNIT)
 def test_chebyshev_series_are_exp_on_their_interval(precision):
     series = _chebyshev(precision)
-    assert np.all(np.diff(series.lengths) > 0) and np.all(np.diff(series.degrees) >= 0)
-    assert series.degrees[-1] <= _ROOT_OF_LONGEST**2
+    assert_ordered(series)
     for n in range(0, len(series.lengths), 6):
-        length, degree = series.lengths[n], series.degrees[n]
+        length = series.lengths[n]
         with mp.workdps(30):
             for y in np.linspace(-length, length, 9):
                 z = mp.mpc(0, y)
-                before, last, total = mp.mpf(0), mp.mpf(1), mp.mpf(series.weights[n, 0])
-                for k in range(degree):
-                    last, before = last * z / series.divisors[n, k] + before, last
-                    total += last * series.weights[n, k + 1]
+                total, _ = partial_sums(series, n, z)
                 # What is left out, and a rounding of each weight.
                 rounding = 2.0**-54 * np.abs(series.weights[n]).sum()
                 assert abs(total - mp.expm1(z)) <= UNIT[precision] / 8 * min(1, length) + rounding
@@ -67,6 +80,7 @@ def test_chebyshev_series_are_exp_on_their_interval(precision):
 
 @either
 def test_expm_multiply_at_every_norm(is_skew):
+    """And NaN where it is too large or not finite."""
     values, vectors = np.linalg.eigh(1j * skew_hermitian(1.0))
     x = vector()
     for norm in (0.0, 1e-9, 1e-3, 0.1, 0.5, 2.4, 2.5, 28.0, 29.0, 1000.0):
@@ -76,6 +90,8 @@ def test_expm_multiply_at_every_norm(is_skew):
         # Units for the norm, of A in `eigh` and of each piece; nothing grows. At zero
         # what is left out of the series.
         np.testing.assert_allclose(found, expected, rtol=0, atol=16 * 2.0**-53 * norm + 1e-18)
+    for norm in (np.nan, np.inf, 2e5):
+        assert np.isnan(moved(skew_hermitian(1.0), x, norm, is_skew)).all()
 
 
 @pytest.mark.representatives(1)
@@ -111,34 +127,24 @@ def number_of_products(steps):
 
 
 @pytest.mark.parametrize("precision", UNIT)
-def test_the_degrees_on_a_strip(precision):
+def test_series_on_a_strip_are_exp_on_their_rectangle(precision):
+    series = _on_strip(precision)
+    assert_ordered(series)
+    for n in range(0, len(series.lengths), 5):
+        length = series.lengths[n]
+        edge = [complex(x, y) for x in (-_DECAY, 0.0, _GROWTH) for y in (-length, 0.3, length)]
+        with mp.workdps(30):
+            for z in map(mp.mpmathify, edge):
+                total, largest = partial_sums(series, n, z)
+                # What is left out, and a rounding of each weight.
+                rounding = 2.0**-53 * series.degrees[n] * largest
+                assert abs(total - mp.expm1(z)) <= 2 * UNIT[precision] / 8 + rounding
     for length, degree in DEGREES[precision].items():
         x = jnp.asarray(length, precision)
         steps = _steps_on_strip(x, Strip(x, jnp.full_like(x, _DECAY), jnp.full_like(x, _GROWTH)))
         # The study's intervals are those lengths themselves, ours of few bits: up to 15% longer.
         assert int(steps.number) == 1
         assert int(steps.degree) <= degree * 1.12 + 1
-
-
-@pytest.mark.parametrize("precision", UNIT)
-def test_series_on_a_strip_are_exp_on_their_rectangle(precision):
-    series = _on_strip(precision)
-    assert np.all(np.diff(series.lengths) > 0) and np.all(np.diff(series.degrees) >= 0)
-    assert series.degrees[-1] <= _ROOT_OF_LONGEST**2
-    for n in range(0, len(series.lengths), 5):
-        length = series.lengths[n]
-        edge = [complex(x, y) for x in (-_DECAY, 0.0, _GROWTH) for y in (-length, 0.3, length)]
-        with mp.workdps(30):
-            for z in map(mp.mpmathify, edge):
-                before, last, total = mp.mpf(0), mp.mpf(1), mp.mpf(series.weights[n, 0])
-                largest = abs(series.weights[n, 0])
-                for k in range(series.degrees[n]):
-                    last, before = last * z / series.divisors[n, k] + before, last
-                    total += last * series.weights[n, k + 1]
-                    largest = max(largest, abs(last * series.weights[n, k + 1]))
-                # What is left out, and a rounding of each weight.
-                rounding = 2.0**-53 * series.degrees[n] * largest
-                assert abs(total - mp.expm1(z)) <= 2 * UNIT[precision] / 8 + rounding
 
 
 def normal_matrix(values, seed=0):
@@ -157,22 +163,24 @@ def strip_of(values, margin=1 + 1e-12):
     return Strip(*(jnp.asarray(margin * b) for b in bounds))
 
 
-# Lengths in one piece, in a few, and in many; and widths of one, of many.
-@pytest.mark.parametrize("length", [0.5, 3.0, 20.0, 100.0, 1000.0])
-@pytest.mark.parametrize("width", [0.1, 1.0, 10.0])
-def test_accuracy_on_a_strip(length, width):
+def test_accuracy_on_a_strip(subtests):
     """Normal matrices with eigenvalues all over the rectangle, in its corners too."""
-    rng, x = np.random.default_rng(5), vector()
-    real = width * np.concatenate([[-_DECAY] * 2, [_GROWTH] * 2, rng.uniform(-0.5, 0.125, N - 4)])
-    imaginary = length * np.concatenate([[-1, 1, -1, 1], rng.uniform(-1, 1, N - 4)])
-    values = real + 1j * imaginary
-    a, q = normal_matrix(values)
-    norm = np.abs(values).max() * (1 + 1e-12)
-    found = moved_on_strip(a, x, norm, strip_of(values))
-    expected = q @ (np.expm1(values) * (q.conj().T @ x))
-    # Units for the norm, of which some are those of A itself; what grows is as large as this.
-    growth = np.exp(max(real.max(), 0))
-    np.testing.assert_allclose(found, expected, rtol=0, atol=16 * 2.0**-53 * (1 + norm) * growth)
+    x = vector()
+    # Lengths in one piece, in a few, and in many; and widths of one, of many.
+    for length, width in itertools.product((0.5, 3.0, 20.0, 100.0, 1000.0), (0.1, 1.0, 10.0)):
+        rng = np.random.default_rng(5)
+        inside = rng.uniform(-0.5, 0.125, N - 4)
+        real = width * np.concatenate([[-_DECAY] * 2, [_GROWTH] * 2, inside])
+        imaginary = length * np.concatenate([[-1, 1, -1, 1], rng.uniform(-1, 1, N - 4)])
+        values = real + 1j * imaginary
+        a, q = normal_matrix(values)
+        norm = np.abs(values).max() * (1 + 1e-12)
+        found = moved_on_strip(a, x, norm, strip_of(values))
+        expected = q @ (np.expm1(values) * (q.conj().T @ x))
+        # Units for the norm, of which some are those of A itself; what grows is as large as this.
+        atol = 16 * 2.0**-53 * (1 + norm) * np.exp(max(real.max(), 0))
+        with subtests.test(case=f"{length} {width}"):
+            np.testing.assert_allclose(found, expected, rtol=0, atol=atol)
 
 
 def test_accuracy_on_a_strip_without_growth():
@@ -256,16 +264,6 @@ def test_a_strip_with_bounds_that_are_nan_or_infinite():
         assert np.isnan(moved_on_strip(skew_hermitian(1.0), x, b, Strip(b, b, b))).all()
 
 
-@pytest.mark.slow
-@either
-def test_a_gradient_of_a_gradient(is_skew):
-    """The term of second order of exp is d d / 2, so its second derivative at zero is d d."""
-    d, x, w = skew_hermitian(1.0, seed=2), vector(), vector(3)
-    value = lambda t: jnp.sum(w * moved(t.astype(complex) * d, x, 1.0, is_skew)).real  # noqa: E731
-    found = jax.jit(jax.grad(jax.grad(value)))(0.0)
-    assert found == pytest.approx(np.sum(w * (d @ d @ x)).real, abs=1e-13)
-
-
 def test_a_batch_of_expm_multiply_of_all_norms():
     norms, x = np.array([0.0, 1.0, 50.0]), vector()
     a = np.stack([skew_hermitian(norm) for norm in norms])
@@ -273,12 +271,6 @@ def test_a_batch_of_expm_multiply_of_all_norms():
     for y, b in zip(found, a, strict=True):
         # SciPy squares up to six times.
         np.testing.assert_allclose(y, scipy.linalg.expm(b) @ x - x, rtol=0, atol=1e-13)
-
-
-def test_a_norm_that_is_too_large_or_not_finite_gives_nan():
-    x = vector()
-    for norm in (np.nan, np.inf, 2e5):
-        assert np.isnan(moved(skew_hermitian(1.0), x, norm, True)).all()
 
 
 def test_row_norm():

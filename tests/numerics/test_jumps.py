@@ -2,7 +2,6 @@
 
 import jax
 import jax.numpy as jnp
-import pytest
 
 from cfjax._numerics.jumps import may_jump
 
@@ -38,11 +37,8 @@ CONTINUOUS = {
 }
 
 
-@pytest.mark.parametrize("name", JUMPS)
-def test_jumps_are_seen(name):
-    assert may_jump(JUMPS[name], 0.3)
-
-
-@pytest.mark.parametrize("name", CONTINUOUS)
-def test_what_is_continuous_does_not(name):
-    assert not may_jump(CONTINUOUS[name], 0.3)
+def test_jumps_are_seen_and_what_is_continuous_does_not(subtests):
+    for functions, expected in ((JUMPS, True), (CONTINUOUS, False)):
+        for name, function in functions.items():
+            with subtests.test(case=name):
+                assert may_jump(function, 0.3) == expected

@@ -39,11 +39,11 @@ SHOWN: dict[str, Any] = {
 }
 
 
-@pytest.mark.parametrize("name", SHOWN)
-def test_linearity_of_a_program(name):
-    fun, power, constant = SHOWN[name]
-    (found,) = linearity(fun, jnp.ones(3), STATE, jnp.ones(3))
-    assert (found.power, found.constant) == (power, constant)
+def test_linearity_of_a_program(subtests):
+    for name, (fun, power, constant) in SHOWN.items():
+        (found,) = linearity(fun, jnp.ones(3), STATE, jnp.ones(3))
+        with subtests.test(case=name):
+            assert (found.power, found.constant) == (power, constant)
 
 
 # Fields of an increment
@@ -130,21 +130,18 @@ def checks(field, y=STATE):
     cfjax.check_terms(of_three(field), jnp.asarray(0.0), y, jnp.asarray(0.5))
 
 
-@pytest.mark.parametrize("name", LINEAR)
-def test_fields_that_are_linear(name):
-    checks(LINEAR[name])
-
-
-@pytest.mark.parametrize("name", DRIFTS)
-def test_a_drift_in_the_field_of_the_noise(name):
-    with pytest.raises(ValueError, match=r"zero where the increment is zero.*LieTerm\(drift"):
-        checks(DRIFTS[name])
-
-
-@pytest.mark.parametrize("name", NOT_LINEAR)
-def test_fields_that_are_not_linear(name):
-    with pytest.raises(ValueError, match="that of a sum of two increments is not the sum of their"):
-        checks(NOT_LINEAR[name])
+def test_fields_that_are_linear_have_a_drift_or_are_not(subtests):
+    for name, field in LINEAR.items():
+        with subtests.test(case=("linear", name)):
+            checks(field)
+    texts = (
+        (DRIFTS, r"zero where the increment is zero.*LieTerm\(drift"),
+        (NOT_LINEAR, "that of a sum of two increments is not the sum of their"),
+    )
+    for fields, text in texts:
+        for name, field in fields.items():
+            with subtests.test(case=(text, name)), pytest.raises(ValueError, match=text):
+                checks(field)
 
 
 def test_a_drift_is_seen_where_the_start_is_special():

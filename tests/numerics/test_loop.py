@@ -23,16 +23,16 @@ def everything(a, x, n, mostly):
     return f(a, x), forward, jax.grad(f)(a, x), jax.grad(jax.grad(f))(a, x)
 
 
-@pytest.mark.representatives(2)
-@pytest.mark.parametrize("mostly", [0, 1, 3])
-@pytest.mark.parametrize("n", [0, 1, 3, 4, 5, 16])
-def test_powers_and_their_derivatives(n, mostly):
+@pytest.mark.parametrize("mostly", [0, pytest.param(1, marks=pytest.mark.slow), 3])
+def test_powers_and_their_derivatives(mostly, subtests):
     a, x = 1.5, 0.7
-    found = everything(a, x, jnp.asarray(n, jnp.int32), mostly)
-    c = x / float(np.prod(np.arange(1, n + 1.0)))
-    first, second = n * c * a ** (n - 1), n * (n - 1) * c * a ** (n - 2)
-    # Some roundings for each step.
-    np.testing.assert_allclose(found, [c * a**n, first, first, second], rtol=1e-14)
+    for n in (0, 1, 3, 4, 5, 16):
+        found = everything(a, x, jnp.asarray(n, jnp.int32), mostly)
+        c = x / float(np.prod(np.arange(1, n + 1.0)))
+        first, second = n * c * a ** (n - 1), n * (n - 1) * c * a ** (n - 2)
+        with subtests.test(n=str(n)):
+            # Some roundings for each step.
+            np.testing.assert_allclose(found, [c * a**n, first, first, second], rtol=1e-14)
 
 
 def test_a_batch_of_loops():

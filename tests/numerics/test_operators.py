@@ -1,5 +1,7 @@
 """Linear operators, arrays and those of lineax: what they make of vectors, and their norms."""
 
+import itertools
+
 import jax
 import jax.numpy as jnp
 import lineax as lx
@@ -26,29 +28,26 @@ OPERATORS = {
 }
 
 
-@pytest.mark.parametrize("name", OPERATORS)
-@pytest.mark.parametrize("dtype", [float, complex])
-@pytest.mark.parametrize("columns", [(), (2,)])
-def test_an_operator_applied(name, dtype, columns):
-    operator, matrix = OPERATORS[name]
-    x = random((3, *columns), 2, dtype)
-    found = applied(operator, jnp.asarray(x))
-    assert found.dtype == dtype
-    np.testing.assert_allclose(found, matrix @ x, rtol=0, atol=1e-15 * 10)
+def test_an_operator_applied(subtests):
+    for name, (operator, matrix) in OPERATORS.items():
+        for dtype, columns in itertools.product((float, complex), ((), (2,))):
+            x = random((3, *columns), 2, dtype)
+            found = applied(operator, jnp.asarray(x))
+            with subtests.test(case=f"{name} {dtype} {columns}"):
+                assert found.dtype == dtype
+                np.testing.assert_allclose(found, matrix @ x, rtol=0, atol=1e-15 * 10)
 
 
-@pytest.mark.parametrize("name", OPERATORS)
-def test_shape_dtype_and_entries_of_an_operator(name):
-    operator, matrix = OPERATORS[name]
-    assert shape_of(operator) == ((3,) if name == "diagonal" else (3, 3))
-    assert dtype_of(operator) == np.float64
-    entries = entries_of(operator)
-    if name == "FunctionLinearOperator":
-        assert entries is None
-    else:
-        np.testing.assert_array_equal(
-            entries if np.ndim(entries) == 2 else np.diag(entries), matrix
-        )
+def test_shape_dtype_and_entries_of_an_operator():
+    for name, (operator, matrix) in OPERATORS.items():
+        assert shape_of(operator) == ((3,) if name == "diagonal" else (3, 3)), name
+        assert dtype_of(operator) == np.float64
+        entries = entries_of(operator)
+        if name == "FunctionLinearOperator":
+            assert entries is None
+        else:
+            whole = entries if np.ndim(entries) == 2 else np.diag(entries)
+            np.testing.assert_array_equal(whole, matrix, name)
 
 
 def test_a_sum_of_real_and_complex_arrays():
@@ -56,13 +55,13 @@ def test_a_sum_of_real_and_complex_arrays():
     np.testing.assert_array_equal(found, [2 + 1j, 1j])
 
 
-@pytest.mark.parametrize("kind", ["general", "skew", "negative"])
-@pytest.mark.parametrize("dtype", [np.float32, np.float64, np.complex128])
-def test_the_2_norm_is_that_of_numpy_or_a_little_more(kind, dtype):
-    a = of_norm(kind, 5, 3.0, 0, dtype)
-    exact = np.linalg.norm(a.astype(np.result_type(dtype, np.float64)), 2)
-    norm = two_norm(a)
-    assert norm is not None and exact < norm < exact * (1 + 2e-6)
+def test_the_2_norm_is_that_of_numpy_or_a_little_more():
+    kinds, dtypes = ("general", "skew", "negative"), (np.float32, np.float64, np.complex128)
+    for kind, dtype in itertools.product(kinds, dtypes):
+        a = of_norm(kind, 5, 3.0, 0, dtype)
+        exact = np.linalg.norm(a.astype(np.result_type(dtype, np.float64)), 2)
+        norm = two_norm(a)
+        assert norm is not None and exact < norm < exact * (1 + 2e-6), (kind, dtype)
 
 
 def test_the_2_norm_of_a_diagonal_and_of_what_is_not_finite():

@@ -1,11 +1,12 @@
 """Columns brought back to given products, against SciPy's polar decomposition."""
 
+from functools import partial
+
 import jax
 import jax.numpy as jnp
 import matrices
 import mpmath
 import numpy as np
-import pytest
 import scipy.linalg
 
 from cfjax._numerics.polar import polar_correction
@@ -18,42 +19,47 @@ def orthonormal(n, k, dtype=np.float64):
     return np.linalg.qr(matrices.random((n, k), 1, dtype))[0]
 
 
-@pytest.mark.parametrize("dtype", [np.float64, np.complex128])
-@pytest.mark.parametrize("shape", [(5, 5), (7, 3), (4, 1)])
-def test_orthonormal_columns_become_the_nearest_ones(shape, dtype):
-    y, direction = orthonormal(*shape, dtype), matrices.random(shape, 2, dtype)
-    for size in SIZES:
-        found, is_there = correct(y, size * direction, False)
-        nearest, _ = scipy.linalg.polar(y + size * direction)
-        assert is_there
-        # The distance itself is as small as the step, up to the products of y, which rounding
-        # has left off the identity.
-        np.testing.assert_allclose(y + np.asarray(found), nearest, rtol=0, atol=3e-15)
+@jax.jit
+@partial(jax.vmap, in_axes=(None, 0))
+def corrected(y, step):
+    return polar_correction(y, step, False)
 
 
-@pytest.mark.parametrize("dtype", [np.float64, np.complex128])
-def test_other_columns_keep_their_products(dtype):
-    y, direction = matrices.random((7, 3), 1, dtype), matrices.random((7, 3), 2, dtype)
-    expected = y.conj().T @ y
-    for size in SIZES:
-        v, is_there = correct(y, size * direction, False)
-        end = y + np.asarray(v)
-        assert is_there
-        np.testing.assert_allclose(end.conj().T @ end, expected, rtol=0, atol=2e-14)
-        # No further than the step itself is off.
-        assert np.linalg.norm(v - size * direction) < 2 * size * np.linalg.norm(direction)
+def test_columns_become_the_nearest_ones_or_keep_their_products(subtests):
+    for dtype in (np.float64, np.complex128):
+        for shape in [(5, 5), (7, 3), (4, 1)]:
+            y, direction = orthonormal(*shape, dtype), matrices.random(shape, 2, dtype)
+            steps = np.multiply.outer(SIZES, direction)
+            founds, are_there = corrected(y, steps)
+            with subtests.test(case=f"{shape} {dtype}"):
+                assert np.all(are_there)
+                for step, found in zip(steps, founds, strict=True):
+                    nearest, _ = scipy.linalg.polar(y + step)
+                    # The distance itself is as small as the step, up to the products of y, which
+                    # rounding has left off the identity.
+                    np.testing.assert_allclose(y + found, nearest, rtol=0, atol=3e-15)
+        y, direction = matrices.random((7, 3), 1, dtype), matrices.random((7, 3), 2, dtype)
+        steps = np.multiply.outer(SIZES, direction)
+        founds, are_there = corrected(y, steps)
+        with subtests.test(case=f"other columns, {dtype}"):
+            assert np.all(are_there)
+            for step, found in zip(steps, np.asarray(founds), strict=True):
+                products = (y + found).conj().T @ (y + found)
+                np.testing.assert_allclose(products, y.conj().T @ y, rtol=0, atol=2e-14)
+                # No further than the step itself is off.
+                assert np.linalg.norm(found - step) < 2 * np.linalg.norm(step)
 
 
-@pytest.mark.parametrize("size", [1e-9, 1e-8])
-def test_rounding_is_as_small_as_the_step(size):
+def test_rounding_is_as_small_as_the_step():
     """Over many steps what is left adds up, so it must be below the rounding of the products."""
     y = matrices.random((6, 3), 1)
-    v, _ = correct(y, size * matrices.random((6, 3), 2), False)
-    with mpmath.workdps(40):
-        a, b = mpmath.matrix(y.tolist()), mpmath.matrix(np.asarray(v).tolist())
-        e = a.T * b + b.T * a + b.T * b
-    # Some tens of roundings of numbers as large as v, and a square of 1.5e-10.
-    assert np.abs(matrices.to_numpy(e)).max() < 20 * 2e-16 * size + 1e-19
+    for size in (1e-9, 1e-8):
+        v, _ = correct(y, size * matrices.random((6, 3), 2), False)
+        with mpmath.workdps(40):
+            a, b = mpmath.matrix(y.tolist()), mpmath.matrix(np.asarray(v).tolist())
+            e = a.T * b + b.T * a + b.T * b
+        # Some tens of roundings of numbers as large as v, and a square of 1.5e-10.
+        assert np.abs(matrices.to_numpy(e)).max() < 20 * 2e-16 * size + 1e-19
 
 
 def test_columns_that_are_nearly_orthonormal_become_so():
@@ -64,26 +70,23 @@ def test_columns_that_are_nearly_orthonormal_become_so():
     np.testing.assert_allclose(end.T @ end, np.eye(3), rtol=0, atol=1e-15)
 
 
-@pytest.mark.parametrize("size", [1.0, 5.0, np.inf, np.nan])
-@pytest.mark.parametrize("are_orthonormal", [False, True])
-def test_columns_too_far_off_are_reported(size, are_orthonormal):
-    v = np.full((4, 2), size)
-    assert not correct(orthonormal(4, 2), v, are_orthonormal)[1]
+def test_columns_too_far_off_or_without_full_rank_are_reported():
+    for are_orthonormal in (False, True):
+        for size in (1.0, 5.0, np.inf, np.nan):
+            v = np.full((4, 2), size)
+            assert not correct(orthonormal(4, 2), v, are_orthonormal)[1]
     # And whatever is reported to be there is.
     for factor in np.linspace(0.05, 1.0, 20):
         v, is_there = correct(orthonormal(4, 2), factor * matrices.random((4, 2), 2), True)
         end = orthonormal(4, 2) + np.asarray(v)
         assert not is_there or np.abs(end.T @ end - np.eye(2)).max() < 1e-15
-
-
-def test_columns_without_full_rank_are_reported():
     assert not correct(np.zeros((3, 1)), np.full((3, 1), 0.1), False)[1]
 
 
 def test_members_of_a_batch_are_corrected_as_they_need():
     y, v = orthonormal(5, 2), matrices.random((5, 2), 2)
     vs = np.stack([size * v for size in (1e-12, 0.03, 5.0)])
-    found, is_there = jax.vmap(lambda v: polar_correction(jnp.asarray(y), v, False))(vs)
+    found, is_there = corrected(y, vs)
     np.testing.assert_array_equal(is_there, [True, True, False])
     for k in range(2):
         nearest, _ = scipy.linalg.polar(y + vs[k])
@@ -93,11 +96,12 @@ def test_members_of_a_batch_are_corrected_as_they_need():
 def test_the_derivative_is_that_of_difference_quotients():
     y, v, w = (jnp.asarray(matrices.random((4, 2), k)) for k in (1, 2, 3))
 
+    @jax.jit
     def value(s):
         return jnp.sum(w * jnp.sin(polar_correction(y, s * v, False)[0]))
 
     s, h = 0.01, 1e-4
     expected = (value(s + h) - value(s - h)) / (2 * h)
-    for derivative in (jax.grad, jax.jacfwd):
+    for found in jax.jit(lambda s: (jax.grad(value)(s), jax.jacfwd(value)(s)))(s):
         # The quotient is off by h^2 times a third derivative of some hundred.
-        np.testing.assert_allclose(derivative(value)(s), expected, rtol=0, atol=1e-5)
+        np.testing.assert_allclose(found, expected, rtol=0, atol=1e-5)

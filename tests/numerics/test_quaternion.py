@@ -1,5 +1,6 @@
 """Products of quaternions with vectors and their exponentials, against SciPy's rotations."""
 
+import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
@@ -8,7 +9,8 @@ from scipy.spatial.transform import Rotation
 from cfjax._numerics import quaternion
 
 OMEGA, Q = np.array([0.7, -1.1, 0.4]), np.array([0.1, 0.5, -0.5, 0.7])
-both = pytest.mark.parametrize("frame, layout", [("body", "wxyz"), ("fixed", "xyzw")])
+BOTH = (("body", "wxyz"), ("fixed", "xyzw"))
+ANGLES = [0.0, 1e-9, 1.0, 3.0, 7.0]
 
 
 def product(p, q):
@@ -21,34 +23,36 @@ def in_layout(q, layout):
     return q if layout == "wxyz" else np.roll(q, -1)
 
 
-@pytest.mark.parametrize("layout", ["wxyz", "xyzw"])
-def test_parts_of_a_quaternion(layout):
-    parts = quaternion.parts(jnp.asarray(in_layout(Q, layout)), layout)
-    np.testing.assert_array_equal(parts, Q)
-    np.testing.assert_array_equal(quaternion.from_parts(parts, layout), in_layout(Q, layout))
+def test_parts_of_a_quaternion():
+    for layout in ("wxyz", "xyzw"):
+        parts = quaternion.parts(jnp.asarray(in_layout(Q, layout)), layout)
+        np.testing.assert_array_equal(parts, Q)
+        np.testing.assert_array_equal(quaternion.from_parts(parts, layout), in_layout(Q, layout))
 
 
-@both
-def test_the_product_with_half_a_vector(frame, layout):
-    half = np.array([0.0, *OMEGA / 2])
-    expected = product(half, Q) if frame == "fixed" else product(Q, half)
-    q = jnp.asarray(in_layout(Q, layout))
-    found = quaternion.times(jnp.asarray(OMEGA), q, frame, layout)
-    np.testing.assert_allclose(found, in_layout(expected, layout), rtol=0, atol=1e-15)
+def test_the_velocity_and_the_increment_along_a_rotation():
+    @jax.jit
+    @jax.vmap
+    def everything(omega):
+        given = [(jnp.asarray(in_layout(Q, layout)), frame, layout) for frame, layout in BOTH]
+        return [
+            (quaternion.times(omega, *x), quaternion.increment(omega, *x, leads_back=False))
+            for x in given
+        ]
 
-
-@both
-@pytest.mark.parametrize("angle", [0.0, 1e-9, 1.0, 3.0, 7.0])
-def test_the_increment_along_a_rotation(frame, layout, angle):
-    omega = angle * OMEGA / np.linalg.norm(OMEGA)
-    x, y, z, w = Rotation.from_rotvec(omega).as_quat()
-    turn = np.array([w, x, y, z])
-    # SciPy's has one sign of the two; the exponential that of cos(angle / 2).
-    turn = turn if w * np.cos(angle / 2) > 0 else -turn
-    expected = product(turn, Q) if frame == "fixed" else product(Q, turn)
-    q = jnp.asarray(in_layout(Q, layout))
-    found = quaternion.increment(jnp.asarray(omega), q, frame, layout, leads_back=False)
-    np.testing.assert_allclose(found, in_layout(expected - Q, layout), rtol=0, atol=2e-15)
+    omegas = np.multiply.outer(ANGLES, OMEGA / np.linalg.norm(OMEGA))
+    found = everything(omegas)
+    for k, (angle, omega) in enumerate(zip(ANGLES, omegas, strict=True)):
+        half = np.array([0.0, *omega / 2])
+        x, y, z, w = Rotation.from_rotvec(omega).as_quat()
+        turn = np.array([w, x, y, z])
+        # SciPy's has one sign of the two; the exponential that of cos(angle / 2).
+        turn = turn if w * np.cos(angle / 2) > 0 else -turn
+        for (frame, layout), (velocity, increment) in zip(BOTH, found, strict=True):
+            by = (lambda p: product(p, Q)) if frame == "fixed" else (lambda p: product(Q, p))
+            # Some roundings of numbers up to four.
+            np.testing.assert_allclose(velocity[k], in_layout(by(half), layout), 0, 2e-15)
+            np.testing.assert_allclose(increment[k], in_layout(by(turn) - Q, layout), 0, 2e-15)
 
 
 def test_an_increment_leads_the_length_back():

@@ -1,54 +1,50 @@
 """Rotations of vectors in space, against SciPy's rotations and exponentials."""
 
+import jax
 import jax.numpy as jnp
 import numpy as np
-import pytest
 import scipy.linalg
 from matrices import inverse_derivative_of_exp
+from problems import hat
 from scipy.spatial.transform import Rotation
 
 from cfjax._numerics import rotate
 
 AXIS = np.array([2.0, -3.0, 6.0]) / 7
 ANGLES = [0.0, 1e-9, 0.3, 2.0, 3.2, 6.0]
-angles = pytest.mark.parametrize("angle", ANGLES)
 X = np.random.default_rng(0).normal(size=(3, 4))
 
 
-def hat(w):
-    return np.cross(w, np.eye(3)).T
+@jax.jit
+@jax.vmap
+def everything(a):
+    x = jnp.asarray(X)
+    one = x[:, 0]
+    moved = [f(a, y) for f in (rotate.rotate, rotate.increment) for y in (x, one)]
+    return *moved, rotate.mean(a, x), rotate.dexpinv(a, one)
+
+
+def test_rotations_by_every_angle():
+    found = everything(np.multiply.outer(ANGLES, AXIS))
+    for angle, moved, moved_one, by, by_one, mean, inverse in zip(ANGLES, *found, strict=True):
+        turn = Rotation.from_rotvec(angle * AXIS).as_matrix()
+        # Some roundings of entries below 3.
+        for got, want in ((moved, turn @ X), (by, turn @ X - X)):
+            np.testing.assert_allclose(got, want, rtol=0, atol=4e-15)
+        for got, want in ((moved_one, moved[:, 0]), (by_one, by[:, 0])):
+            np.testing.assert_allclose(got, want, rtol=0, atol=4e-15)
+        # In the corner of the exponential of [[a, x], [0, 0]].
+        block = np.block([[angle * hat(AXIS), X], [np.zeros((4, 7))]])
+        np.testing.assert_allclose(mean, scipy.linalg.expm(block)[:3, 3:], rtol=0, atol=1e-14)
+        basis = [hat(e) for e in np.eye(3)]
+        want = inverse_derivative_of_exp(hat(angle * AXIS), basis, hat(X[:, 0]))
+        # Near a full turn, where it is singular, SciPy's rounding grows.
+        np.testing.assert_allclose(inverse, want, rtol=0, atol=1e-12)
 
 
 def test_the_cross_product_with_columns():
     found = rotate.cross_product(jnp.asarray(AXIS), jnp.asarray(X))
     np.testing.assert_allclose(found, np.cross(AXIS, X, axis=0), rtol=0, atol=1e-15)
-
-
-@angles
-@pytest.mark.parametrize("columns", [(), (4,)])
-def test_rotated_vectors(angle, columns):
-    x = X if columns else X[:, 0]
-    a, turn = jnp.asarray(angle * AXIS), Rotation.from_rotvec(angle * AXIS).as_matrix()
-    # Some roundings of entries below 3.
-    np.testing.assert_allclose(rotate.rotate(a, jnp.asarray(x)), turn @ x, rtol=0, atol=4e-15)
-    np.testing.assert_allclose(rotate.increment(a, jnp.asarray(x)), turn @ x - x, 0, 4e-15)
-
-
-@angles
-def test_the_mean_along_a_rotation(angle):
-    """In the corner of the exponential of [[a, x], [0, 0]]."""
-    block = np.block([[angle * hat(AXIS), X], [np.zeros((4, 7))]])
-    found = rotate.mean(jnp.asarray(angle * AXIS), jnp.asarray(X))
-    np.testing.assert_allclose(found, scipy.linalg.expm(block)[:3, 3:], rtol=0, atol=1e-14)
-
-
-@angles
-def test_the_inverse_derivative_of_the_exponential(angle):
-    x = X[:, 0]
-    expected = inverse_derivative_of_exp(hat(angle * AXIS), [hat(e) for e in np.eye(3)], hat(x))
-    found = rotate.dexpinv(jnp.asarray(angle * AXIS), jnp.asarray(x))
-    # Near a full turn, where it is singular, SciPy's rounding grows.
-    np.testing.assert_allclose(found, expected, rtol=0, atol=1e-12)
 
 
 def test_where_the_inverse_derivative_exists():

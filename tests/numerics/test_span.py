@@ -2,7 +2,6 @@
 
 import jax.numpy as jnp
 import numpy as np
-import pytest
 from matrices import random
 
 from cfjax._numerics.span import (
@@ -20,7 +19,6 @@ N, P = 7, 2
 FIRST, SECOND, THIRD = (jnp.asarray(random((N, P), seed)) for seed in range(3))
 BLOCKS = {"columns": (FIRST, SECOND), "corner": (Corner(P), FIRST, SECOND), "vectors": None}
 BLOCKS["vectors"] = (FIRST[:, :1], SECOND[:, :1])
-each = pytest.mark.parametrize("kind", BLOCKS)
 
 
 def whole(blocks):
@@ -34,25 +32,21 @@ def made(*blocks):
     return Span(blocks, jnp.asarray(w.T @ w))
 
 
-@each
-def test_products_with_the_columns(kind):
-    blocks = BLOCKS[kind]
-    w, x = whole(blocks), random((N, P), 5)
-    z = random((w.shape[1], P), 6)
-    # Sums of seven products of numbers of size two.
-    np.testing.assert_allclose(inner(blocks, jnp.asarray(x)), w.T @ x, rtol=0, atol=1e-14)
-    found = plus_product(jnp.asarray(x), blocks, jnp.asarray(z))
-    np.testing.assert_allclose(found, x + w @ z, rtol=0, atol=1e-14)
-    columns = w[:, P:] if kind == "corner" else w
-    np.testing.assert_array_equal(joined(blocks), columns)
-
-
-@each
-def test_an_extended_span_has_the_products_of_its_columns(kind):
-    span = made(*BLOCKS[kind]).extended(THIRD)
-    w = whole(span.blocks)
-    np.testing.assert_array_equal(w[:, -P:], THIRD)
-    np.testing.assert_allclose(span.gram, w.T @ w, rtol=0, atol=1e-14)
+def test_products_with_the_columns_and_extended_spans(subtests):
+    for kind, blocks in BLOCKS.items():
+        w, x = whole(blocks), random((N, P), 5)
+        z = random((w.shape[1], P), 6)
+        products = inner(blocks, jnp.asarray(x))
+        moved = plus_product(jnp.asarray(x), blocks, jnp.asarray(z))
+        span = made(*blocks).extended(THIRD)
+        wider = whole(span.blocks)
+        with subtests.test(case=kind):
+            # Sums of seven products of numbers of size two.
+            np.testing.assert_allclose(products, w.T @ x, rtol=0, atol=1e-14)
+            np.testing.assert_allclose(moved, x + w @ z, rtol=0, atol=1e-14)
+            np.testing.assert_array_equal(joined(blocks), w[:, P:] if kind == "corner" else w)
+            np.testing.assert_array_equal(wider[:, -P:], THIRD)
+            np.testing.assert_allclose(span.gram, wider.T @ wider, rtol=0, atol=1e-14)
 
 
 def test_a_joint_span_has_each_block_once_and_the_corner_in_front():

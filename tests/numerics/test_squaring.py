@@ -13,32 +13,27 @@ from cfjax._numerics.squaring import exponent, magnitude, max_over_batch, square
 SIZES = [1e-300, 0.3, np.nextafter(0.5, 0), 0.5, 0.75, 1.0, np.nextafter(1.0, 2), 3.0, 4.0, 1e300]
 
 
-@pytest.mark.parametrize("size", SIZES)
-def test_the_exponent_is_that_of_frexp(size):
-    assert exponent(jnp.asarray(size)) == math.frexp(size)[1]
+def test_the_exponent_is_that_of_frexp(subtests):
+    for size in SIZES:
+        with subtests.test(size=str(size)):
+            assert exponent(jnp.asarray(size)) == math.frexp(size)[1]
 
 
-@pytest.mark.parametrize("dtype", [np.float32, np.float64])
-def test_exponents_at_the_ends_of_a_precision(dtype):
-    info = jnp.finfo(dtype)
-    assert exponent(jnp.asarray(info.max, dtype)) == info.maxexp
-    assert exponent(jnp.zeros((), dtype)) < -100
-    for bad in (np.inf, np.nan):
-        assert exponent(jnp.asarray(bad, dtype)) > info.maxexp
-
-
-@pytest.mark.parametrize("dtype", [np.float32, np.float64])
-def test_the_power_of_some_squarings(dtype):
-    digits = jnp.finfo(dtype).nmant
-    # As `exponent` gives it.
-    integer = np.int32 if dtype == np.float32 else np.int64
-    for s in (0, 1, 7, digits):
-        number, power = squarings(jnp.asarray(s, integer), jnp.dtype(dtype))
-        assert (number, power) == (s, 2.0**-s)
-        assert power.dtype == dtype
-    # No digit would be left.
-    number, power = squarings(jnp.asarray(digits + 1, integer), jnp.dtype(dtype))
-    assert number == 0 and np.isnan(power)
+def test_exponents_and_powers_at_the_ends_of_a_precision():
+    for dtype, integer in ((np.float32, np.int32), (np.float64, np.int64)):
+        info = jnp.finfo(dtype)
+        assert exponent(jnp.asarray(info.max, dtype)) == info.maxexp
+        assert exponent(jnp.zeros((), dtype)) < -100
+        for bad in (np.inf, np.nan):
+            assert exponent(jnp.asarray(bad, dtype)) > info.maxexp
+        # Integers as `exponent` gives them.
+        for s in (0, 1, 7, info.nmant):
+            number, power = squarings(jnp.asarray(s, integer), jnp.dtype(dtype))
+            assert (number, power) == (s, 2.0**-s)
+            assert power.dtype == dtype
+        # No digit would be left.
+        number, power = squarings(jnp.asarray(info.nmant + 1, integer), jnp.dtype(dtype))
+        assert number == 0 and np.isnan(power)
 
 
 def test_the_magnitude_of_a_complex_number():
@@ -77,17 +72,18 @@ def test_none_are_started_where_there_is_no_squaring():
 
 
 @pytest.mark.parametrize("n", [3, 6])
-@pytest.mark.parametrize("s", [0, 3, 6])
-def test_derivatives_of_powers(n, s):
+def test_derivatives_of_powers(n):
     """The trace of (t a)^m has the derivative m times itself at t = 1, m = 2^s, in both modes."""
     a = random((n, n))
     a = jnp.asarray(a / np.linalg.norm(a, 2))
 
-    def trace(t):
-        return jnp.trace(powers(t * a, jnp.asarray(s, jnp.int32)))
+    @jax.jit
+    def both_modes(s):
+        trace = lambda t: jnp.trace(powers(t * a, s))  # noqa: E731
+        return jax.grad(trace)(1.0), jax.jvp(trace, (1.0,), (1.0,))[1]
 
-    m = 2**s
-    expected = m * np.trace(np.linalg.matrix_power(np.asarray(a), m))
-    atol = m * m * n * 2.0**-52
-    np.testing.assert_allclose(jax.grad(trace)(1.0), expected, rtol=0, atol=atol)
-    np.testing.assert_allclose(jax.jvp(trace, (1.0,), (1.0,))[1], expected, rtol=0, atol=atol)
+    for s in (0, 3, 6):
+        m = 2**s
+        expected = m * np.trace(np.linalg.matrix_power(np.asarray(a), m))
+        for found in both_modes(jnp.asarray(s, jnp.int32)):
+            np.testing.assert_allclose(found, expected, rtol=0, atol=m * m * n * 2.0**-52)
