@@ -7,6 +7,7 @@ starts at the nodes of a Gauss-Legendre rule. The powers of one matrix are compa
 exponential of the other.
 """
 
+import functools
 from typing import Any
 
 import diffrax
@@ -85,6 +86,7 @@ def heights(solver, h, slope, starts, nodes):
     return jax.vmap(lambda z: jax.vmap(lambda node: height(z, node))(nodes))(starts)
 
 
+@functools.cache
 def step_matrix(solver: Any, h: float, slope: float, degree: int, number: int) -> np.ndarray:
     starts, weights = legendre.leggauss(degree + 4)
     is_pieces = isinstance(solver, cfjax.WeakOrder2 | cfjax.ShiftedNoise)
@@ -127,24 +129,19 @@ class UncheckedWeakOrder2(cfjax.WeakOrder2):
 # Noise that depends on the state, by `1 + z / 2`.
 
 
-ORDER_1: Any = [cfjax.CF4(), cfjax.CF2(), cfjax.RKMK4(), cfjax.CG4(), cfjax.CF54()]
-
-
-@pytest.mark.representatives(2)
-@pytest.mark.parametrize("solver", ORDER_1, ids=lambda x: type(x).__name__)
+@pytest.mark.representatives(1)
+@pytest.mark.parametrize(
+    "solver", [cfjax.CF4(), cfjax.CF2(), cfjax.RKMK4()], ids=lambda x: type(x).__name__
+)
 def test_a_step_along_the_chord_has_weak_order_1(solver):
     for found in slopes(solver, 0.5):
         assert 0.9 < found < 1.15
 
 
+@pytest.mark.representatives(1)
 @pytest.mark.parametrize(
     "solver",
-    [
-        cfjax.WeakOrder2(),
-        pytest.param(cfjax.WeakOrder2(cfjax.RKMK4()), marks=pytest.mark.slow),
-        pytest.param(cfjax.WeakOrder2(cfjax.CG4()), marks=pytest.mark.slow),
-        pytest.param(cfjax.WeakOrder2(cfjax.CF54()), marks=pytest.mark.slow),
-    ],
+    [cfjax.WeakOrder2(), cfjax.WeakOrder2(cfjax.RKMK4())],
     ids=lambda x: type(x.solver).__name__,
 )
 def test_weak_order_2(solver):
@@ -164,12 +161,14 @@ def test_why_the_inner_method_needs_order_4(no_shape_hook):
     assert np.all(errors[:, -1] > 5 * np.abs(weak_errors(cfjax.WeakOrder2(), STEPS, 0.5))[:, -1])
 
 
+@pytest.mark.slow
 def test_shifted_noise_has_weak_order_1_at_least():
     """On this problem it is nearly 2, where two channels have no area that it could miss."""
     for found in slopes(cfjax.ShiftedNoise(), 0.5):
         assert 0.95 < found < 2.3
 
 
+@pytest.mark.representatives(1)
 @pytest.mark.parametrize("slope", [0.5, 0.0], ids=["of the state", "constant"])
 def test_lie_euler_is_of_weak_order_1_for_ito_in_the_frame(slope):
     errors = weak_errors(cfjax.LieEuler(), STEPS, slope, is_ito=True)
@@ -183,17 +182,8 @@ def test_lie_euler_is_of_weak_order_1_for_ito_in_the_frame(slope):
 # Noise that does not depend on the state.
 
 
-@pytest.mark.parametrize(
-    "solver",
-    [
-        cfjax.WeakOrder2(cfjax.CF3()),
-        pytest.param(cfjax.WeakOrder2(), marks=pytest.mark.slow),
-        pytest.param(cfjax.WeakOrder2(cfjax.Luscher3()), marks=pytest.mark.slow),
-    ],
-    ids=lambda x: type(x.solver).__name__,
-)
-def test_an_inner_method_of_order_3_is_enough_for_constant_noise(solver):
-    for found in slopes(solver, 0.0):
+def test_an_inner_method_of_order_3_is_enough_for_constant_noise():
+    for found in slopes(cfjax.WeakOrder2(cfjax.CF3()), 0.0):
         assert 1.85 < found < 2.15
 
 

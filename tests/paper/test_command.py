@@ -77,32 +77,20 @@ main(["paper"])
     assert done.stderr == f"cfjax paper: error: {extra} is missing: pip install 'cfjax[paper]'\n"
 
 
-def test_no_command_prints_the_help(capsys):
+def test_help(capsys):
     assert main([]) == 0
     assert "paper" in capsys.readouterr().out
+    for arguments in (["--help"], ["paper", "--help"]):
+        with pytest.raises(SystemExit) as exit_:
+            main(arguments)
+        assert exit_.value.code == 0
+        assert "usage: cfjax" in capsys.readouterr().out
 
 
-@pytest.mark.parametrize("arguments", [["--help"], ["paper", "--help"]])
-def test_help(arguments, capsys):
-    with pytest.raises(SystemExit) as exit_:
-        main(arguments)
-    assert exit_.value.code == 0
-    assert "usage: cfjax" in capsys.readouterr().out
-
-
-def test_bad_command_has_status_2():
-    done = command_line("chess")
-    assert done.returncode == 2
-    assert done.stdout == ""
-    assert done.stderr.count("\n") == 1
-    assert "'chess'" in done.stderr
-
-
-@pytest.mark.parametrize(
-    "arguments", [["paper", "--output"], ["paper", "x"], ["paper", "--step=3"]]
-)
-def test_bad_arguments(arguments, capsys):
-    check_one_line_error(arguments, capsys)
+def test_bad_arguments(capsys):
+    for arguments in (["chess"], ["paper", "--output"], ["paper", "x"], ["paper", "--step=3"]):
+        error = check_one_line_error(arguments, capsys)
+        assert "'chess'" in error or arguments[0] == "paper"
 
 
 def test_output_that_is_a_file(tmp_path, capsys):

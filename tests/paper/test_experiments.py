@@ -6,7 +6,6 @@ Table 4 and Figure 4 against a program of their own in NumPy, and the steps that
 import functools
 import os
 from itertools import pairwise
-from typing import Any
 
 import diffrax
 import jax.numpy as jnp
@@ -54,18 +53,6 @@ def test_counts_are_the_papers_but_for_order_five():
     assert counts["C-G", 5] == (43, 0)
     assert counts["this paper", 3] == (3, 0)
     assert counts["this paper", 4] == (5, 0)
-
-
-@pytest.mark.slow
-def test_counts_are_those_of_the_tableaus():
-    for methods in (complexity.METHODS["C-G"], complexity.METHODS["this paper"]):
-        for _, method in methods.values():
-            solver: Any = method
-            assert complexity.flows_and_brackets(method) == (solver.tableau.num_flows, 0)
-
-
-@pytest.mark.slow
-def test_report_of_counts():
     (table,) = complexity.report(Progress(disable=True)).printed
     assert isinstance(table, Table)
     assert [column.header for column in table.columns][2] == "method"
@@ -84,36 +71,23 @@ def trajectories():
 @pytest.fixture(scope="module")
 def work():
     with Progress(disable=True) as progress:
-        return rigid_body.efficiencies((1000, 2000, 4000), 3, progress)
+        return rigid_body.efficiencies((1000, 2000), 3, progress)
 
 
-@pytest.mark.slow
-def test_fourth_order_is_far_better_than_third(trajectories):
-    for quantity in ("error", "energy_error"):
-        last = {name: getattr(run, quantity)[-1] for name, run in trajectories.items()}
+def test_rankings_of_errors(trajectories):
+    energy, error = (
+        {name: getattr(run, quantity)[-1] for name, run in trajectories.items()}
+        for quantity in ("energy_error", "error")
+    )
+    for last in (energy, error):
         assert 100 * max(last["CF4"], last["RKMK4"]) < min(last["CF3"], last["RKMK3"])
-
-
-@pytest.mark.slow
-def test_cf4_and_rkmk4_are_close(trajectories, work):
-    # At h = 0.1 and t = 100 the factor is 2.03; at h = 0.05 and h = 0.025 it is 1.3 at most.
-    ratio = trajectories["RKMK4"].error[-1] / trajectories["CF4"].error[-1]
-    assert 1 < ratio < 2.1
-    ratios = work.select("RKMK4").error[1:] / work.select("CF4").error[1:]
-    assert np.all((ratios > 1 / 1.5) & (ratios < 1.5))
-
-
-def test_third_order_ranking_is_not_the_papers(trajectories):
-    # The paper has RKMK3 better than CF3 in energy. The captions and the table say this.
-    assert trajectories["CF3"].energy_error[-1] < trajectories["RKMK3"].energy_error[-1]
-    assert trajectories["CF3"].error[-1] < trajectories["RKMK3"].error[-1]
-
-
-def test_ranking_with_every_commutator_is_the_papers(trajectories):
-    last = {name: run.energy_error[-1] for name, run in trajectories.items()}
-    assert last["RKMK3, full series"] < last["CF3"]
-    last = {name: run.error[-1] for name, run in trajectories.items()}
-    assert 0.9 * last["CF4"] < last["RKMK4, full series"] < last["CF4"]
+        # The paper has RKMK3 better than CF3 in energy. The captions and the table say this.
+        assert last["CF3"] < last["RKMK3"]
+    # At h = 0.1 and t = 100 the factor is 2.03.
+    assert 1 < error["RKMK4"] / error["CF4"] < 2.1
+    # With every commutator the ranking is the paper's.
+    assert energy["RKMK3, full series"] < energy["CF3"]
+    assert 0.9 * error["CF4"] < error["RKMK4, full series"] < error["CF4"]
 
 
 @pytest.mark.skipif(
@@ -123,20 +97,17 @@ def test_flops_of_a_step(work):
     flops = {name: rigid_body.flops_of_step(method) for name, method in rigid_body.METHODS.items()}
     assert flops["CF3"] < flops["RKMK3"] < flops["RKMK4"] < flops["CF4"] < 1.25 * flops["RKMK4"]
     for name in flops:
-        np.testing.assert_array_equal(
-            work.select(name).flops, flops[name] * np.array([1000, 2000, 4000])
-        )
+        np.testing.assert_array_equal(work.select(name).flops, flops[name] * np.array([1000, 2000]))
 
 
 def test_efficiency_has_the_errors_of_the_trajectories(trajectories, work):
     for name in rigid_body.METHODS:
         cost = work.select(name)
         np.testing.assert_allclose(cost.error[0], trajectories[name].error[-1], rtol=1e-9)
-        assert cost.seconds.shape == (3, 3)
+        assert cost.seconds.shape == (2, 3)
         assert np.all(cost.seconds > 0)
-
-
-def test_text_in_the_figures_of_the_rigid_body(trajectories, work):
+    # At h = 0.05.
+    assert 1 / 1.5 < work.select("RKMK4").error[1] / work.select("CF4").error[1] < 1.5
     for figure in (rigid_body.figure_1(trajectories), rigid_body.figure_2(work)):
         check_text(figure, 2)
 
@@ -295,7 +266,6 @@ EXPECTED = {
     "RK4": (1779, 1779, 1780, 1781, 1783, 1788),
 }
 ALLOWED = {"CF4": 0.05, "RKMK4": 0.1, "RK4": 0.01}
-names = pytest.mark.parametrize("name", EXPECTED)
 
 
 @pytest.fixture(scope="module")
@@ -308,19 +278,13 @@ def runs():
 
 
 @pytest.mark.slow
-@names
-def test_steps_are_those_expected(name, runs):
-    for tol, expected in zip(heat.TOLERANCES, EXPECTED[name], strict=True):
-        slack = max(ALLOWED[name] * expected, 2 if name == "CF4" else 0)
-        assert abs(runs[name, tol].num_steps - expected) <= slack, tol
-
-
-@pytest.mark.slow
-@names
+@pytest.mark.parametrize("name", EXPECTED)
 def test_steps_are_those_of_the_program(name, runs):
     exact = cfjax.scenes.heat.reference(0.5, MU)
-    for tol in heat.TOLERANCES:
+    for tol, expected in zip(heat.TOLERANCES, EXPECTED[name], strict=True):
         run = runs[name, tol]
+        slack = max(ALLOWED[name] * expected, 2 if name == "CF4" else 0)
+        assert abs(run.num_steps - expected) <= slack, tol
         ends, attempted, rejected, u = program(PROGRAMS[name], tol)
         assert len(run.t) == run.num_steps - run.num_rejected
         if name == "CF4":

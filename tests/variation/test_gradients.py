@@ -19,7 +19,7 @@ GAIN = np.array([[0.3, 0.1], [-0.2, 0.2], [0.05, 0.4]])
 # Of the network omega = second tanh(first q + bias) + (sin t, 0.5, 0).
 SHAPES = {"first": (3, 4), "bias": (3,), "second": (3, 3)}
 SIZE = sum(map(np.prod, SHAPES.values()))
-WEIGHTS, *DIRECTIONS = np.random.default_rng(7).normal(size=(3, SIZE))
+WEIGHTS, DIRECTION = np.random.default_rng(7).normal(size=(2, SIZE))
 
 # The velocity of a quaternion (w, x, y, z) is E(q) omega in the frame of the body, with
 # E(q) = (FRAME[0] q, FRAME[1] q, FRAME[2] q): half of q times i, j and k.
@@ -106,14 +106,10 @@ TOLERANCE = 1.6e-7
 
 @pytest.fixture(scope="module")
 def slopes():
-    """The derivatives of both along each direction."""
+    """The derivatives of both along the direction."""
     with mpmath.workdps(50):
-        weights, h = exact(WEIGHTS), mpmath.mpf(10) ** -15
-        ends = [
-            [end(weights + sign * h * exact(direction)) for sign in (1, -1)]
-            for direction in DIRECTIONS
-        ]
-        return np.array([(plus - minus) / (2 * h) for plus, minus in ends]).astype(float)
+        weights, h, v = exact(WEIGHTS), mpmath.mpf(10) ** -15, exact(DIRECTION)
+        return ((end(weights + h * v) - end(weights - h * v)) / (2 * h)).astype(float)
 
 
 # By cfjax
@@ -138,10 +134,9 @@ def both(weights):
 
 
 def test_forward_mode_by_the_weights_of_a_network(slopes):
-    weights, directions = jnp.asarray(WEIGHTS), jnp.asarray(np.stack(DIRECTIONS))
+    weights, direction = jnp.asarray(WEIGHTS), jnp.asarray(DIRECTION)
     with cfjax.rewriting(False):
-        along = lambda v: jax.jvp(both, (weights,), (v,))[1]  # noqa: E731
-        found = jax.jit(jax.vmap(along))(directions)
+        found = jax.jit(lambda w, v: jax.jvp(both, (w,), (v,))[1])(weights, direction)
     np.testing.assert_allclose(found, slopes, rtol=0, atol=TOLERANCE)
     assert np.abs(slopes).min() > 0.1
 
@@ -152,4 +147,4 @@ def test_reverse_mode_by_the_weights_of_a_network(slopes):
     share = np.array([1.0, 0.3])
     with cfjax.rewriting(False):
         found = jax.jit(jax.grad(lambda weights: share @ both(weights)))(jnp.asarray(WEIGHTS))
-    np.testing.assert_allclose(np.stack(DIRECTIONS) @ found, slopes @ share, rtol=0, atol=TOLERANCE)
+    np.testing.assert_allclose(DIRECTION @ found, slopes @ share, rtol=0, atol=TOLERANCE)

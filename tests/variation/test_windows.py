@@ -6,8 +6,8 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-import scipy.linalg
 from numpy.polynomial import Polynomial
+from problems import hat
 from scipy.spatial.transform import Rotation as SciPyRotation
 
 import cfjax
@@ -39,10 +39,6 @@ def noise(t, x, args, dw):
     return imu(dw[:3], dw[3:], gravity=0 * dw[:3], time=0.0)
 
 
-def hat(w):
-    return np.array([[0, -w[2], w[1]], [w[2], 0, -w[0]], [-w[1], w[0], 0]])
-
-
 def matrix_of(omega, force):
     """A of `eta' = A eta`, in which neither the state nor gravity is."""
     a = np.kron(np.eye(3), -hat(omega))
@@ -51,8 +47,8 @@ def matrix_of(omega, force):
     return a
 
 
-def end(term, solver, y0, args=None, num_steps=20):
-    ys = cfjax.integrate(term, solver, 0.0, 1.0, y0, args, num_steps=num_steps).ys
+def end(term, solver, y0, args=None, num_steps=20, t0=0.0, t1=1.0):
+    ys = cfjax.integrate(term, solver, t0, t1, y0, args, num_steps=num_steps).ys
     return jax.tree.map(lambda x: x[-1], ys)
 
 
@@ -135,14 +131,22 @@ def test_the_reference_is_exact_to_rounding():
     assert np.abs(p / np.sqrt(np.outer(np.diag(p), np.diag(p))) - np.eye(9)).max() > 0.5
 
 
-def test_order_of_cf4():
+def test_order_of_cf4_and_another_start():
+    # 20 and 40 steps by one program.
+    one, middle = end(TERM, CF4(), start(), NO_BIAS), end(TERM, CF4(), start(), NO_BIAS, t1=0.5)
     errors = []
-    for num_steps in (20, 40):
-        y = end(TERM, CF4(), start(), NO_BIAS, num_steps)
+    for y in (one, end(TERM, CF4(), middle, NO_BIAS, t0=0.5)):
         found = y.transition, y.covariance, y.sensitivity
         errors.append([np.abs(a - b).max() for a, b in zip(found, exact(), strict=True)])
     slopes = np.log2(np.divide(*errors))
     assert np.all(np.abs(slopes - 4) < 0.25), slopes
+    # A window does not depend on its start.
+    other = end(TERM, CF4(), start(OTHER), NO_BIAS)
+    assert np.abs(one.state - other.state).max() > 1
+    for name in ("transition", "covariance", "sensitivity"):
+        a, b = getattr(one, name), getattr(other, name)
+        # Ten units of rounding.
+        np.testing.assert_allclose(a, b, rtol=0, atol=2e-15 * np.abs(a).max(), err_msg=name)
 
 
 @pytest.mark.slow
@@ -161,37 +165,6 @@ def test_the_matrix_of_errors_depends_on_the_readings_alone():
         a = term.vf_prod(0.0, y, None, 1.0).transition
         # Velocities of 5 and a gravity of 10 cancel.
         np.testing.assert_allclose(a, matrix_of(omega, force), rtol=0, atol=4e-15)
-
-
-def test_a_window_does_not_depend_on_its_start():
-    one, other = (end(TERM, CF4(), start(x0), NO_BIAS, 20) for x0 in (X0, OTHER))
-    assert np.abs(one.state - other.state).max() > 1
-    for name in ("transition", "covariance", "sensitivity"):
-        a, b = getattr(one, name), getattr(other, name)
-        # Ten units of rounding.
-        np.testing.assert_allclose(a, b, rtol=0, atol=2e-15 * np.abs(a).max(), err_msg=name)
-
-
-@pytest.mark.slow
-def test_a_bias_in_the_state_adds_its_share():
-    def with_bias(t, y, args):
-        return {"bias": None, "x": window(t, y["x"], y["bias"])}
-
-    def noise_of_both(t, y, args, dw):
-        return {"bias": None, "x": noise(t, y["x"], args, dw)}
-
-    p_bias = np.diag([1e-4, 2e-4, 3e-4, 1e-2, 2e-2, 3e-2])
-    term = VariationTerm(LieTerm(with_bias), noise=noise_of_both, channels=6)
-    y0 = term.start(
-        0.0, {"bias": np.zeros(6), "x": X0}, covariance=scipy.linalg.block_diag(p_bias, P0)
-    )
-    found = end(term, RKMK8(), y0, None, 40).covariance
-    _, p, jacobian = exact()
-    # As for RKMK8 above.
-    np.testing.assert_allclose(
-        found[6:, 6:], p + jacobian @ p_bias @ jacobian.T, rtol=0, atol=1e-12
-    )
-    np.testing.assert_allclose(found[6:, :6], jacobian @ p_bias, rtol=0, atol=1e-12)
 
 
 # Constant readings
@@ -216,19 +189,8 @@ def covariance(readings, num_steps=20):
 
 
 @pytest.mark.slow
-def test_gradients_of_the_covariance_by_readings():
-    readings = jnp.asarray([0.4, -0.3, 0.8, 1.0, 0.5, -0.7])
-    loss = lambda r: jnp.trace(covariance(r))  # noqa: E731
-    want = jax.grad(lambda r: jnp.trace(van_loan(r)))(readings)
-    reverse, forward = jax.jit(jax.grad(loss))(readings), jax.jit(jax.jacfwd(loss))(readings)
-    # Of a method of order 4 with steps of 1/20; both modes agree to rounding.
-    np.testing.assert_allclose(reverse, want, rtol=0, atol=1e-5)
-    np.testing.assert_allclose(forward, reverse, rtol=0, atol=1e-13)
-    assert np.abs(want).min() > 1e-2
-
-
-@pytest.mark.parametrize("count", [200, pytest.param(10_000, marks=pytest.mark.slow)])
-def test_many_windows_by_map_batch(count):
+def test_many_windows_by_map_batch():
+    count = 200
     readings = np.random.default_rng(1).normal(size=(count, 6)) * np.repeat([0.5, 2.0], 3)
     found = cfjax.map_batch(covariance, readings, chunk_size=count // 4, progress=False).values
     assert found.shape == (count, 9, 9)
@@ -241,38 +203,25 @@ def test_many_windows_by_map_batch(count):
 # Log-density
 
 
-def drag(t, x, args):
-    """Turns the body to the identity, and slows it down."""
-    k, loss = args
-    # omega = -k sin(angle) times the axis: 2 w (x, y, z) is sin(angle) times the axis.
-    omega = -2 * k * x[0] * x[1:4]
-    back = x[:4] * jnp.asarray([1.0, -1, -1, -1])
-    force = cfjax.quaternion_rotate(back, -loss * x[4:7] - jnp.asarray(GRAVITY), layout="wxyz")
-    return imu(omega, force)
-
-
-@pytest.mark.slow
-def test_log_density_and_its_gradients():
-    """tan(angle/2) falls as e^(-kt), of the weight sin^2(angle/2); velocities as e^(-loss t)."""
+def test_the_rate_of_a_log_density():
+    """The angle falls as -k sin(angle), of weight sin^2(angle/2); velocities by the loss."""
     angle = 1.2
     x0 = np.r_[np.cos(angle / 2), np.sin(angle / 2) * np.array([2.0, -1, 2]) / 3, X0[4:]]
-    term = VariationTerm(LieTerm(drag))
 
-    def found(args):
-        y0 = Variation(jnp.asarray(x0), log_density=jnp.asarray(0.3))
-        return end(term, CF4(), y0, args, 40).log_density
-
-    def want(args):
+    def drag(t, x, args):
         k, loss = args
-        later = 2 * jnp.arctan(jnp.exp(-k) * jnp.tan(angle / 2))
-        of_turns = jnp.log(jnp.sin(later) / jnp.sin(angle))
-        of_turns += 2 * jnp.log(jnp.sin(later / 2) / jnp.sin(angle / 2))
-        return 0.3 - of_turns + 3 * loss
+        # omega = -k sin(angle) times the axis: 2 w (x, y, z) is sin(angle) times the axis.
+        omega = -2 * k * x[0] * x[1:4]
+        back = x[:4] * jnp.asarray([1.0, -1, -1, -1])
+        force = cfjax.quaternion_rotate(back, -loss * x[4:7] - jnp.asarray(GRAVITY), layout="wxyz")
+        return imu(omega, force)
 
-    args = jnp.asarray([0.8, 0.5])
-    # An integral by a method of order 4 with steps of 1/40.
-    np.testing.assert_allclose(found(args), want(args), rtol=0, atol=1e-7)
-    slope = jax.grad(want)(args)
-    reverse, forward = jax.jit(jax.grad(found))(args), jax.jit(jax.jacfwd(found))(args)
-    np.testing.assert_allclose(reverse, slope, rtol=0, atol=1e-6)
-    np.testing.assert_allclose(forward, reverse, rtol=0, atol=1e-13)
+    def rate(args):
+        y = Variation(jnp.asarray(x0), log_density=jnp.asarray(0.3))
+        return VariationTerm(LieTerm(drag)).vf_prod(0.0, y, args, 1.0).log_density
+
+    args, slope = jnp.asarray([0.8, 0.5]), np.array([1 + 2 * np.cos(angle), 3.0])
+    found = jax.jit(jax.value_and_grad(rate))(args)
+    # Some ten units of rounding, of velocities and a gravity of 10.
+    np.testing.assert_allclose(found[0], args @ slope, rtol=0, atol=1e-14)
+    np.testing.assert_allclose(found[1], slope, rtol=0, atol=1e-14)
