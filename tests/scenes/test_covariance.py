@@ -105,35 +105,32 @@ def test_in_the_end_the_filter_solves_the_algebraic_riccati_equation():
     np.testing.assert_allclose(found, p, rtol=0, atol=1e-12)
 
 
-@pytest.mark.representatives(1)
-@pytest.mark.parametrize(
-    ("args", "t1", "num_steps"), [(SEEN, 5.0, 80), (HIDDEN, 20.0, 40)], ids=["Riccati", "Lyapunov"]
-)
-def test_order(args, t1, num_steps):
+def test_order():
     start = covariance.y0()
-    exact = covariance.reference(t1, start, args)
-    errors = [np.abs(CF4(t1, n, start, args)[-1] - exact).max() for n in (num_steps, 2 * num_steps)]
-    # Order 4 gives 16, and more where terms of the next order have not gone yet.
-    assert 14 < errors[0] / errors[1] < 24
-    assert errors[1] < 1e-6
+    # Riccati's equation, and Lyapunov's.
+    for args, t1, n in ((SEEN, 5.0, 80), (HIDDEN, 20.0, 40)):
+        exact = covariance.reference(t1, start, args)
+        errors = [np.abs(CF4(t1, k, start, args)[-1] - exact).max() for k in (n, 2 * n)]
+        # Order 4 gives 16, and more where terms of the next order have not gone yet.
+        assert 14 < errors[0] / errors[1] < 24
+        assert errors[1] < 1e-6
 
 
-@pytest.mark.parametrize(
-    ("args", "t1", "deviation"),
-    [(SEEN, 5.0, 2.0), (HIDDEN._replace(drag_across=10.0), 20.0, 0.5)],
-    ids=["Riccati", "Lyapunov"],
-)
-def test_definite_where_rk4_in_plain_space_is_not(args, t1, deviation):
-    start = covariance.y0(deviation)
-    for n in (5, 20, 80):
-        ys = CF4(t1, n, start, args)
-        assert len(ys) == n
-        assert np.all(covariance.smallest(ys) > 0)
-        np.testing.assert_array_equal(ys, np.swapaxes(ys, 1, 2))
-        # What is indefinite runs away, in the end to NaN.
-        assert np.any(covariance.smallest(RK4(t1, n, start, args)) < 0)
-    # With short steps it is, so what fails is the method.
-    assert np.all(covariance.smallest(RK4(t1 / 10, 200, start, args)) > 0)
+def test_definite_where_rk4_in_plain_space_is_not():
+    for args, t1, deviation in (
+        (SEEN, 5.0, 2.0),
+        (HIDDEN._replace(drag_across=10.0), 20.0, 0.5),
+    ):
+        start = covariance.y0(deviation)
+        for n in (5, 20, 80):
+            ys = CF4(t1, n, start, args)
+            assert len(ys) == n
+            assert np.all(covariance.smallest(ys) > 0)
+            np.testing.assert_array_equal(ys, np.swapaxes(ys, 1, 2))
+            # What is indefinite runs away, in the end to NaN.
+            assert np.any(covariance.smallest(RK4(t1, n, start, args)) < 0)
+        # With short steps it is, so what fails is the method.
+        assert np.all(covariance.smallest(RK4(t1 / 10, 200, start, args)) > 0)
 
 
 @pytest.mark.slow
@@ -162,29 +159,6 @@ def test_the_velocity_is_that_of_the_field():
         for found in (covariance.velocity(t, jnp.asarray(y), args), frozen.tangent(jnp.asarray(y))):
             # Sums of a dozen terms of size 1.
             np.testing.assert_allclose(found, want, rtol=0, atol=1e-15)
-
-
-@pytest.mark.slow
-def test_error_control_with_the_jumps():
-    args, start = covariance.Track(), covariance.y0()
-    controller = diffrax.ClipStepSizeController(
-        diffrax.PIDController(rtol=0.0, atol=1e-8), jump_ts=jnp.array([args.lost, args.found])
-    )
-    sol = diffrax.diffeqsolve(
-        TERM,
-        cfjax.CF4(),
-        0.0,
-        60.0,
-        0.01,
-        start,
-        args,
-        saveat=diffrax.SaveAt(ts=jnp.array([20.0, 40.0, 42.0, 60.0])),
-        stepsize_controller=controller,
-    )
-    exact = covariance.reference(np.asarray(sol.ts), start, args)
-    # A few hundred steps with a tolerance of 1e-8 each.
-    np.testing.assert_allclose(sol.ys, exact, rtol=0, atol=1e-6)
-    assert np.all(covariance.smallest(sol.ys) > 0)
 
 
 @pytest.mark.slow

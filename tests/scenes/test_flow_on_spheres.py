@@ -64,15 +64,18 @@ def test_rkmk8_against_the_reference():
     np.testing.assert_allclose(end.log_density, np.log(density), rtol=0, atol=1e-13)
 
 
+def grid_and_weights(n, m):
+    """Over the sphere, by a product of Gauss's rule and a sum."""
+    x, weights = np.polynomial.legendre.leggauss(n)
+    longitude = 2 * np.pi * np.arange(m) / m
+    ring = np.sqrt(1 - x**2)[:, None]
+    points = ring * np.cos(longitude), ring * np.sin(longitude), x[:, None] + 0 * longitude
+    return np.stack(points, axis=-1), weights
+
+
 def test_peaks():
     args = Peaks()
-    # Over the sphere by a product of Gauss's rule and a sum.
-    x, weights = np.polynomial.legendre.leggauss(60)
-    longitude = 2 * np.pi * np.arange(80) / 80
-    ring = np.sqrt(1 - x**2)[:, None]
-    grid = np.stack(
-        [ring * np.cos(longitude), ring * np.sin(longitude), x[:, None] + 0 * longitude], axis=-1
-    )
+    grid, weights = grid_and_weights(60, 80)
     density = np.exp(flow_on_spheres.log_density_of(args, grid.reshape(-1, 3))).reshape(60, 80)
     np.testing.assert_allclose(weights @ density.mean(axis=1) / 2, 1.0, rtol=0, atol=1e-10)
     y = flow_on_spheres.samples_of(args, 20_000)
@@ -85,12 +88,7 @@ def test_peaks():
 def test_the_density_of_a_network_has_integral_one():
     args = flow_on_spheres.network(jax.random.key(1), 4)
     args = args._replace(outer=10 * args.outer)
-    x, weights = np.polynomial.legendre.leggauss(12)
-    longitude = 2 * np.pi * np.arange(24) / 24
-    ring = np.sqrt(1 - x**2)[:, None]
-    grid = np.stack(
-        [ring * np.cos(longitude), ring * np.sin(longitude), x[:, None] + 0 * longitude], axis=-1
-    )
+    grid, weights = grid_and_weights(12, 24)
     with cfjax.rewriting(False):
         logs = jax.jit(flow_on_spheres.log_likelihood)(args, grid.reshape(-1, 3))
     density = np.exp(np.asarray(logs)).reshape(12, 24)

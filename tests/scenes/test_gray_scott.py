@@ -85,22 +85,6 @@ def test_order():
 
 
 @pytest.mark.slow
-def test_a_gradient():
-    """How the mass depends on the feed, against differences."""
-    start = gray_scott.y0(N)
-
-    def mass(feed):
-        args = SMALL._replace(feed=feed)
-        y = cfjax.integrate(TERM, cfjax.CF4(), 0.0, 20.0, start, args, num_steps=10).ys
-        return jnp.mean(y["u"][-1] + y["v"][-1])
-
-    found = jax.grad(mass)(jnp.asarray(0.03))
-    near = [float(mass(jnp.asarray(0.03 + h))) for h in (-1e-5, 1e-5)]
-    # Third derivatives of size 20^3, times 1e-10, and rounding of 1e-16 / 1e-5.
-    assert float(found) == pytest.approx((near[1] - near[0]) / 2e-5, abs=1e-6)
-
-
-@pytest.mark.slow
 def test_the_error_of_the_reference():
     given = gray_scott.problem()
     answer = gray_scott.reference(gray_scott.t1, given["y0"], given["args"])

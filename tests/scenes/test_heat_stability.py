@@ -70,21 +70,28 @@ def test_rk4_at_its_limit():
 # CF4's own limit: the part of the diffusivity that is not in the flow
 
 
-@pytest.mark.representatives(6)
-@pytest.mark.parametrize("ratio", [0.0, 0.5, 1.0, 1.5, 2.0, 2.5])
-@pytest.mark.parametrize("solver", [cfjax.LieEuler(), cfjax.CF2(), cfjax.CF3(), cfjax.CF4()])
-def test_linear_theory_is_a_real_step(solver, ratio):
+@pytest.mark.representatives(1)
+@pytest.mark.parametrize("solver", [cfjax.CF4(), cfjax.LieEuler(), cfjax.CF2(), cfjax.CF3()])
+def test_linear_theory_is_a_real_step(solver):
     """The diffusivity is constant, `ratio * mu_c`, where every mode has `w = (ratio - 1) z`."""
-    n, constant = 20, 0.7
-    args = heat.Diffusivity(jnp.full(n, ratio * constant), jnp.asarray(constant))
-    y0 = jnp.ones(n - 1)
-    for h in (1e-3, 0.1, 10.0):
-        found = problems.first_step(solver, COEFFICIENTS, 0.0, h, y0, args)[0]
-        z = h * np.asarray(heat.field(0.0, y0, args).spectrum)
+    n, constant, y0 = 20, 0.7, jnp.ones(19)
+    ratios, h = np.meshgrid([0.0, 0.5, 1.0, 1.5, 2.0, 2.5], [1e-3, 0.1, 10.0])
+
+    @jax.jit
+    @jax.vmap
+    def step(ratio, h):
+        args = heat.Diffusivity(jnp.full(n, ratio * constant), jnp.asarray(constant))
+        return problems.first_step(solver, COEFFICIENTS, jnp.zeros(()), h, y0, args)[0]
+
+    found = step(*problems.arrays((ratios.ravel(), h.ravel())))
+    args = heat.Diffusivity(jnp.full(n, constant), jnp.asarray(constant))
+    spectrum = np.asarray(heat.field(0.0, y0, args).spectrum)
+    for ratio, length, end in zip(ratios.ravel(), h.ravel(), found, strict=True):
+        z = length * spectrum
         wanted = growth(solver.tableau, z, (ratio - 1) * z)
         # The frozen part rounds in grid values, which mixes the modes: relative to the largest,
         # after stages whose intermediate values may be larger than the end.
-        assert np.abs(found - wanted).max() < 1e-12 * max(1, np.abs(wanted).max()) * 10
+        assert np.abs(end - wanted).max() < 1e-12 * max(1, np.abs(wanted).max()) * 10
 
 
 def limit_of(tableau):
@@ -110,10 +117,12 @@ def test_the_limit_of_cf4():
         assert np.abs(growth(CF4.tableau, z, (ratio - 1) * z)).max() <= 1 + 1e-12
 
 
-def spectral_radius(args, h):
-    eye = jnp.eye(len(args.mu) - 1)
-    step = jax.vmap(lambda y: problems.first_step(CF4, COEFFICIENTS, 0.0, h, y, args)[0])
-    return np.abs(np.linalg.eigvals(np.asarray(jax.jit(step)(eye)))).max()
+@jax.jit
+def step_matrix(args, h):
+    def step(y):
+        return problems.first_step(CF4, COEFFICIENTS, jnp.zeros(()), h, y, args)[0]
+
+    return jax.vmap(step)(jnp.eye(len(args.mu) - 1))
 
 
 def variable(power, fraction):
@@ -124,50 +133,36 @@ def variable(power, fraction):
     )
 
 
-@pytest.mark.representatives(2)
-@pytest.mark.parametrize(
-    "power, fraction", [(1, 1.0), (1, 0.72), (2, 1.0), (1, 0.68), (1, 0.5), (3, 1.0), (8, 1.0)]
-)
-def test_variable_diffusivity_fails_where_linear_theory_says(power, fraction):
+def test_variable_diffusivity_fails_where_linear_theory_says():
     """The bound holds for the largest value of mu: fast modes sit where it is."""
-    ratio, args = variable(power, fraction)
-    r = ratio - 1
-    limit = abs(r / 6 - r**2 / 6 - r**3 / 3 + r**4)
-    for h in (1e-2, 0.1, 1.0):
-        radius = spectral_radius(args, h)
-        if ratio < 2.099:
-            # Slow modes decay as they should; rounding of a matrix of norm one.
-            assert radius < 1 + 1e-10
-        else:
-            # The fastest mode is not quite at the maximum of mu.
-            assert limit * 0.98 < radius < limit * (1 + 1e-9)
-            assert radius > 1
+    for power, fraction in [(1, 1), (1, 0.72), (2, 1), (1, 0.68), (1, 0.5), (3, 1), (8, 1)]:
+        ratio, args = variable(power, fraction)
+        r = ratio - 1
+        limit = abs(r / 6 - r**2 / 6 - r**3 / 3 + r**4)
+        for h in (1e-2, 0.1, 1.0):
+            radius = np.abs(np.linalg.eigvals(np.asarray(step_matrix(args, jnp.asarray(h))))).max()
+            if ratio < 2.099:
+                # Slow modes decay as they should; rounding of a matrix of norm one.
+                assert radius < 1 + 1e-10
+            else:
+                # The fastest mode is not quite at the maximum of mu.
+                assert limit * 0.98 < radius < limit * (1 + 1e-9)
+                assert radius > 1
 
 
 # Failure is visible
 
 
-def test_blow_up_with_fixed_steps_is_a_result():
+@pytest.mark.slow
+def test_failures_are_results():
     u0, args = heat.to_grid(jnp.asarray(heat.y0())), problems.arrays(heat.diffusivity())
     # The factor of the fastest mode is 2e5 a step.
-    solution = diffrax.diffeqsolve(GRID, CF4, 0.0, 0.5, 5e-3, u0, args, throw=False)
-    assert solution.result == diffrax.RESULTS.nonfinite
     with pytest.raises(eqx.EquinoxRuntimeError, match="Nonfinite"):
         diffrax.diffeqsolve(GRID, CF4, 0.0, 0.5, 5e-3, u0, args)
-
-
-@pytest.mark.representatives(1)
-@pytest.mark.parametrize(
-    # On translations CF4 is the classical Runge-Kutta method.
-    "term, solver",
-    [(GRID, CF4), (COEFFICIENTS, cfjax.RKMK4())],
-    ids=["RK4", "RKMK4"],
-)
-def test_too_few_adaptive_steps_are_a_result(term, solver):
-    u0, args = jnp.asarray(heat.y0()), problems.arrays(heat.diffusivity())
+    # On translations CF4 is the classical Runge-Kutta method, which needs 1800 steps.
     solution = diffrax.diffeqsolve(
-        term,
-        cfjax.Richardson(solver),
+        GRID,
+        cfjax.Richardson(CF4),
         0.0,
         0.5,
         5e-3,
@@ -178,28 +173,3 @@ def test_too_few_adaptive_steps_are_a_result(term, solver):
         throw=False,
     )
     assert solution.result == diffrax.RESULTS.max_steps_reached
-
-
-@pytest.mark.slow
-def test_adaptive_steps_see_what_fixed_ones_do_not():
-    """With half of mu_c the steps of CF4 grow 13 times each, unless they are small."""
-    _, args = variable(1, 0.5)
-    y0 = jnp.asarray(heat.y0())
-    exact = heat.reference(0.5, np.asarray(args.mu))
-    fixed = cfjax.integrate(COEFFICIENTS, CF4, 0.0, 0.5, y0, args, num_steps=50).ys
-    assert np.linalg.norm(np.asarray(fixed)[-1]) > 1e40
-    solution = diffrax.diffeqsolve(
-        COEFFICIENTS,
-        cfjax.Richardson(CF4),
-        0.0,
-        0.5,
-        5e-3,
-        y0,
-        args,
-        stepsize_controller=diffrax.PIDController(rtol=0.0, atol=1e-5),
-    )
-    assert solution.ys is not None
-    error = np.linalg.norm(heat.to_grid(solution.ys[-1]) - exact)
-    # A root mean square over 99 entries of at most 1e-5 in the solution's unit of time; what is old
-    # decays at a rate of 2 and more.
-    assert error < np.sqrt(99) * 1e-5, error

@@ -5,6 +5,7 @@ import jax
 import jax.numpy as jnp
 import mpmath
 import numpy as np
+import problems
 import pytest
 
 import cfjax
@@ -46,29 +47,27 @@ def end(solver, num_steps, args=landau_zener.slow, y0=None, term=TERM):
     return np.asarray(sol.ys[-1])
 
 
-@pytest.mark.parametrize("args", SWEEPS)
-@pytest.mark.parametrize("times", [(-10.0, 10.0), (-3.0, 2.0), (4.0, -1.0)])
-def test_the_reference_is_the_closed_form(args, times):
-    t_start, t = times
-    found = landau_zener.reference(t, args=args, t_start=t_start)
-    # A hundred steps or three hundred, of a few roundings each.
-    np.testing.assert_allclose(found, closed_form(t, t_start, args), rtol=0, atol=1e-13)
+def test_the_reference_is_the_closed_form(subtests):
+    for args in SWEEPS:
+        for t_start, t in [(-10.0, 10.0), (-3.0, 2.0), (4.0, -1.0)]:
+            found = landau_zener.reference(t, args=args, t_start=t_start)
+            with subtests.test(case=f"{args} {t_start} {t}"):
+                # A hundred steps or three hundred, of a few roundings each.
+                np.testing.assert_allclose(found, closed_form(t, t_start, args), rtol=0, atol=1e-13)
 
 
 # Steps in which the error is well above rounding and the order seen.
-@pytest.mark.representatives(2)
+@pytest.mark.representatives(1)
 @pytest.mark.parametrize(
     ("solver", "num_steps", "order"),
-    [
-        (cfjax.CF4(), 160, 4),
-        (cfjax.Magnus4(), 80, 4),
-        (cfjax.Magnus6(), 80, 6),
-        (cfjax.Magnus8(), 80, 8),
-    ],
+    [(cfjax.Magnus6(), 80, 6), (cfjax.CF4(), 160, 4), (cfjax.Magnus8(), 80, 8)],
 )
 def test_order(solver, num_steps, order):
-    exact = closed_form(landau_zener.t1, landau_zener.t0, landau_zener.slow)
-    errors = [np.abs(end(solver, n) - exact).max() for n in (num_steps, 2 * num_steps)]
+    exact = landau_zener.reference(landau_zener.t1)
+    times = problems.arrays((landau_zener.t0, landau_zener.t1))
+    given = landau_zener.field, solver, *times, jnp.asarray(landau_zener.y0()), landau_zener.slow
+    ends = [problems.many_steps(*given, jnp.asarray(n)) for n in (num_steps, 2 * num_steps)]
+    errors = [np.abs(end - exact).max() for end in ends]
     assert 0.7 * 2**order < errors[0] / errors[1] < 1.4 * 2**order
 
 
@@ -83,20 +82,19 @@ def test_the_limit():
     assert landau_zener.limit(landau_zener.Sweep(0.1, 1.0)) < 1e-27
 
 
-def test_the_norm_stays_where_plain_space_loses_it():
+def test_a_propagator_stays_unitary_where_plain_space_loses_the_norm():
     plain = diffrax.ODETerm(landau_zener.velocity)
-    y, off = end(cfjax.Magnus6(), 400), end(diffrax.Tsit5(), 400, term=plain)
+    u = end(cfjax.Magnus6(), 400, y0=np.eye(2, dtype=complex))
+    off = end(diffrax.Tsit5(), 400, term=plain)
     # Sums over the steps are compensated: a few roundings.
-    np.testing.assert_allclose(np.linalg.norm(y), 1, rtol=0, atol=2e-15)
+    np.testing.assert_allclose(np.conj(u.T) @ u, np.eye(2), rtol=0, atol=4e-15)
+    exact = landau_zener.reference(landau_zener.t1)
+    # The error of the method, of order 6, with steps of 1/20.
+    np.testing.assert_allclose(u @ landau_zener.y0(), exact, rtol=0, atol=1e-7)
     assert abs(np.linalg.norm(off) - 1) > 1e-9
 
 
-def test_a_propagator():
-    u = end(cfjax.Magnus6(), 400, y0=np.eye(2, dtype=complex))
-    np.testing.assert_allclose(u @ landau_zener.y0(), end(cfjax.Magnus6(), 400), atol=1e-14)
-    np.testing.assert_allclose(np.conj(u.T) @ u, np.eye(2), rtol=0, atol=4e-15)
-
-
+@pytest.mark.slow
 def test_the_derivative_in_the_coupling():
     def stays(coupling):
         args = landau_zener.Sweep(1.0, coupling)

@@ -1,12 +1,13 @@
 """Preintegration: exact readings, schemes and their orders, and a covariance by quadrature."""
 
 from pathlib import Path
+from typing import Any
 
-import diffrax
-import jax
 import jax.numpy as jnp
 import numpy as np
+import problems
 import pytest
+from problems import hat
 from scipy.spatial.transform import Rotation
 
 import cfjax
@@ -43,9 +44,9 @@ def test_the_velocity_is_that_of_the_field():
 
 def test_a_flight_against_the_reference():
     with cfjax.rewriting(False):
+        given: dict[str, Any] = {"args": None} | preintegration.problem()
         ends = [
-            cfjax.integrate(**preintegration.problem(), solver=cfjax.CF4(), num_steps=n).ys[-1]
-            for n in (160, 320)
+            problems.in_pieces(**given, solver=cfjax.CF4(), num_steps=160, pieces=n) for n in (1, 2)
         ]
     exact = preintegration.reference(preintegration.t1)
     errors = [preintegration.error(np.asarray(y), exact) for y in ends]
@@ -64,12 +65,11 @@ ORDERS = {
 }
 
 
+QUICK = "exact flow, mean of two", "CF4, cubic interpolation"
+
+
 @pytest.mark.parametrize(
-    "name",
-    [
-        pytest.param(name, marks=() if "exact" in name or "cubic" in name else pytest.mark.slow)
-        for name in SCHEMES
-    ],
+    "name", [pytest.param(x, marks=[pytest.mark.slow] * (x not in QUICK)) for x in SCHEMES]
 )
 def test_orders_of_the_schemes(name):
     scheme = SCHEMES[name]
@@ -91,10 +91,6 @@ def test_schemes_agree_where_readings_are_constant():
 
 def covariance_by_quadrature(t1, args):
     """P in the body's frame, by Gauss's rule: errors of turned attitudes stay, others add up."""
-
-    def hat(w):
-        return np.array([[0, -w[2], w[1]], [w[2], 0, -w[0]], [-w[1], w[0], 0]])
-
     x, weights = np.polynomial.legendre.leggauss(60)
     t, weights = t1 * (1 + x) / 2, t1 * weights / 2
     end = preintegration.reference(t1)
@@ -122,31 +118,6 @@ def test_the_covariance_against_quadrature():
         scale = np.sqrt(np.outer(np.diag(want), np.diag(want)))
         # The error of a method of order 4 with steps of 1/20, in units of the standard deviations.
         np.testing.assert_allclose(ys.covariance[k] / scale, want / scale, rtol=0, atol=1e-4)
-
-
-@pytest.mark.slow
-def test_the_covariance_of_samples():
-    """Positions of 400 flights with noise, at the end."""
-    args, count = Sensor(), 400
-    plain = preintegration.problem()
-
-    @jax.jit
-    @jax.vmap
-    def flight(key):
-        path = diffrax.UnsafeBrownianPath((6,), key)
-        term = diffrax.MultiTerm(
-            cfjax.LieTerm(preintegration.field), cfjax.LieControlTerm(preintegration.noise, path)
-        )
-        problem = plain | {"term": term, "args": args}
-        return cfjax.integrate(**problem, solver=cfjax.CF3(), num_steps=400).ys[-1]
-
-    ends = np.asarray(flight(jax.random.split(jax.random.key(0), count)))
-    off = ends[:, 7:] - preintegration.reference(preintegration.t1)[7:]
-    turn = rotations(preintegration.t1).as_matrix()
-    want = turn @ covariance_by_quadrature(preintegration.t1, args)[6:, 6:] @ turn.T
-    found = off.T @ off / count
-    spread = np.sqrt((np.outer(np.diag(want), np.diag(want)) + want**2) / count)
-    assert np.all(np.abs(found - want) < 4 * spread)
 
 
 @pytest.mark.slow

@@ -1,10 +1,7 @@
 """The Stiefel scenes: the numbers of an independent program, orders, flops and gradients."""
 
-import functools
 from typing import Any
 
-import diffrax
-import jax
 import jax.numpy as jnp
 import numpy as np
 import problems
@@ -15,31 +12,15 @@ from cfjax.scenes import stiefel
 
 FIELDS = {"first": stiefel.first, "second": stiefel.second}
 both = pytest.mark.parametrize("problem", FIELDS)
-# The classical method with every commutator of the series, as `cfjax.RKMK` keeps them.
-CLASSICAL = diffrax.ButcherTableau(
-    a_lower=tuple(map(np.array, ([0.5], [0.0, 0.5], [0.0, 0.0, 1.0]))),
-    b_sol=np.array([1 / 6, 1 / 3, 1 / 3, 1 / 6]),
-    b_error=np.zeros(4),
-    c=np.array([0.5, 0.5, 1.0]),
-)
 METHODS: dict[str, tuple[Any, int]] = {
     "CF3": (cfjax.CF3(), 3),
-    "CF4": (cfjax.CF4(), 4),
-    "CG3": (cfjax.CG3(), 3),
-    "RKMK3": (cfjax.RKMK3(), 3),
     "RKMK4": (cfjax.RKMK4(), 4),
-    "RKMK4, full series": (cfjax.RKMK(CLASSICAL), 4),
     "RKR-C4": (cfjax.CayleyRK4(), 4),
 }
 
 
 def arguments(problem, n, p=4):
     return stiefel.diagonals(n, p) if problem == "first" else None
-
-
-@functools.cache
-def answer(problem, n, p):
-    return stiefel.reference(problem, n, p)
 
 
 def test_initial_value():
@@ -57,8 +38,7 @@ def test_constants_are_numpy_arrays():
         assert rows.dtype == np.float64
 
 
-@pytest.mark.representatives(2)
-@pytest.mark.parametrize("n, p", [(5, 4), (9, 2), (7, 1)])
+@pytest.mark.parametrize("n, p", [(5, 4), (9, 2)])
 def test_frozen_fields_are_the_equations(n, p):
     """The matrices as the paper has them, entry by entry."""
     y = np.linalg.qr(np.random.default_rng(0).standard_normal((n, p)))[0]
@@ -108,7 +88,7 @@ def test_order(problem, name):
         1.0,
         stiefel.y0(n, p),
         arguments(problem, n, p),
-        answer(problem, n, p).ravel(),
+        stiefel.reference(problem, n, p).ravel(),
         steps,
     )
     assert found.min() > 1e-12
@@ -116,40 +96,11 @@ def test_order(problem, name):
     assert solver.order(None) == order
 
 
-@pytest.mark.slow
-@both
-def test_gradients_of_a_whole_solve(problem):
-    """In Y0, D and C, against finite differences of order 4."""
-    n, p = 6, 2
-    x = problems.arrays((stiefel.y0(n, p), arguments(problem, n, p)))
-    v = problems.random_like(x, 0)
-    weight = np.arange(12.0).reshape(n, p) / 4
-
-    def fun(x):
-        y0, args = x
-        term = cfjax.LieTerm(FIELDS[problem])
-        y0 = problems.orthonormal(y0)
-        solution = cfjax.integrate(term, cfjax.CF4(), 0.0, 1.0, y0, args, num_steps=6)
-        return jnp.sum(jnp.sin(weight * solution.ys[-1]))
-
-    fun = jax.jit(fun)
-    gradient = jax.jit(jax.grad(fun))(x)
-    # Fifth derivatives up to 1e5 times 1e-12 / 30, and rounding of 1e-15 over 1e-3.
-    expected = problems.central_difference(fun, x, v, 1e-3)
-    np.testing.assert_allclose(problems.inner(gradient, v), expected, rtol=0, atol=1e-8)
-    if problem == "second":
-        forward = jax.jit(lambda x, v: jax.jvp(fun, (x,), (v,))[1])(x, v)
-        np.testing.assert_allclose(forward, problems.inner(gradient, v), rtol=1e-11)
-    assert all(np.abs(leaf).max() > 1e-3 for leaf in jax.tree.leaves(gradient))
-
-
-@pytest.mark.representatives(1)
-@pytest.mark.parametrize("dtype", [np.float32, np.float64])
-def test_precision_follows_the_state(dtype):
-    y = jnp.asarray(stiefel.y0(6, 2), dtype)
-    args = tuple(jnp.asarray(x, dtype) for x in stiefel.diagonals(6, 2))
-    assert stiefel.first(0.0, y, args).g.dtype == dtype
-    assert stiefel.second(0.0, y).gamma.dtype == dtype
+def test_precision_follows_the_state():
+    y = jnp.asarray(stiefel.y0(6, 2), np.float32)
+    args = tuple(jnp.asarray(x, np.float32) for x in stiefel.diagonals(6, 2))
+    assert stiefel.first(0.0, y, args).g.dtype == np.float32
+    assert stiefel.second(0.0, y).gamma.dtype == np.float32
 
 
 def test_the_picture():

@@ -42,7 +42,7 @@ def test_invariants_are_constant():
         assert abs(value) > 0.3 and abs(rates[name]) < 1e-15, name
 
 
-@pytest.mark.parametrize("angle, height", [(np.pi / 2, 0.1), (0.0, 0.55), (-2.0, -0.6)])
+@pytest.mark.parametrize("angle, height", [(np.pi / 2, 0.1), (-2.0, -0.6)])
 def test_a_start_is_on_the_section(angle, height):
     y = scene.y0(angle, height)
     kept = scene.invariants(jax.tree.map(jnp.asarray, y), ARGS)

@@ -3,6 +3,7 @@
 import jax
 import jax.numpy as jnp
 import numpy as np
+import problems
 import pytest
 
 import cfjax
@@ -78,30 +79,13 @@ def test_order(solver, order, num_steps):
     exact, errors = transition.reference(t1, args, TURNED), []
     start = transition.term.start(0.0, TURNED, args, transition=True)
     with cfjax.rewriting(False):
-        for n in (num_steps, 2 * num_steps):
-            ys = cfjax.integrate(transition.term, solver, 0.0, t1, start, args, num_steps=n).ys
-            end = jax.tree.map(lambda x: np.asarray(x[-1]), ys)
-            errors.append(transition.error(end, exact))
+        for pieces in (1, 2):
+            given = transition.term, solver, 0.0, t1, start, args
+            end = problems.in_pieces(*given, num_steps, pieces)
+            errors.append(transition.error(jax.tree.map(np.asarray, end), exact))
     assert abs(np.log2(errors[0] / errors[1]) - order) < 0.5
     # Above the error of the reference.
     assert errors[1] > 1e-11
-
-
-@pytest.mark.slow
-def test_a_variation_in_a_chart():
-    with cfjax.rewriting(False):
-        chart = cfjax.work_precision(
-            **transition.problem() | {"t1": 2.0},
-            methods={"CF4": cfjax.CF4(), "RKMK5": cfjax.RKMK5()},
-            reference=transition.reference(2.0),
-            num_steps=[20, 40],
-            error=transition.error,
-            budget=0.1,
-            progress=False,
-        )
-    for method, order in (("CF4", 4), ("RKMK5", 5)):
-        coarse, fine = chart.select(method).error
-        assert abs(np.log2(coarse / fine) - order) < 0.5
 
 
 @pytest.mark.slow

@@ -4,6 +4,7 @@ import diffrax
 import jax
 import jax.numpy as jnp
 import numpy as np
+import problems
 import pytest
 from scipy.integrate import solve_ivp
 
@@ -35,28 +36,21 @@ def test_the_reference_against_the_laboratory_frame():
         h = bare + (first * np.cos(w * t) + second * np.sin(w * t)) * coupling
         return (-1j * h @ y.reshape(4, 4)).ravel()
 
-    found = solve_ivp(
-        rate,
-        (0.0, PULSE.duration),
-        np.eye(4, dtype=complex).ravel(),
-        "DOP853",
-        rtol=1e-12,
-        atol=1e-12,
-    )
+    start, times = np.eye(4, dtype=complex).ravel(), (0.0, PULSE.duration)
+    found = solve_ivp(rate, times, start, "DOP853", rtol=1e-12, atol=1e-12).y[:, -1]
     # Some thousand steps of that tolerance, whose errors add up.
-    np.testing.assert_allclose(
-        transmon.reference(PULSE), found.y[:, -1].reshape(4, 4), rtol=0, atol=1e-9
-    )
+    np.testing.assert_allclose(transmon.reference(PULSE), found.reshape(4, 4), rtol=0, atol=1e-9)
 
 
 # Ten to twenty periods of the fastest level, so steps in which the error is small but not rounding.
+@pytest.mark.representatives(1)
 @pytest.mark.parametrize(
-    ("solver", "num_steps", "order"),
-    [(cfjax.CF4(), 200, 4), (cfjax.Magnus4(), 100, 4), (cfjax.Magnus6(), 100, 6)],
+    ("solver", "num_steps", "order"), [(cfjax.Magnus6(), 100, 6), (cfjax.CF4(), 200, 4)]
 )
 def test_order(solver, num_steps, order):
     exact = transmon.reference(PULSE)
-    errors = [np.abs(end(solver, n) - exact).max() for n in (num_steps, 2 * num_steps)]
+    given = TERM, solver, 0.0, PULSE.duration, transmon.y0(), PULSE, num_steps
+    errors = [np.abs(problems.in_pieces(*given, pieces) - exact).max() for pieces in (1, 2)]
     assert 0.7 * 2**order < errors[0] / errors[1] < 1.4 * 2**order
     assert errors[1] < 1e-4
 
@@ -65,8 +59,6 @@ def test_stays_unitary_and_keeps_the_norm_where_plain_space_does_not():
     y = np.asarray(end(cfjax.Magnus6(), 100))
     # A hundred steps, of a few roundings each.
     assert np.abs(y.conj().T @ y - np.eye(4)).max() < 1e-13
-    state = np.asarray(end(cfjax.Magnus6(), 100, y0=transmon.y0()[:, 0]))
-    np.testing.assert_allclose(state, y[:, 0], rtol=0, atol=1e-13)
     space = diffrax.ODETerm(transmon.velocity)
     sol = cfjax.integrate(
         space, diffrax.Tsit5(), 0.0, PULSE.duration, transmon.y0()[:, 0], PULSE, num_steps=100
@@ -115,6 +107,7 @@ def test_the_quadrature_mends_most():
     assert losses[1] < losses[0] / 10
 
 
+@pytest.mark.slow
 def test_gradient_of_the_infidelity():
     def loss(parts):
         args = PULSE._replace(in_phase=parts[0], quadrature=parts[1])
