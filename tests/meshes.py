@@ -63,6 +63,12 @@ def check(file: str, names: list[str], *arguments: str) -> None:
 
 
 def show(kind: str, programs: Iterable[tuple[str, Callable, bool]]) -> None:
+    """Prints the differences of a kind, or of "both", then with the kind in their names."""
     jax.config.update("jax_enable_x64", True)
     jax.config.update("jax_disable_most_optimizations", True)
-    print(json.dumps(differences(kind, programs)))
+    found = differences(kind, programs) if kind in KINDS else {}
+    if kind == "both":
+        for each in KINDS:
+            shown = differences(each, programs).items()
+            found |= {f"{name}, {each}": value for name, value in shown}
+    print(json.dumps(found))

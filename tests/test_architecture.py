@@ -45,7 +45,7 @@ AGAINST_THE_DIRECTION = {
     (
         "_batch.fingerprint",
         FACE,
-    ): "the version is part of a fingerprint; it is read when one is made, not at import",
+    ): "the version is part of a fingerprint; it is read when one is made, not at import"
 }
 # Beyond the public names.
 PRIVATE = {

@@ -29,7 +29,7 @@ print([[float(x) for x in y] for y in numbers], [events[name] for name in names]
 """
 
 
-@pytest.mark.parametrize("solver", ["CF4", pytest.param("RKMK5", marks=pytest.mark.slow)])
+@pytest.mark.parametrize("solver", ["CF2", pytest.param("RKMK5", marks=pytest.mark.slow)])
 def test_the_second_process_compiles_nothing(solver, tmp_path):
     """Called from Python, errors are looked for on the host; in a program, with `throw=False`."""
     settings = {

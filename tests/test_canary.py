@@ -158,11 +158,7 @@ EXAMPLES: dict[str, tuple[Any, tuple[Any, ...], tuple[str, ...]]] = {
     "cholesky": (lax.linalg.cholesky, (M,), ()),
     "clamp": (lax.clamp, (X, X, X), ()),
     "concatenate": (lambda x: jnp.concatenate([x, x]), (X,), ("dimension",)),
-    "cond": (
-        lambda x: lax.cond(x[0] > 0, lambda: x, lambda: 2 * x),
-        (X,),
-        ("branches",),
-    ),
+    "cond": (lambda x: lax.cond(x[0] > 0, lambda: x, lambda: 2 * x), (X,), ("branches",)),
     "convert_element_type": (lambda x: x.astype(jnp.float32), (jnp.asarray(X),), ()),
     "copy": (lax.copy_p.bind, (X,), ()),
     "cumprod": (lax.cumprod, (X,), ("axis",)),

@@ -27,26 +27,17 @@ def frame(dtype: Any, n: int, p: int) -> jax.Array:
 
 SPECTRUM = RNG.standard_normal(4)
 F32, F64, C64 = np.float32, np.float64, np.complex64
+# Of each way through the checks: leading columns, complex numbers, a mean, structure, a chart of
+# its own, a defect, and an increment.
 BUILT_IN: dict[str, tuple[Any, Any]] = {
-    "Rotation": (lambda: cfjax.Rotation(random(F64, 3)), random(F64, 3, 2)),
-    "Rotation, attitude": (lambda: cfjax.Rotation(random(F64, 3)), frame(F64, 3, 3)),
-    "Rotation, float32": (lambda: cfjax.Rotation(random(F32, 3)), random(F32, 3)),
+    "Rotation, float32": (lambda: cfjax.Rotation(random(F32, 3)), random(F32, 3, 2)),
     "LeftMatrix": (lambda: cfjax.LeftMatrix(random(C64, 2, 2)), random(C64, 2, 3)),
-    "RightMatrix": (lambda: cfjax.RightMatrix(random(F64, 2, 2)), random(F64, 2)),
-    "Conjugation": (lambda: cfjax.Conjugation(random(F32, 2, 2)), random(C64, 2, 2)),
     "Congruence": (
         lambda: cfjax.Congruence(random(C64, 2, 2), random(C64, 2, 2)),
         random(C64, 2, 2),
     ),
-    "LinearAffine": (
-        lambda: cfjax.LinearAffine(random(F32, 4, 4), random(F32, 4)),
-        random(F32, 4),
-    ),
+    "LinearAffine": (lambda: cfjax.LinearAffine(random(F32, 4, 4), random(F32, 4)), random(F32, 4)),
     "Affine": (
-        lambda: cfjax.Affine(random(F32, 4), SPECTRUM.astype(F32), alpha=random(F32)),
-        random(F32, 4),
-    ),
-    "Affine, transform": (
         lambda: cfjax.Affine(random(F64, 4), SPECTRUM, cfjax.SineTransform(), alpha=random(F64)),
         random(F64, 4),
     ),
@@ -57,19 +48,14 @@ BUILT_IN: dict[str, tuple[Any, Any]] = {
         lambda: cfjax.QuaternionRotation(random(F64, 3), frame="body", layout="wxyz"),
         jnp.asarray([0.5, -0.1, 0.7, 0.5]),
     ),
-    "BorderedSkew": (lambda: cfjax.BorderedSkew(random(F32, 5, 2)), frame(F32, 5, 2)),
 }
 
 
-@pytest.mark.representatives(3)
+@pytest.mark.representatives(1)
 @pytest.mark.parametrize("name", BUILT_IN)
 def test_every_class_of_the_package_passes(name):
     make, point = BUILT_IN[name]
     cfjax.check_field([make(), make()], point)
-
-
-def test_three_fields():
-    cfjax.check_field([cfjax.Rotation(random(F64, 3)) for _ in range(3)], random(F64, 3))
 
 
 class Line(AbstractAlgebraElement):
@@ -79,8 +65,9 @@ class Line(AbstractAlgebraElement):
     b: jax.Array
 
     def flow(self, point):
-        # phi_1(a) is 1 at zero. The series is that of a few terms more than float64 needs.
-        phi = sum(self.a**k / float(np.prod(np.arange(1.0, k + 2))) for k in range(25))
+        # phi_1(a) is 1 at zero.
+        safe = jnp.where(self.a == 0, 1, self.a)
+        phi = jnp.where(self.a == 0, 1, jnp.expm1(safe) / safe)
         return jnp.exp(self.a) * point + phi * self.b
 
     def tangent(self, point):
@@ -101,20 +88,17 @@ def test_a_field_of_a_users_own():
     cfjax.check_field(fields_of(Line), POINT)
 
 
-@pytest.mark.parametrize(
-    "framed, text",
-    [
+def test_mistakes_in_framed_are_named(subtests):
+    for framed, text in [
         (lambda self, point: self, "must return elements that move the point freely"),
         (lambda self, point: 2 * self.tangent(point), "must have the velocity of the field"),
         (lambda self, point: self.tangent(point) ** 2, "must be linear in the field"),
         (lambda self, point: self.tangent(point)[0], "must return an algebra element, or"),
         (lambda self, point: Still(self.b), "must return an algebra element or the velocity"),
-    ],
-)
-def test_mistakes_in_framed_are_named(framed, text):
-    cls = type("Framed", (Line,), {"framed": framed})
-    with pytest.raises(ValueError, match=f"Framed.framed {text}"):
-        cfjax.check_field(fields_of(cls), POINT)
+    ]:
+        fields = fields_of(type("Framed", (Line,), {"framed": framed}))
+        with subtests.test(text=text), pytest.raises(ValueError, match=f"Framed.framed {text}"):
+            cfjax.check_field(fields, POINT)
 
 
 class Still(AbstractFrozenField):
@@ -141,10 +125,6 @@ def other_bracket(self, other):
     return type(self)(0 * self.a, self.a * self.b * other.a)
 
 
-def symmetric_bracket(self, other):
-    return type(self)(0 * self.a, self.a * other.b + other.a * self.b)
-
-
 def doubled(cls, weights, fields):
     return cls(*(2 * sum(w * x for w, x in zip(weights, xs, strict=True)) for xs in ab(fields)))
 
@@ -167,18 +147,15 @@ def along_the_old_one(self, point):
 
 
 MISTAKES = {
-    "opposite bracket": (dict(bracket=opposite_bracket), r"bracket must .*, here \[a, b\], but it"),
-    "opposite sign": (dict(bracket=opposite_bracket), r"but it has the opposite sign\."),
+    "opposite sign": (
+        dict(bracket=opposite_bracket),
+        r"bracket must .*, here \[a, b\], but it has the opposite sign\.",
+    ),
     "twice": (dict(bracket=double_bracket), r"but it is 2 times what is expected\."),
     "other": (dict(bracket=other_bracket), r"bracket must .* but it is off by"),
-    "symmetric": (dict(bracket=symmetric_bracket), r"bracket must .* but it is off by"),
     "tangent of half": (
         dict(tangent=lambda self, point: (self.a * point + self.b) / 2),
         r"tangent must be the derivative of the flow .* but it is 0\.5 times what is expected",
-    ),
-    "tangent without a part": (
-        dict(tangent=lambda self, point: self.a * point),
-        r"tangent must be the derivative of the flow at time zero, but it is off by",
     ),
     "Euler": (
         dict(flow=lambda self, point: point + self.a * point + self.b),
@@ -234,21 +211,11 @@ MISTAKES = {
 }
 
 
-@pytest.mark.parametrize("mistake", MISTAKES)
-def test_a_planted_mistake_is_named(mistake):
-    overrides, message = MISTAKES[mistake]
-    with pytest.raises(ValueError, match=message):
-        cfjax.check_field(fields_of(type("Planted", (Line,), overrides)), POINT)
-
-
-def test_a_transposed_tangent_is_found():
-    class Transposed(cfjax.Rotation):
-        def tangent(self, point):
-            return -super().tangent(point)
-
-    fields = [Transposed(random(F64, 3)) for _ in range(2)]
-    with pytest.raises(ValueError, match=r"Transposed\.tangent must be .* the opposite sign"):
-        cfjax.check_field(fields, random(F64, 3))
+def test_a_planted_mistake_is_named(subtests):
+    for mistake, (overrides, message) in MISTAKES.items():
+        fields = fields_of(type("Planted", (Line,), overrides))
+        with subtests.test(mistake=mistake), pytest.raises(ValueError, match=message):
+            cfjax.check_field(fields, POINT)
 
 
 # Mistakes that some fields show only.
@@ -267,19 +234,18 @@ class Turn(AbstractFrozenField):
         return jnp.array([-1.0, 1.0, 1.0]) * jnp.cross(self.w, point)
 
 
-@pytest.mark.parametrize(
-    "a, b, label",
-    [
+def test_a_flow_that_is_nan_for_some_fields_is_named():
+    for a, b, label in [
         ([0.3, 1.0, 0.2], [1.0, 0.2, -0.3], r"fields\[0\]"),
         ([1.0, 0.3, 0.2], [0.2, 1.0, -0.3], r"fields\[1\]"),
         ([1.0, 0.1, 0.2], [1.0, 0.5, -0.3], r"fields\[0\] - fields\[1\]"),
-    ],
-)
-def test_a_flow_that_is_nan_for_some_fields_is_named(a, b, label):
-    with pytest.raises(
-        ValueError, match=rf"Turn\.flow must be finite, but it is NaN for {label}\."
-    ):
-        cfjax.check_field([Turn(jnp.asarray(a)), Turn(jnp.asarray(b))], random(F64, 3))
+    ]:
+        message = rf"Turn\.flow must be finite, but it is NaN for {label}\."
+        with pytest.raises(ValueError, match=message):
+            cfjax.check_field([Turn(jnp.asarray(a)), Turn(jnp.asarray(b))], TURNED)
+
+
+TURNED = random(F64, 3)
 
 
 class Growth(AbstractFrozenField):
@@ -297,17 +263,14 @@ class ShortGrowth(Growth):
         return point * jnp.exp(jnp.where(jnp.abs(self.rate) > 1, jnp.nan, self.rate))
 
 
-@pytest.mark.parametrize(
-    "cls, message",
-    [
+def test_a_flow_that_is_wrong_for_some_signs_or_sizes_is_named():
+    rates = jnp.array([[0.4, 0.1], [0.3, 0.2]])
+    for cls, message in [
         (Growth, r"flow of -0\.4 of a field must lead back along that of the field, but"),
         (ShortGrowth, r"flow must be finite, but it is NaN for 4 fields\[0\]\."),
-    ],
-)
-def test_a_flow_that_is_wrong_for_some_signs_or_sizes_is_named(cls, message):
-    rates = jnp.array([[0.4, 0.1], [0.3, 0.2]])
-    with pytest.raises(ValueError, match=message):
-        cfjax.check_field([cls(rate) for rate in rates], POINT)
+    ]:
+        with pytest.raises(ValueError, match=message):
+            cfjax.check_field([cls(rate) for rate in rates], POINT)
 
 
 def test_a_stiff_field_may_overflow_backwards():
@@ -356,30 +319,25 @@ def test_an_annotated_acts_on_subtree_is_named():
             acts_on_subtree: bool = True  # pyright: ignore[reportIncompatibleVariableOverride]
 
 
-@pytest.mark.parametrize(
-    "fields, point, error, message",
-    [
-        (Line(POINT, POINT), POINT, TypeError, "fields must be a sequence of at least two"),
-        ([Line(POINT, POINT)], POINT, TypeError, "fields must be a sequence of at least two"),
+def test_wrong_arguments(no_shape_hook, subtests):
+    line, columns = Line(POINT, POINT), np.ones((3, 1))
+    for fields, point, error, message in [
+        (line, POINT, TypeError, "fields must be a sequence of at least two"),
+        ([line], POINT, TypeError, "fields must be a sequence of at least two"),
         ([POINT, POINT], POINT, TypeError, "fields must be frozen fields of one class, got Arr"),
+        ([line, cfjax.Rotation(np.ones(3))], POINT, TypeError, "of one class, got Line, Rotation"),
+        ([line] * 2, np.ones(2, int), TypeError, "point must be floating or comp"),
         (
-            [Line(POINT, POINT), cfjax.Rotation(np.ones(3))],
-            POINT,
-            TypeError,
-            "of one class, got Line, Rotation",
-        ),
-        ([Line(POINT, POINT)] * 2, np.ones(2, int), TypeError, "point must be floating or comp"),
-        (
-            [cfjax.BorderedSkew(np.ones((3, 1)))] * 2,
-            np.ones((3, 1)),
+            [cfjax.BorderedSkew(columns)] * 2,
+            columns,
             ValueError,
             "point must have orthonormal columns .*, and is off by 2",
         ),
-    ],
-)
-def test_wrong_arguments(no_shape_hook, fields, point, error, message):
-    with pytest.raises(error, match=message):
-        cfjax.check_field(fields, point)
+    ]:
+        with subtests.test(message=message), pytest.raises(error, match=message):
+            cfjax.check_field(fields, point)
+    with pytest.raises(TypeError, match=r"must be a diffrax\.MultiTerm"):
+        cfjax.check_terms(cfjax.LieTerm(drift), 0.0, BODY)
 
 
 # Splittings.
@@ -419,18 +377,16 @@ def test_terms_with_exact_flows_pass():
     cfjax.check_terms(sum_of(sphere, sphere), 0.0, BODY["q"] / jnp.linalg.norm(BODY["q"]))
 
 
-@pytest.mark.parametrize(
-    "fields, place",
-    [
+def test_terms_that_change_along_their_flow_are_named():
+    for fields, place in [
         ((kick, tumble(jnp.ones(3))), 1),
         ((lambda t, y, args: {"q": None, "p": -y["p"]}, drift), 0),
         # Both parts at once.
         ((lambda t, y, args: {"q": y["p"], "p": -y["q"]}, kick), 0),
-    ],
-)
-def test_terms_that_change_along_their_flow_are_named(fields, place):
-    with pytest.raises(ValueError, match=rf"terms\[{place}\] must not change along its own flow"):
-        cfjax.check_terms(sum_of(*fields), 0.0, BODY, 2.0)
+    ]:
+        message = rf"terms\[{place}\] must not change along its own flow"
+        with pytest.raises(ValueError, match=message):
+            cfjax.check_terms(sum_of(*fields), 0.0, BODY, 2.0)
 
 
 def test_a_small_array_that_changes_beside_a_large_one_that_moves():
@@ -439,8 +395,3 @@ def test_a_small_array_that_changes_beside_a_large_one_that_moves():
 
     with pytest.raises(ValueError, match=r"terms\[0\] must not change .* where it moves y\['p'\]"):
         cfjax.check_terms(sum_of(far, drift), 0.0, BODY, 2.0)
-
-
-def test_a_term_that_is_no_sum(no_shape_hook):
-    with pytest.raises(TypeError, match=r"must be a diffrax\.MultiTerm"):
-        cfjax.check_terms(cfjax.LieTerm(drift), 0.0, BODY)

@@ -98,6 +98,7 @@ def substitute(code, **values):
     return code
 
 
+@pytest.mark.slow
 def test_correlation_functions_move_any_operator():
     text = (ROOT / "docs" / "state" / "density.md").read_text()
     parts = [

@@ -30,25 +30,17 @@ def operations():
     return sum(isinstance(x, JaxprEqn) for x in gc.get_objects())
 
 
-def solve(solver):
+def solve(solver, is_equal=False):
     """A program of a new field."""
-    is_plain = isinstance(solver, diffrax.Tsit5)
 
     def field(t, y, args):
+        is_plain = isinstance(solver, diffrax.Tsit5)
         return jnp.cross(-y / args, y) if is_plain else cfjax.Rotation(-y / args)
 
-    term = diffrax.ODETerm(field) if is_plain else cfjax.LieTerm(field)
-    run = lambda a: diffrax.diffeqsolve(term, solver, 0.0, 1.0, 0.25, Y0, a).ys  # noqa: E731
-    return run
-
-
-def integrate(solver):
-    def field(t, y, args):
-        return cfjax.Rotation(-y / args)
-
     term = cfjax.LieTerm(field)
-    run = lambda a: cfjax.integrate(term, solver, 0.0, 1.0, Y0, a, num_steps=4).ys  # noqa: E731
-    return run
+    if is_equal:
+        return lambda a: cfjax.integrate(term, solver, 0.0, 1.0, Y0, a, num_steps=4).ys
+    return lambda a: diffrax.diffeqsolve(term, solver, 0.0, 1.0, 0.25, Y0, a).ys
 
 
 def gradient(run):
@@ -56,8 +48,8 @@ def gradient(run):
 
 
 PROGRAMS = {
-    "CF4, gradient": lambda: gradient(solve(cfjax.CF4())),
-    "CF4, equal steps, gradient": lambda: gradient(integrate(cfjax.CF4())),
+    "CF2, equal steps, gradient": lambda: gradient(solve(cfjax.CF2(), is_equal=True)),
+    "CF2, gradient": lambda: gradient(solve(cfjax.CF2())),
     "CF4, batch": lambda: solve(cfjax.CF4()),
     "Tsit5, gradient": lambda: gradient(solve(diffrax.Tsit5())),
 }

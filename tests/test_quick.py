@@ -32,10 +32,7 @@ FIELDS = {
     ),
     "PlanarMotion": (
         lambda t, y, args: cfjax.PlanarMotion(
-            omega=args[0] * y[2] + t,
-            v=args[1:] + y[2:],
-            frame="fixed",
-            layout="unit_complex_xy",
+            omega=args[0] * y[2] + t, v=args[1:] + y[2:], frame="fixed", layout="unit_complex_xy"
         ),
         np.array([0.6, 0.8, 0.3, -0.4]),
     ),
@@ -138,6 +135,7 @@ def test_no_field_is_left_out():
     assert fields - abstract == FIELDS.keys() - {"array"}
 
 
+@pytest.mark.slow
 def test_steps_that_are_controlled():
     """By diffrax, with output within the steps."""
     solution = diffrax.diffeqsolve(

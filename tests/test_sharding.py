@@ -66,9 +66,9 @@ def programs(some):
 
 
 @pytest.mark.parametrize("some", ["quick", pytest.param("all", marks=pytest.mark.slow)])
-@pytest.mark.parametrize("kind", meshes.KINDS)
-def test_a_batch_on_a_mesh_is_that_on_one_device(kind, some):
-    meshes.check(__file__, [name for name, *_ in programs(some)], kind, some)
+def test_a_batch_on_a_mesh_is_that_on_one_device(some):
+    names = [f"{name}, {kind}" for kind in meshes.KINDS for name, *_ in programs(some)]
+    meshes.check(__file__, names, "both", some)
 
 
 if __name__ == "__main__":

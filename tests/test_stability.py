@@ -66,18 +66,15 @@ def random_tableau():
 
 SOLVERS = [
     cfjax.LieEuler(),
-    cfjax.CF2(),
-    cfjax.CF3(),
     cfjax.CF4(),
-    cfjax.CG3(),
     cfjax.CG5(),
     cfjax.CommutatorFree(cfjax.third_order_b(0.9)),
     cfjax.CommutatorFree(random_tableau()),
 ]
 
 
-@pytest.mark.representatives(2)
-@pytest.mark.parametrize("solver", SOLVERS, ids=lambda s: type(s).__name__)
+@pytest.mark.representatives(1)
+@pytest.mark.parametrize("solver", SOLVERS[::-1], ids=lambda s: type(s).__name__)
 def test_the_tableau_says_what_a_real_step_does(solver):
     z, w = RNG.normal(size=(2, 200)) + 1j * RNG.normal(size=(2, 200))
     z[:2] = 0
@@ -89,26 +86,12 @@ def test_the_tableau_says_what_a_real_step_does(solver):
     np.testing.assert_allclose(found, expected, rtol=0, atol=1e-13 * scale)
 
 
-@pytest.mark.representatives(2)
-@pytest.mark.parametrize("solver", SOLVERS, ids=lambda s: type(s).__name__)
-def test_without_an_explicit_part_a_step_is_exact(solver):
+def test_without_an_explicit_part_a_step_is_exact():
     z = np.array([0, -1e-9, -1, -50, 3j, -2 + 5j])
-    found = cfjax.stability_function(solver.tableau, z, 0)
-    # At most 43 exponentials, whose exponents of up to 50 are off by a unit of rounding each.
-    np.testing.assert_allclose(found, np.exp(z), rtol=43 * 50 * 2.0**-52)
-
-
-@pytest.mark.slow
-def test_negative_rows_overflow_where_dissipation_is_strong():
-    """They go backwards in time: a Crouch-Grossman method meets exp(+|z|) on its way."""
-    z = -1e6
-    assert min(min(row) for row in cfjax.CG3.tableau.beta) < 0
-    for solver in (cfjax.CG3(), cfjax.CG5()):
-        assert not np.isfinite(cfjax.stability_function(solver.tableau, z, 1.0))
-        step = one_step(solver, jnp.full(1, z + 0j), jnp.full(1, 1 + 0j))
-        assert not np.isfinite(np.asarray(step)).any()
-    for solver in (cfjax.CF3(), cfjax.CF4()):
-        assert np.abs(cfjax.stability_function(solver.tableau, z, 1.0)) < 1e-5
+    for solver in SOLVERS:
+        found = cfjax.stability_function(solver.tableau, z, 0)
+        # At most 43 exponentials, whose exponents of up to 50 are off by a unit of rounding each.
+        np.testing.assert_allclose(found, np.exp(z), rtol=43 * 50 * 2.0**-52)
 
 
 def test_methods_with_flows_backwards_in_time_say_so():
@@ -141,34 +124,30 @@ def test_how_long_a_step_of_cf54_may_be(dtype, limit):
     assert np.isfinite(step(cfjax.CF43(), 100 * limit)).all()
 
 
-@pytest.mark.representatives(2)
-@pytest.mark.parametrize("solver, order", [(cfjax.CF3(), 3), (cfjax.CF4(), 4), (cfjax.CF2(), 2)])
-def test_without_an_exact_part_it_is_the_classical_polynomial(solver, order):
+def test_without_an_exact_part_it_is_the_classical_polynomial():
     """A method of as many stages as its order has the truncated series of the exponential."""
     w = 3 * (RNG.normal(size=50) + 1j * RNG.normal(size=50))
-    series = sum(w**k / float(mpmath.factorial(k)) for k in range(order + 1))
-    found = cfjax.stability_function(solver.tableau, 0, w)
-    np.testing.assert_allclose(found, series, rtol=1e-13)
+    for solver, order in [(cfjax.CF2(), 2), (cfjax.CF3(), 3), (cfjax.CF4(), 4)]:
+        series = sum(w**k / float(mpmath.factorial(k)) for k in range(order + 1))
+        found = cfjax.stability_function(solver.tableau, 0, w)
+        np.testing.assert_allclose(found, series, rtol=1e-13)
 
 
-@pytest.mark.representatives(2)
-@pytest.mark.parametrize(
-    "solver, direction, limit",
-    [
-        # Hairer & Wanner, Solving Ordinary Differential Equations II, Section IV.2.
+def test_known_intervals_of_stability():
+    """Hairer & Wanner, Solving Ordinary Differential Equations II, Section IV.2."""
+    for solver, direction, limit in [
         (cfjax.CF4(), -1, 2.785293563405282),
         (cfjax.CF4(), 1j, np.sqrt(8)),
         (cfjax.CF3(), -1, 2.512745326618329),
         (cfjax.CF3(), 1j, np.sqrt(3)),
-    ],
-)
-def test_known_intervals_of_stability(solver, direction, limit):
-    def growth(x):
-        return np.abs(cfjax.stability_function(solver.tableau, 0, direction * x))
+    ]:
 
-    inside = np.linspace(0, limit * (1 - 1e-9), 1000)
-    assert np.all(growth(inside) <= 1 + 1e-15)
-    assert np.all(growth(limit * np.array([1 + 1e-9, 1.01, 2])) > 1)
+        def growth(x, solver=solver, direction=direction):
+            return np.abs(cfjax.stability_function(solver.tableau, 0, direction * x))
+
+        inside = np.linspace(0, limit * (1 - 1e-9), 1000)
+        assert np.all(growth(inside) <= 1 + 1e-15)
+        assert np.all(growth(limit * np.array([1 + 1e-9, 1.01, 2])) > 1)
 
 
 def test_the_limit_is_that_of_many_steps():
@@ -179,12 +158,9 @@ def test_the_limit_is_that_of_many_steps():
     limit = w[np.flatnonzero(stable)[0]]
     # More than the 2.785 without an exact part: the flow damps what the explicit part excites.
     assert -25 < limit < -20
-    for factor, grows in ((0.99, False), (1.01, True)):
-        u = jnp.ones(1, complex)
-        for _ in range(20):
-            step = one_step(cfjax.CF4(), jnp.full(1, z + 0j), jnp.full(1, factor * limit + 0j))
-            u = u * step
-        assert (abs(u[0]) > 1) == grows
+    factors = np.array([0.99, 1.01])
+    step = one_step(cfjax.CF4(), jnp.full(2, z + 0j), jnp.asarray(factors * limit + 0j))
+    assert (np.abs(step) ** 20 > 1).tolist() == [False, True]
 
 
 def test_phi_at_small_and_large_arguments():
@@ -214,8 +190,10 @@ LENGTH = np.linalg.norm(rigid_body.y0)
 
 
 @pytest.mark.representatives(1)
-@pytest.mark.parametrize("solver", [cfjax.CF3(), cfjax.CF4(), cfjax.RKMK4()])
-@pytest.mark.parametrize("dtype", [np.float32, np.float64])
+@pytest.mark.parametrize(
+    "solver, dtype",
+    [(cfjax.CF3(), np.float32), (cfjax.RKMK4(), np.float32), (cfjax.CF4(), np.float64)],
+)
 def test_large_steps_stay_on_the_sphere(solver, dtype):
     """However large the angle, a rotation is one.
 
@@ -223,43 +201,13 @@ def test_large_steps_stay_on_the_sphere(solver, dtype):
     h = 100.
     """
     eps = np.finfo(dtype).eps
+    y0, args = START.astype(dtype), INERTIA.astype(dtype)
     for h in (0.5, 4.0, 100.0, 1e4)[: 3 if dtype is np.float32 else 4]:
-        sol = cfjax.integrate(
-            TERM,
-            solver,
-            0.0,
-            64 * h,
-            START.astype(dtype),
-            INERTIA.astype(dtype),
-            num_steps=64,
-            save_every=1,
-        )
-        length = np.linalg.norm(np.asarray(sol.ys, float), axis=1)
+        options = dict(num_steps=64, save_every=1)
+        ys = cfjax.integrate(TERM, solver, 0.0, 64 * h, y0, args, **options).ys
+        length = np.linalg.norm(np.asarray(ys, float), axis=1)
         # 64 steps of two flows, each with a few roundings: a random walk of 5 sqrt(128) halves.
         assert np.abs(length - LENGTH).max() < 5 * np.sqrt(128) * eps / 2
-
-
-@pytest.mark.representatives(1)
-@pytest.mark.parametrize("solver", [cfjax.CF3(), cfjax.CF4(), cfjax.RKMK4()])
-def test_the_error_of_large_steps_is_large_and_seen(solver):
-    """Beyond a rotation by one radian a step says nothing, and two step sizes disagree.
-
-    On the sphere no error exceeds twice its radius, so only a comparison can tell.
-    """
-
-    def solve(h, num_steps):
-        sol = cfjax.integrate(
-            TERM, solver, 0.0, h * num_steps, START, INERTIA, num_steps=num_steps, save_every=1
-        )
-        return np.asarray(sol.ys)
-
-    for h in (2.0, 4.0, 8.0, 16.0):
-        coarse, fine = solve(h, 16), solve(h / 2, 32)[1::2]
-        exact = rigid_body.reference(h * np.arange(1, 17))
-        error = np.linalg.norm(coarse - exact, axis=1).max()
-        assert 0.5 < error < 2 * LENGTH + 1e-12
-        seen = np.linalg.norm(coarse - fine, axis=1).max()
-        assert seen > error / 4
 
 
 @pytest.mark.slow
@@ -292,25 +240,6 @@ def test_a_huge_first_step_is_rejected():
 # Near-singular parameters of the third-order families
 
 
-@pytest.fixture(scope="module")
-def body_answer():
-    return problems.reference(
-        lambda t, y: problems.driven_body_ode(t, y, problems.INERTIA), 0.0, 1.0, problems.MOMENTUM
-    )
-
-
-def errors(tableau, answer, steps, dtype=np.float64):
-    return problems.errors(
-        problems.driven_body,
-        cfjax.CommutatorFree(tableau),
-        dtype(1.0),
-        dtype(problems.MOMENTUM),
-        dtype(problems.INERTIA),
-        answer,
-        steps,
-    )
-
-
 # At these the stages 2 and 3, or 1 and 3, come together, and the weights are a difference quotient.
 TOGETHER = [
     (cfjax.third_order_a, Fraction(1, 3), Fraction(1, 2)),
@@ -319,59 +248,33 @@ TOGETHER = [
 ]
 
 
-@pytest.mark.representatives(1)
-@pytest.mark.parametrize("family, singular, residue", TOGETHER)
-def test_weights_grow_and_the_error_constant_does_not(family, singular, residue):
-    constants = []
-    for k in (3, 4, 5, 6):
-        distance = Fraction(1, 10**k)
-        tableau = family(singular + distance)
-        assert cfjax.order(tableau) == 3
-        largest = max(abs(x) for row in tableau.beta for x in row)
-        # The weight is the residue over the distance, plus something bounded.
-        assert abs(largest * distance - residue) < 2 * distance
-        constants.append(cfjax.error_constant(tableau))
-    np.testing.assert_allclose(constants, constants[-1], rtol=2e-3)
+def test_weights_grow_and_the_error_constant_does_not():
+    for family, singular, residue in TOGETHER:
+        constants = []
+        for k in (3, 4, 5, 6):
+            distance = Fraction(1, 10**k)
+            tableau = family(singular + distance)
+            assert cfjax.order(tableau) == 3
+            largest = max(abs(x) for row in tableau.beta for x in row)
+            # The weight is the residue over the distance, plus something bounded.
+            assert abs(largest * distance - residue) < 2 * distance
+            constants.append(cfjax.error_constant(tableau))
+        np.testing.assert_allclose(constants, constants[-1], rtol=2e-3)
 
 
-@pytest.mark.slow
-@pytest.mark.parametrize("family, singular, residue", TOGETHER)
-def test_close_stages_magnify_rounding(family, singular, residue, body_answer):
-    """The floor is eps over the distance; above it the order is 3 and the error no larger."""
-    near, far = (float(singular) + d for d in (1e-4, 0.1))
-    found = errors(family(near), body_answer, [16, 32, 64])
-    assert abs(problems.slope([16, 32, 64], found) - 3) < 0.15
-    assert found[-1] < 2 * errors(family(far), body_answer, [64])[0]
-    distances = np.array([1e-4, 1e-5, 1e-6, 1e-7])
-    rounding = [
-        errors(family(float(singular) + d), body_answer, [24, 32, 40, 48], np.float32)
-        for d in distances
-    ]
-    floor = np.sqrt(np.mean(np.square(rounding), axis=1))
-    # A unit of rounding in each of n stage values, times h times the weight, as a random walk.
-    expected = 2.0**-24 * float(residue) / distances / np.sqrt(36)
-    assert np.all((floor / expected > 1 / 5) & (floor / expected < 5))
-
-
-@pytest.mark.representatives(1)
-@pytest.mark.parametrize("side", [-1, 1])
-def test_a_far_stage_makes_the_error_constant_grow(side, body_answer):
-    """At alpha = 1 of family B the second stage goes to infinity, and order 3 is late to come."""
-    constants = []
-    for k in (3, 4, 5):
-        distance = Fraction(1, 10**k)
-        tableau = cfjax.third_order_b(1 + side * distance)
-        assert cfjax.order(tableau) == 3
-        # c2 = 2 (3 alpha^2 - 3 alpha + 1) / (3 (1 - alpha)), whose residue is 2/3.
-        assert abs(abs(tableau.c[1]) * distance - Fraction(2, 3)) < 3 * distance
-        constants.append(cfjax.error_constant(tableau) * float(distance))
-    # b2 c2^3 is of size 1 / distance.
-    np.testing.assert_allclose(constants, constants[-1], rtol=0.01)
-
-    near = cfjax.third_order_b(1 + side * 1e-2)
-    coarse, fine = [16, 32, 64], [2048, 4096, 8192]
-    assert problems.slope(coarse, errors(near, body_answer, coarse)) < 2.6
-    assert abs(problems.slope(fine, errors(near, body_answer, fine)) - 3) < 0.15
+def test_a_far_stage_makes_the_error_constant_grow():
+    """At alpha = 1 of family B the second stage goes to infinity."""
+    for side in (-1, 1):
+        constants = []
+        for k in (3, 4, 5):
+            distance = Fraction(1, 10**k)
+            tableau = cfjax.third_order_b(1 + side * distance)
+            assert cfjax.order(tableau) == 3
+            # c2 = 2 (3 alpha^2 - 3 alpha + 1) / (3 (1 - alpha)), whose residue is 2/3.
+            assert abs(abs(tableau.c[1]) * distance - Fraction(2, 3)) < 3 * distance
+            constants.append(cfjax.error_constant(tableau) * float(distance))
+        # b2 c2^3 is of size 1 / distance.
+        np.testing.assert_allclose(constants, constants[-1], rtol=0.01)
 
 
 # float32
@@ -424,11 +327,12 @@ def growth(solver, h):
 
 
 LAMBDA = 0.1931833275037836  # Omelyan, Mryglod & Folk, doi:10.1016/S0010-4655(02)00754-3
+OMELYAN = (LAMBDA, 0.5 - LAMBDA, 0.5 - LAMBDA, LAMBDA)
 
 
 @pytest.mark.parametrize(
     "stages, quartic",
-    [((0.5, 0.5), 0.0), ((LAMBDA, 0.5 - LAMBDA, 0.5 - LAMBDA, LAMBDA), LAMBDA * (0.5 - LAMBDA))],
+    [((0.5, 0.5), 0.0), (OMELYAN, LAMBDA * (0.5 - LAMBDA))],
     ids=["Strang", "Omelyan2"],
 )
 def test_the_longest_step_of_an_oscillator(stages, quartic):
