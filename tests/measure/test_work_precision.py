@@ -309,18 +309,21 @@ def test_failures_have_reasons_and_other_runs_survive():
         "blow-up": (BLOW_UP, diffrax.HalfSolver(cfjax.CF4())),
         "check": (diffrax.ODETerm(checked), cfjax.CF4()),
         "stiff": (diffrax.ODETerm(lambda t, y, args: -1000 * y), cfjax.CF4()),
+        # To exp(460), whose square is no number.
+        "large": (diffrax.ODETerm(lambda t, y, args: 230 * y), cfjax.CF4()),
     }
     small = np.full(2, 1e-12)
     work = measure(DECAY, methods, small, jnp.ones(2), None, t1=2.0, num_steps=[200, 2000])
     # Stable for steps up to 2.785 / 1000; at 10 / 1000 each step grows by 291.
-    has_failed = [True] * 5 + [False]
+    has_failed = [True] * 5 + [False] + [True] * 2
     np.testing.assert_array_equal(np.isnan(work.error), has_failed)
     np.testing.assert_array_equal(np.isnan(work.seconds).all(axis=1), has_failed)
     assert work.error[5] < 1e-10 and np.isfinite(work.seconds[5]).all()
-    assert work.note[2:] == 2 * ("no field after one half",) + (work.note[0], "")
+    assert work.note[2:6] == 2 * ("no field after one half",) + (work.note[0], "")
+    assert work.note[6:] == 2 * ("The error is not finite.",)
     assert "Nonfinite" in work.note[0] and "Nonfinite" in work.note[1]
-    np.testing.assert_array_equal(work.num_steps, [200, 2000] * 3)
-    np.testing.assert_array_equal(work.num_evaluations[2:], [800, 8000] * 2)
+    np.testing.assert_array_equal(work.num_steps, [200, 2000] * 4)
+    np.testing.assert_array_equal(work.num_evaluations[2:], [800, 8000] * 3)
     assert "Nonfinite" in rendered(work.table())
     work.plot()
 

@@ -717,6 +717,14 @@ def test_bases():
             np.testing.assert_allclose(a @ b - b @ a, c)
 
 
+def test_terms_of_equal_bases_share_a_program():
+    so3 = algebra_basis("so", 3)
+    term, same, other = (VariationTerm(LieTerm(attitude), basis=x) for x in (so3, so3 + 0, -so3))
+    structure, of_same, of_other = map(jax.tree.structure, (term, same, other))
+    assert structure == of_same != of_other
+    assert hash(structure) == hash(of_same)
+
+
 # Errors
 
 
