@@ -18,7 +18,7 @@ import time
 import traceback
 import warnings
 from collections import Counter
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -498,7 +498,10 @@ class Maker(string.Formatter):
     def get_value(self, key, args, kwargs):
         if key not in self.fields:
             method = getattr(self, f"_{key}", None)
-            value = method() if method else self._pick(PICKS[key])
+            if key in DRAWN:
+                value = self.rng.choice(DRAWN[key])
+            else:
+                value = method() if method else self._pick(PICKS[key])
             if key not in ONCE:
                 return value
             self.fields[key] = value
@@ -544,9 +547,9 @@ class Maker(string.Formatter):
         shape = tuple(np.shape(x))
         if choice < 0.35:
             fits = [v for v in self.values if np.shape(v.x) == shape or np.shape(v.x) == ()]
-            return str(rng.choice(fits)) if fits else self._number()
+            return str(rng.choice(fits)) if fits else self.rng.choice(DRAWN["number"])
         if choice < 0.5:
-            return self._number()
+            return self.rng.choice(DRAWN["number"])
         if choice < 0.8:
             sides = [shape, shape[-1:], (), (*shape[:-1], 1), (1, *shape[1:])]
             return self._parameter(rng.choice(sides) if shape else (), self.dtype)
@@ -581,15 +584,6 @@ class Maker(string.Formatter):
             x += ".real"
         return f"({x} {self.rng.choice(['>', '>=', '==', '<'])} {self.rng.choice([0, 1, -0.5])})"
 
-    def _number(self) -> str:
-        return self.rng.choice("0 1 2 -1 3 0.5 -2.0 1.5 0.3 0.0 7.0".split())
-
-    def _small(self) -> int:
-        return self.rng.choice([0, 1, 2, 3, -1, -2])
-
-    def _zero_or_one(self) -> int:
-        return self.rng.randint(0, 1)
-
     def _axis(self) -> int:
         n = np.ndim(self.x)
         if not n:
@@ -597,9 +591,6 @@ class Maker(string.Formatter):
         return self.rng.randrange(n)
 
     _another = _axis
-
-    def _shift(self) -> int:
-        return self.rng.randint(-3, 3)
 
     def _length(self, axis: int) -> int:
         shape = np.shape(self.x)
@@ -626,16 +617,19 @@ class Maker(string.Formatter):
             return f"p[{len(self.parameters) - 1}]"
         return f"np.array({indices})"
 
+    def _few(self, one: Callable[[], int]) -> str:
+        return self._indices([one() for _ in range(self.rng.randint(1, 3))])
+
     def _index_array(self) -> str:
-        n = self._length(0)
-        return self._indices([self.rng.randrange(-n, n) for _ in range(self.rng.randint(1, 3))])
+        self._length(0)
+        return self._few(self._at)
 
     def _last_array(self) -> str:
-        n = self._length(-1)
-        return self._indices([self.rng.randrange(-n, n) for _ in range(self.rng.randint(1, 3))])
+        self._length(-1)
+        return self._few(self._last_at)
 
     def _far_array(self) -> str:
-        return self._indices([self._far() for _ in range(self.rng.randint(1, 3))])
+        return self._few(self._far)
 
     def _index_array_of_x(self) -> str:
         if not np.ndim(self.x):
@@ -720,22 +714,6 @@ class Maker(string.Formatter):
                 for _ in np.shape(self.x)
             ]
         )
-
-    def _pad_mode(self) -> str:
-        return self.rng.choice(
-            "edge reflect symmetric wrap mean maximum minimum median linear_ramp empty".split()
-        )
-
-    def _mode(self) -> str:
-        return self.rng.choice(["fill", "clip", "drop"])
-
-    _gather_mode = _mode
-
-    def _take_mode(self) -> str:
-        return self.rng.choice(["fill", "clip", "wrap"])
-
-    def _float_type(self) -> str:
-        return self.rng.choice(["float32", "float64"])
 
     def _square(self) -> str:
         shape = np.shape(self.x)
@@ -869,6 +847,19 @@ PICKS: dict[str, Callable[[Any], bool]] = {
     "i": _of_kind("iu"),
     "v": lambda x: x.ndim == 1 and 0 < x.size <= 20,
     "s": _of_kind("fc", 0),
+}
+DRAWN: dict[str, Sequence[Any]] = {
+    "number": "0 1 2 -1 3 0.5 -2.0 1.5 0.3 0.0 7.0".split(),
+    "small": [0, 1, 2, 3, -1, -2],
+    "zero_or_one": range(2),
+    "shift": range(-3, 4),
+    "pad_mode": (
+        "edge reflect symmetric wrap mean maximum minimum median linear_ramp empty".split()
+    ),
+    "mode": ["fill", "clip", "drop"],
+    "gather_mode": ["fill", "clip", "drop"],
+    "take_mode": ["fill", "clip", "wrap"],
+    "float_type": ["float32", "float64"],
 }
 # Drawn once a line.
 ONCE = frozenset(["x", "f", "r", "i", "v", "m", "s", "axis"])

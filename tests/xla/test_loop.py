@@ -83,18 +83,26 @@ def close(found, want, case):
     assert jtu.tree_structure(found) == jtu.tree_structure(want)
 
 
-@pytest.mark.representatives(6)
-@pytest.mark.parametrize("case", CASES.values(), ids=CASES.keys())
-def test_values(case):
-    want = jax.jit(plain)(*case)
-    found = jax.jit(looped)(*case)
-    close(found, want, case)
+def check(transform, names):
+    """The same of both, all in one program."""
+    cases = {name: CASES[name] for name in names}
+
+    def all_of(run, cases):
+        return {name: transform(run)(*case) for name, case in cases.items()}
+
+    want, found = jax.jit(lambda cases: [all_of(run, cases) for run in (plain, looped)])(cases)
     assert jtu.tree_map(lambda x: x.dtype, found) == jtu.tree_map(lambda x: x.dtype, want)
+    for name, case in cases.items():
+        close(found[name], want[name], case)
 
 
-@pytest.mark.parametrize("case", ["parts", "matrix", "no short vector"])
-def test_a_number_of_steps_that_is_traced(case):
-    case = CASES[case]
+def test_values():
+    check(lambda run: run, CASES)
+
+
+@pytest.mark.parametrize("name", ["parts", "no short vector"])
+def test_a_number_of_steps_that_is_traced(name):
+    case = CASES[name]
 
     @jax.jit
     def several(case, num_steps):
@@ -106,43 +114,43 @@ def test_a_number_of_steps_that_is_traced(case):
     close(several(case, jnp.asarray(0)), case[0], case)
 
 
-TRANSFORMS = {
-    "reverse": jax.grad,
-    "forward": lambda f: lambda x, rest: jax.jvp(lambda x: f(x, rest), (x,), (x,)),
-    "both": lambda f: lambda x, rest: jax.jvp(lambda x: jax.grad(f)(x, rest), (x,), (x,)),
-}
-DERIVATIVES = [
-    *((case, "reverse") for case in CASES),
-    *((case, "forward") for case in ("vector and parameters", "parts", "real and complex")),
-    *((case, "both") for case in ("vector and parameters", "parts")),
-]
+def forward_over_reverse(f):
+    return lambda x, rest: jax.jvp(lambda x: jax.grad(f)(x, rest), (x,), (x,))
 
 
-@pytest.mark.representatives(1)
-@pytest.mark.parametrize("case, transform", DERIVATIVES)
-def test_derivatives(case, transform):
-    case, transform = CASES[case], TRANSFORMS[transform]
-    x, rest = eqx.partition(case, eqx.is_inexact_array)
-    want, found = (jax.jit(transform(scalar(run)))(x, rest) for run in (plain, looped))
-    close(found, want, case)
+@pytest.mark.parametrize(
+    "transform, names",
+    [
+        (forward_over_reverse, ("vector and parameters", "parts")),
+        pytest.param(jax.grad, CASES, marks=pytest.mark.slow),
+    ],
+    ids=["forward over reverse", "reverse"],
+)
+def test_derivatives(transform, names):
+    check(
+        lambda run: (
+            lambda *case: transform(scalar(run))(*eqx.partition(case, eqx.is_inexact_array))
+        ),
+        names,
+    )
 
 
 @pytest.mark.representatives(1)
 @pytest.mark.parametrize("axes", [(0, None), (None, 0)], ids=["carry", "parameters"])
-@pytest.mark.parametrize("order", ["grad in vmap", "vmap in grad", "none"])
-def test_a_batch(axes, order):
+def test_a_batch(axes):
+    """Of values, of gradients, and the gradient of a batch."""
+
     def batched(run):
-        if order == "grad in vmap":
-            return jax.vmap(jax.grad(lambda c, p: scalar(run)((c, p), (c, p)), (0, 1)), axes)
         many = jax.vmap(run, axes)
-        if order == "none":
-            return many
-        return jax.grad(lambda c, p: scalar(many)((c, p), (c, p)), (0, 1))
+        each = jax.vmap(jax.grad(lambda c, p: scalar(run)((c, p), (c, p)), (0, 1)), axes)
+        whole = jax.grad(lambda c, p: scalar(many)((c, p), (c, p)), (0, 1))
+        return lambda *case: [f(*case) for f in (many, each, whole)]
 
     vectors = jnp.stack([VECTOR, VECTOR * 2])
     case = (vectors, (VECTOR, VECTOR[0])) if axes[0] == 0 else (VECTOR, (vectors, vectors[:, 0]))
-    want, found = (jax.jit(batched(run))(*case) for run in (plain, looped))
-    close(found, want, case)
+    want, found = jax.jit(lambda *case: [batched(run)(*case) for run in (plain, looped)])(*case)
+    for a, b in zip(found, want, strict=True):
+        close(a, b, case)
 
 
 def test_only_what_is_differentiated():
