@@ -251,7 +251,8 @@ def main() -> int:
     options = parser.parse_args()
     matrix = options.matrix and KillMatrix(options.matrix, ROOT, options.seed)
     drawn, killed = draw(options.places, options.count, options.seed), []
-    ignored = shutil.ignore_patterns(".*", "figures", "site", "__pycache__", "*.egg-info")
+    made = ".git .venv* .*_cache .hypothesis .coverage* figures site __pycache__ *.egg-info"
+    ignored = shutil.ignore_patterns(*made.split())
     number_at_once = os.cpu_count() or 1
     with tempfile.TemporaryDirectory() as folder, ExitStack() as stack:
         pool = ThreadPoolExecutor(number_at_once)
