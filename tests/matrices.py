@@ -2,7 +2,10 @@
 
 import math
 from fractions import Fraction
+from typing import Any
 
+import jax
+import jax.numpy as jnp
 import mpmath
 import numpy as np
 import scipy.linalg
@@ -133,3 +136,23 @@ def inverse_derivative_of_exp(a, basis, b):
     columns = [scipy.linalg.expm_frechet(a, e, compute_expm=False) for e in basis]
     right = b @ scipy.linalg.expm(a)
     return np.linalg.lstsq(np.stack(columns, -1).reshape(-1, len(basis)), right.ravel())[0]
+
+
+def motions(module: Any, v: Any, states: Any, places: Any, other: Any) -> Any:
+    """Of angular velocities, with the velocity v, by one program: the velocity and the increment of
+    states in frames, the bracket with another motion, and the inverse derivative.
+    """
+
+    @jax.jit
+    @jax.vmap
+    def everything(w):
+        found = []
+        for x, frame in states:
+            x = jnp.asarray(x)
+            velocity = module.tangent(w, jnp.asarray(v), x, frame, places)
+            increment = module.increment(w, jnp.asarray(v), x, frame, places, False)
+            found.append((velocity, increment))
+        both = w, jnp.asarray(v), *map(jnp.asarray, other)
+        return found, module.bracket(*both), module.dexpinv(*both)
+
+    return everything

@@ -4,7 +4,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import scipy.linalg
-from matrices import inverse_derivative_of_exp
+from matrices import inverse_derivative_of_exp, motions
 
 from cfjax._numerics import planar_motion
 
@@ -14,6 +14,8 @@ POSE = np.array([[0.6, -0.8, 1.5], [0.8, 0.6, -0.3], [0.0, 0.0, 1.0]])
 PLACES, VECTOR = (2, 3, 0, 1), np.array([1.5, -0.3, 0.6, 0.8])
 OTHER = 0.9, np.array([0.3, -0.6])
 ANGLES = [0.0, 1e-9, 0.5, 2.0, 6.0]
+STATES = [(x, f) for f in ("body", "fixed") for x in (POSE, VECTOR)] + [(POINT, "fixed")]
+everything = motions(planar_motion, V, STATES, PLACES, OTHER)
 
 
 def screw(w, v):
@@ -22,20 +24,6 @@ def screw(w, v):
 
 def as_vector(pose):
     return np.array([*pose[:2, 2], *pose[:2, 0]])
-
-
-@jax.jit
-@jax.vmap
-def everything(w):
-    """Velocity and increment of each kind of state, the bracket and the inverse derivative."""
-    v, found = jnp.asarray(V), []
-    kinds = [(x, f) for f in ("body", "fixed") for x in (POSE, VECTOR)] + [(POINT, "fixed")]
-    for x, frame in kinds:
-        x = jnp.asarray(x)
-        velocity = planar_motion.tangent(w, v, x, frame, PLACES)
-        found.append((velocity, planar_motion.increment(w, v, x, frame, PLACES, False)))
-    motions = w, v, *map(jnp.asarray, OTHER)
-    return found, planar_motion.bracket(*motions), planar_motion.dexpinv(*motions)
 
 
 def test_motions_are_those_of_the_exponential():

@@ -1,10 +1,9 @@
 """Motion of points and poses in space, against SciPy's exponential of 4 x 4 matrices."""
 
 import jax
-import jax.numpy as jnp
 import numpy as np
 import scipy.linalg
-from matrices import inverse_derivative_of_exp
+from matrices import inverse_derivative_of_exp, motions
 from scipy.spatial.transform import Rotation
 
 from cfjax._numerics import rigid_motion
@@ -18,26 +17,14 @@ POSE[:3] = np.column_stack([TURN.as_matrix(), [1.5, -0.3, 0.8]])
 PLACES, VECTOR = (6, 3, 4, 5, 0, 1, 2), np.concatenate([POSE[:3, 3], TURN.as_quat()])
 OTHER = np.array([0.9, 0.1, -0.4]), np.array([0.3, -0.6, 0.2])
 ANGLES = [0.0, 1e-9, 0.5, 2.0, 6.0]
+STATES = [(x, f) for f in ("body", "fixed") for x in (POSE, VECTOR)] + [(POINT, "fixed")]
+everything = motions(rigid_motion, V, STATES, PLACES, OTHER)
 
 
 def screw(w, v):
     a = np.zeros((4, 4))
     a[:3] = np.column_stack([np.cross(w, np.eye(3)).T, v])
     return a
-
-
-@jax.jit
-@jax.vmap
-def everything(w):
-    """Velocity and increment of each kind of state, the bracket and the inverse derivative."""
-    v, found = jnp.asarray(V), []
-    kinds = [(x, f) for f in ("body", "fixed") for x in (POSE, VECTOR)] + [(POINT, "fixed")]
-    for x, frame in kinds:
-        x = jnp.asarray(x)
-        velocity = rigid_motion.tangent(w, v, x, frame, PLACES)
-        found.append((velocity, rigid_motion.increment(w, v, x, frame, PLACES, False)))
-    motions = w, v, *map(jnp.asarray, OTHER)
-    return found, rigid_motion.bracket(*motions), rigid_motion.dexpinv(*motions)
 
 
 def as_pose(vector):
