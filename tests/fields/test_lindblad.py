@@ -513,7 +513,12 @@ def test_derivatives_by_times_of_output():
         velocities = [field(t, y, None).tangent(y) for t, y in zip(ts, ys, strict=True)]
         return jnp.sum(w * ys).real, jnp.stack(velocities)
 
-    found, velocities = jax.jit(jax.grad(value, has_aux=True))(jnp.asarray([0.23, 0.61]))
+    compiled = jax.jit(jax.value_and_grad(value, has_aux=True))
+    ts, along = jnp.asarray([0.23, 0.61]), jnp.asarray([1.0, 0.3])
+    (_, velocities), found = compiled(ts)
+    # Times within one step, where the extension is smooth.
+    want = central_difference(lambda ts: compiled(ts)[0][0], ts, along, 1e-3)
+    assert inner(found, along) == pytest.approx(float(want), rel=1e-9)
     # Up to the slope of the error of the continuous extension, of the order of the method less one.
     np.testing.assert_allclose(found, np.sum(w * velocities, axis=(1, 2)).real, rtol=0, atol=1e-5)
 

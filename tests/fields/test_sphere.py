@@ -110,8 +110,7 @@ def test_in_space_it_is_the_rotation(shape, solver):
     y0 = unit(*shape)
     found, expected = (one_step(solver, of_shape(field, shape), y0) for field in (sphere, rotation))
     # The same field, whose coordinates are rounded in another order.
-    atol = 2e-12 if isinstance(solver, cfjax.YRK135) else 2e-14
-    np.testing.assert_allclose(found, expected, rtol=0, atol=atol)
+    np.testing.assert_allclose(found, expected, rtol=0, atol=2e-14)
 
 
 @pytest.mark.parametrize(("n", "num_steps"), [(3, 100_000), (5, 10_000)])
