@@ -27,11 +27,18 @@ def solver_of(name, estimate="group"):
     return type(PAIRS[name])(estimate=estimate)
 
 
-def solve(solver, field, y0, t1, atol, args=None, dt0=0.01, t0=0.0, **kwargs):
-    kwargs.setdefault("stepsize_controller", diffrax.PIDController(rtol=0.0, atol=atol))
-    return diffrax.diffeqsolve(
-        cfjax.LieTerm(field), solver, t0, t1, dt0, y0, args, max_steps=100_000, **kwargs
-    )
+def solve_with(solver, field, y0, t1):
+    """A program of the tolerance, the first step and the parameters of the field."""
+
+    @jax.jit
+    def solve(atol, dt0, args):
+        return diffrax.diffeqsolve(
+            *(cfjax.LieTerm(field), solver, 0.0, t1, dt0, jnp.asarray(y0), args),
+            stepsize_controller=diffrax.PIDController(rtol=0.0, atol=atol),
+            max_steps=100_000,
+        )
+
+    return lambda atol, args=None, dt0=0.01: solve(*problems.arrays((atol, dt0, args)))
 
 
 # The estimate
@@ -43,9 +50,8 @@ def test_an_estimate_of_no_kind_is_an_error(no_shape_hook):
 
 
 def test_without_an_estimate_error_control_is_refused():
-    for name in ("CF3", "CF4"):
-        with pytest.raises(RuntimeError, match="error estimate"):
-            solve(solver_of(name, None), problems.rigid_body, Y0, 1.0, 1e-3, INERTIA)
+    with pytest.raises(RuntimeError, match="error estimate"):
+        solve_with(solver_of("CF4", None), problems.rigid_body, Y0, 1.0)(1e-3, INERTIA)
 
 
 # Problems on which a bad estimate is blind. Answers: closed form, and SciPy.
@@ -70,14 +76,13 @@ def landau_zener_answer():
 @pytest.mark.representatives(1)
 @pairs
 def test_the_group_estimate_sees_an_error_of_commutators_alone(name, landau_zener_answer):
-    y0, args = jnp.asarray(ON_SPHERE), jnp.asarray(LANDAU_ZENER)
+    solve = solve_with(PAIRS[name], landau_zener, ON_SPHERE, 2.0)
     for atol in (1e-4, 1e-7):
-        sol = solve(PAIRS[name], landau_zener, y0, 2.0, jnp.asarray(atol), args)
-        error = np.linalg.norm(sol.ys[-1] - landau_zener_answer)
+        error = np.linalg.norm(solve(atol, LANDAU_ZENER).ys[-1] - landau_zener_answer)
         assert 1e-4 * atol < error < 30 * atol
 
 
-@pytest.mark.representatives(1)
+@pytest.mark.slow
 @pytest.mark.parametrize("name", ["CF3", "CF2", "CF4", "CF54"])
 def test_the_estimate_in_the_algebra_is_blind_to_commutators_alone(name, landau_zener_answer):
     y0, args = jnp.asarray(ON_SPHERE), jnp.asarray(LANDAU_ZENER)
@@ -96,7 +101,7 @@ def test_the_estimate_in_the_algebra_is_blind_to_commutators_alone(name, landau_
         # Rounding of coefficients up to 1.3 times a field of size 3.
         assert blind < 1e-15 * 30
         # So no error stops the steps from growing.
-        sol = solve(solver_of(name, "algebra"), landau_zener, y0, 2.0, 1e-7, args)
+        sol = solve_with(solver_of(name, "algebra"), landau_zener, y0, 2.0)(1e-7, args)
         assert np.linalg.norm(sol.ys[-1] - landau_zener_answer) > 1e-5
 
 
@@ -108,46 +113,23 @@ def test_a_weak_dependence_on_the_state_hides_no_error(estimate):
     def field(t, y, rate):
         return 3 * jnp.cos(5 * t) - rate * y
 
+    solve = solve_with(solver_of("CF4", estimate), field, [0.5], 2.0)
     for rate in (0.0, 1e-6, 1e-4, 1e-2):
         driven = lambda t: 3 * (rate * np.cos(5 * t) + 5 * np.sin(5 * t)) / (25 + rate**2)  # noqa: B023, E731
         exact = (0.5 - driven(0.0)) * np.exp(-2 * rate) + driven(2.0)
-        sol = solve(
-            solver_of("CF4", estimate),
-            field,
-            *(jnp.asarray([0.5]), 2.0, jnp.asarray(1e-6), jnp.asarray(rate)),
-        )
+        sol = solve(1e-6, rate)
         # Some 40 steps of at most the tolerance each, of either sign. A blind estimate let 4 to 20
         # steps pass, with up to 360 000 times the tolerance.
         assert abs(float(sol.ys[-1, 0]) - exact) < 10 * 1e-6
         assert sol.stats["num_accepted_steps"] > 30
 
 
-@pytest.mark.slow
-def test_the_estimate_of_cf4_where_the_field_does_not_depend_on_part_of_the_state():
-    """CF4's embedded method differs by f(y1) only: no help where the field sees no state."""
-
-    def field(t, y, args):
-        return {"driven": cfjax.Rotation(jnp.stack([t, jnp.cos(t), t * t])), "free": -y["free"]}
-
-    y0 = {"driven": jnp.eye(3), "free": jnp.ones(2)}
-
-    def ode(t, y):
-        w = np.array([t, np.cos(t), t * t])
-        return np.cross(w, y.reshape(3, 3).T).T.ravel()
-
-    exact = problems.reference(ode, 0.0, 2.0, np.eye(3).ravel()).reshape(3, 3)
-    for atol in (1e-3, 1e-6):
-        sol = solve(cfjax.CF4(), field, y0, 2.0, jnp.asarray(atol))
-        assert np.linalg.norm(sol.ys["driven"][-1] - exact) < 10 * atol
-        assert np.linalg.norm(sol.ys["free"][-1] - np.exp(-2.0)) < 10 * atol
-
-
-# First same as last
+# Error control, and first same as last
 
 
 @pytest.mark.representatives(1)
-@pytest.mark.parametrize("name", ["CF4", "CF54", "CF3"])
-def test_evaluations_with_accepted_and_rejected_steps(name):
+@pytest.mark.parametrize("name", ["CF4", "CF3", "CF43", "CF54"])
+def test_error_per_tolerance_is_steady(name):
     """A method that is first same as last evaluates once at the start, and never twice there."""
     calls = []
 
@@ -155,64 +137,40 @@ def test_evaluations_with_accepted_and_rejected_steps(name):
         jax.debug.callback(lambda: calls.append(None))
         return problems.driven_body(t, y, args)
 
+    def check_evaluations(sol):
+        jax.effects_barrier()
+        row, num_steps = METHODS[name], int(sol.stats["num_steps"])
+        assert len(calls) == row.first + row.evaluations * num_steps
+        calls.clear()
+
+    ode = lambda t, y: problems.driven_body_ode(t, y, problems.INERTIA)  # noqa: E731
+    answer = problems.reference(ode, 0.0, 5.0, problems.MOMENTUM)
+    solve, ratios = solve_with(PAIRS[name], field, Y0, 5.0), []
+    for atol in [1e-4, 1e-6, 1e-8, 1e-10][: 2 if name == "CF3" else 4]:
+        sol = solve(atol, INERTIA)
+        check_evaluations(sol)
+        ratios.append(np.linalg.norm(sol.ys[-1] - answer) / atol)
+    assert max(ratios) < 10 * min(ratios)
+    assert max(ratios) < 20
     # The first step is far too long, so some are rejected.
-    sol = solve(PAIRS[name], field, Y0, 2.0, 1e-6, INERTIA, dt0=1.0)
-    jax.effects_barrier()
+    sol = solve(1e-6, INERTIA, dt0=1.0)
     assert sol.stats["num_rejected_steps"] > 0
-    row, num_steps = METHODS[name], int(sol.stats["num_steps"])
-    assert len(calls) == row.first + row.evaluations * num_steps
-
-
-@pytest.mark.slow
-@pytest.mark.parametrize("name", ["CF3", "CF4", "CF54"])
-def test_steps_over_a_jump(name):
-    """The field changes at t = 0.7: what was evaluated before says nothing of after."""
-    jump = 0.7
-
-    def field(t, y, args):
-        drive = jnp.where(t < jump, 1.0, -2.0) * jnp.asarray([0.3, 1.0, 0.2])
-        return cfjax.Rotation(drive - y / args)
-
-    def ode(sign):
-        return lambda t, y: np.cross(sign * np.array([0.3, 1.0, 0.2]) - y / problems.INERTIA, y)
-
-    middle = problems.reference(ode(1.0), 0.0, jump, problems.MOMENTUM)
-    exact = problems.reference(ode(-2.0), jump, 2.0, middle)
-    inner = diffrax.PIDController(rtol=0.0, atol=1e-9)
-    controller = diffrax.ClipStepSizeController(inner, jump_ts=jnp.asarray([jump]))
-    sol = solve(PAIRS[name], field, Y0, 2.0, 1e-9, INERTIA, stepsize_controller=controller)
-    assert np.linalg.norm(sol.ys[-1] - exact) < 1e-7
-    # With the jump known it is no harder than without one.
-    assert sol.stats["num_rejected_steps"] <= 5
+    check_evaluations(sol)
 
 
 def test_a_kept_evaluation_is_discarded_after_a_jump():
     solver, term = cfjax.CF4(), cfjax.LieTerm(problems.driven_body)
-    times = jnp.asarray(0.0), jnp.asarray(0.1)
-    fresh = solver.init(term, *times, Y0, INERTIA)
-    stale = eqx.tree_at(lambda state: state.first.omega, fresh, replace_fn=lambda x: x + 1)
 
-    @eqx.filter_jit
-    def step(state, made_jump):
-        return solver.step(term, *times, Y0, INERTIA, state, made_jump=made_jump)[0]
+    @jax.jit
+    def ends(y0, jump):
+        times = jnp.asarray(0.0), jnp.asarray(0.1)
+        fresh = solver.init(term, *times, y0, INERTIA)
+        stale = eqx.tree_at(lambda state: state.first.omega, fresh, replace_fn=lambda x: x + 1)
+        return [
+            solver.step(term, *times, y0, INERTIA, state, made_jump=made_jump)[0]
+            for state, made_jump in ((fresh, False), (stale, False), (stale, True), (stale, jump))
+        ]
 
-    right = step(fresh, False)
-    assert np.linalg.norm(step(stale, False) - right) > 1e-3
-    for jump in (True, jnp.asarray(True)):
-        np.testing.assert_allclose(step(stale, jump), right, rtol=0, atol=1e-15)
-
-
-# Error control
-
-
-@pytest.mark.representatives(1)
-@pytest.mark.parametrize("name", ["CF4", "CF3", "CF43", "CF54"])
-def test_error_per_tolerance_is_steady(name):
-    ode = lambda t, y: problems.driven_body_ode(t, y, problems.INERTIA)  # noqa: E731
-    answer = problems.reference(ode, 0.0, 5.0, problems.MOMENTUM)
-    ratios = []
-    for atol in [1e-4, 1e-6, 1e-8, 1e-10][: 2 if name == "CF3" else 4]:
-        sol = solve(PAIRS[name], problems.driven_body, Y0, 5.0, jnp.asarray(atol), INERTIA)
-        ratios.append(np.linalg.norm(sol.ys[-1] - answer) / atol)
-    assert max(ratios) < 10 * min(ratios)
-    assert max(ratios) < 20
+    right, wrong, *found = ends(Y0, True)
+    assert np.linalg.norm(wrong - right) > 1e-3
+    problems.assert_close(found, [right, right], 1e-15)
