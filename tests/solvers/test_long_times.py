@@ -17,8 +17,7 @@ import numpy as np
 import problems
 import pytest
 from scipy.linalg import expm
-from scipy.spatial.transform import Rotation
-from scipy.special import ellipj, ellipk
+from scipy.special import ellipj
 
 import cfjax
 
@@ -129,72 +128,6 @@ def test_the_error_of_a_method_that_is_not_symplectic_grows_as_the_square():
     assert 3.8 < growth(runs, off_body)[1] < 4.2
 
 
-# Lagrange's top: inertia 1, 1 and I3, and a potential that is the height of a point of its axis.
-
-I3, TILT, SPIN = 0.4, 0.8, np.array([0.0, 0.4, 1.0])
-TILTED = np.array(
-    [[1, 0, 0], [0, np.cos(TILT), -np.sin(TILT)], [0, np.sin(TILT), np.cos(TILT)]], dtype=float
-)
-ATTITUDE = np.array([np.cos(TILT / 2), np.sin(TILT / 2), 0.0, 0.0])
-VERTICAL = (TILTED @ SPIN)[2]
-
-
-def turn(w, frame) -> Any:
-    return cfjax.QuaternionRotation(w, frame=frame, layout="wxyz")
-
-
-def frame_of(q):
-    return cfjax.quaternion_to_matrix(q, layout="wxyz")
-
-
-def nutation(t):
-    """The height of the axis, between two roots of a cubic: Goldstein, Mechanics, section 5.7."""
-    energy, start = SPIN[1] ** 2 + 2 * np.cos(TILT), np.cos(TILT)
-    # u'^2 = (1 - u^2) (energy - 2 u) - (vertical - m3 u)^2.
-    m3 = SPIN[2]
-    cubic = [2, -energy - m3**2, 2 * m3 * VERTICAL - 2, energy - VERTICAL**2]
-    low, high, other = np.sort(np.roots(cubic).real)
-    # The start is the higher of its turning points.
-    np.testing.assert_allclose(high, start, rtol=1e-14)
-    rate, parameter = np.sqrt((other - low) / 2), (high - low) / (other - low)
-    return low + (high - low) * ellipj(rate * t + ellipk(parameter), parameter)[0] ** 2
-
-
-def kick_in_space(t, y, args):
-    a = frame_of(y["q"])[:, 2]
-    return {"q": None, "m": jnp.stack([-a[1], a[0], jnp.zeros_like(a[0])])}
-
-
-def spherical(t, y, args):
-    return {"q": turn(y["m"], "fixed"), "m": None}
-
-
-def axial(t, y, args):
-    m3 = jnp.dot(frame_of(y["q"])[:, 2], y["m"])
-    return {"q": turn((1 / I3 - 1) * m3 * np.array([0.0, 0.0, 1.0]), "body"), "m": None}
-
-
-SYMMETRIC_TOP = all_terms(kick_in_space, spherical, axial)
-
-
-def test_the_nutation_of_a_symmetric_top():
-    start = {"q": ATTITUDE, "m": TILTED @ SPIN}
-    # 200 nutations.
-    runs = twice(SYMMETRIC_TOP, cfjax.BlanesMoan4(), 1000.0, start, 5000, 2)
-    frames = [Rotation.from_quat(np.roll(ys["q"], -1, axis=1)).as_matrix() for _, ys in runs]
-    assert_linear(
-        [(ts, frame) for (ts, _), frame in zip(runs, frames, strict=True)],
-        lambda ts, frames: np.abs(frames[:, 2, 2] - nutation(ts)),
-        4,
-    )
-    # No flow moves the vertical momentum, and each keeps the momentum about the axis.
-    m = runs[0][1]["m"]
-    np.testing.assert_array_equal(m[:, 2], VERTICAL)
-    # 30 000 kicks, each with a rounding or two of numbers of size one: a random walk of 4e-14.
-    about_axis = np.sum(frames[0][:, :, 2] * m, axis=1)
-    np.testing.assert_allclose(about_axis, SPIN[2], rtol=0, atol=2e-13)
-
-
 # Kovalevskaya's top, in the body's frame: inertia 1, 1, 1/2, and g is the upward direction, with a
 # potential g1. With z = m1 + i m2 and c = g1 + i g2, (z^2 - 2 c)' = -2 i m3 (z^2 - 2 c).
 
@@ -248,62 +181,6 @@ def test_both_invariants_of_kovalevskaya_stay_in_a_band(solver, order, step):
     slopes = np.log2(bands[0] / bands[1])
     # The next terms are smaller by the square of the step; a maximum has 3 per cent of scatter.
     assert np.all((order - 0.15 < slopes) & (slopes < order + 0.15))
-
-
-# Links of SU(3) with the action -(beta / 3) sum Re tr and the kinetic energy -tr P^2, so that
-# U' = P U and P' = -(beta / 6) (the traceless skew-Hermitian part of U times its staple).
-
-BETA = 6.0
-
-
-def dagger(u):
-    return u.conj().swapaxes(-1, -2)
-
-
-def skew(m):
-    m = (m - dagger(m)) / 2
-    trace = m[..., 0, 0] + m[..., 1, 1] + m[..., 2, 2]
-    xp = jnp if isinstance(m, jax.Array) else np
-    return m - trace[..., None, None] / 3 * xp.broadcast_to(np.eye(3, dtype=complex), m.shape)
-
-
-def drift(t, y, args):
-    return {"U": cfjax.LeftMatrix(y["P"]), "P": None}
-
-
-@pytest.mark.parametrize(
-    "name, order, num_steps",
-    [
-        ("nystrom", 6, 800),
-        pytest.param("minimum_norm", 2, 2000, marks=pytest.mark.slow),
-    ],
-)
-def test_pendulums_in_a_torus(name, order, num_steps):
-    """Single links U = exp(i phi H) with the action of U itself: phi'' = -(beta / 6) sin phi."""
-    rng = np.random.default_rng(1)
-    basis = np.linalg.qr(rng.normal(size=(3, 3)) + 1j * rng.normal(size=(3, 3)))[0]
-    # The last one starts close to the top.
-    modulus = np.sin(np.array([0.5, 1.5, 2.8]) / 2)
-
-    def links(t):
-        cd = np.divide(*ellipj(np.sqrt(BETA / 6) * t[:, None], modulus**2)[1:3])
-        phi = 2 * np.arcsin(modulus * cd)
-        phases = np.exp(1j * phi[..., None] * np.array([1, -1, 0]))
-        return np.einsum("ik,...k,jk->...ij", basis, phases, basis.conj())
-
-    def off(ts, ys):
-        return np.abs(ys["U"] - links(ts)).max(axis=(1, 2, 3))
-
-    term = all_terms(lambda t, y, args: {"U": None, "P": -BETA / 6 * skew(y["U"])}, drift)
-    start = {"U": links(np.zeros(1))[0], "P": np.zeros((3, 3, 3), complex)}
-    # 16 periods of the slowest.
-    runs = twice(term, of_the_page(name), 200.0, start, num_steps)
-    assert_linear(runs, off, order)
-    # To rounding of some thousand exponentials, at random.
-    squares = dagger(runs[0][1]["U"]) @ runs[0][1]["U"]
-    np.testing.assert_allclose(
-        squares, np.broadcast_to(np.eye(3), squares.shape), rtol=0, atol=1e-13
-    )
 
 
 # One step of an oscillator, q' = p and p' = -q, as a product of matrices of the published numbers.
@@ -409,6 +286,26 @@ def test_a_step_has_each_published_digit(subtests):
 
 
 # Hybrid Monte Carlo: a periodic lattice of 4 x 4 plaquettes, with shape (chains, 2, 4, 4, 3, 3).
+# Its links in SU(3) have the action -(beta / 3) sum Re tr of plaquettes and the kinetic energy
+# -tr P^2, so that U' = P U and P' = -(beta / 6) (the traceless skew-Hermitian part of U times its
+# staple).
+
+BETA = 6.0
+
+
+def dagger(u):
+    return u.conj().swapaxes(-1, -2)
+
+
+def skew(m):
+    m = (m - dagger(m)) / 2
+    trace = m[..., 0, 0] + m[..., 1, 1] + m[..., 2, 2]
+    xp = jnp if isinstance(m, jax.Array) else np
+    return m - trace[..., None, None] / 3 * xp.broadcast_to(np.eye(3, dtype=complex), m.shape)
+
+
+def drift(t, y, args):
+    return {"U": cfjax.LeftMatrix(y["P"]), "P": None}
 
 
 def staples(u):

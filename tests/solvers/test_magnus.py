@@ -1,4 +1,4 @@
-"""Commutator-free Magnus methods on every algebra; fields that depend on y are refused."""
+"""Commutator-free Magnus methods: steps, orders, derivatives, error control and cost."""
 
 import functools
 
@@ -80,38 +80,23 @@ def product(rows, values, y):
     return y
 
 
-# Flows one by one, and in a loop.
-@pytest.mark.parametrize(
-    "name, shape",
-    [
-        ("Magnus2", (3,)),
-        ("Magnus4", (3,)),
-        ("Magnus4Lobatto", (3, 3)),
-        ("Magnus6", (3, 3)),
-        *(pytest.param(x, (3, 3), marks=pytest.mark.slow) for x in ("Magnus8", "Magnus10")),
-    ],
-)
-def test_one_step_in_numpy(name, shape):
-    """With its estimate and output within it, for complex matrices."""
+def omega(xp, t):
+    return xp.stack([xp.ones_like(t), xp.cos(t), xp.sin(3 * t)])
+
+
+def check_step(name, field, parts, y0, run):
+    """With its estimate and output within it; the field is the matrix `omega @ parts`."""
     solver, (t, h), theta = MAGNUS[name], (0.3, 0.25), 0.6
-    rng = np.random.default_rng(0)
-    parts = rng.normal(size=(3, 3, 3)) + 1j * rng.normal(size=(3, 3, 3))
-    y0 = rng.normal(size=shape) + 1j * rng.normal(size=shape)
 
-    def generator(xp, t):
-        return parts[0] + xp.cos(t) * parts[1] + xp.sin(3 * t) * parts[2]
-
-    @jax.jit
     def step(y0):
-        field = cfjax.LieTerm(lambda t, y, _: cfjax.LeftMatrix(generator(jnp, t) + 0j))
         times = jnp.asarray(t), jnp.asarray(t + h)
-        end, error, info, *_ = problems.first_step(solver, field, *times, y0, None)
+        end, error, info, *_ = problems.first_step(solver, cfjax.LieTerm(field), *times, y0, None)
         path = solver.interpolation_cls(t0=times[0], t1=times[1], **info)
         return end, error, path.evaluate(t + theta * h)
 
     tableau = solver.tableau
-    values = [h * generator(np, t + c * h) for c in tableau.nodes]
-    found, error, within = step(jnp.asarray(y0))
+    values = [h * np.tensordot(omega(np, t + c * h), parts, 1) for c in tableau.nodes]
+    found, error, within = run(step, jnp.asarray(y0))
     expected = product(tableau.rows, values, y0)
     # Up to 16 exponentials of a few roundings each.
     np.testing.assert_allclose(found, expected, rtol=0, atol=2e-14)
@@ -127,38 +112,22 @@ def test_one_step_in_numpy(name, shape):
         assert error is None
 
 
-# Every algebra
+def test_a_step_of_every_method_in_numpy(subtests):
+    parts = np.stack([hat(axis) for axis in np.eye(3)])
+    field = lambda t, y, args: cfjax.Rotation(omega(jnp, t))  # noqa: E731
+    for name in MAGNUS:
+        with subtests.test(name=name), cfjax.rewriting(False):
+            check_step(name, field, parts, B, problems.op_by_op)
 
 
-def wave(t, shape, phase=0.0):
-    numbers = jnp.asarray(np.arange(1.0, np.prod(shape) + 1).reshape(shape))
-    return jnp.sin(numbers * t / numbers.size + numbers + phase)
-
-
-def several(t, y, args):
-    spectrum, alpha = -jnp.arange(1.0, 4.0), 1.0 + 0.5 * jnp.sin(t)
-    return {
-        "frame": cfjax.Rotation(wave(t, (3,))),
-        "vector": wave(t, (2,)),
-        "pose": cfjax.RigidMotion(
-            omega=wave(t, (3,)), v=wave(t, (3,), 1.0), frame="body", layout="wxyz_xyz"
-        ),
-        "heat": cfjax.Affine(wave(t, (3,)), spectrum, cfjax.SineTransform(), alpha=alpha),
-        "points": cfjax.Rotation(wave(t, (2, 3))),
-    }
-
-
-def test_a_product_with_every_kind_of_part():
-    """As `CF4` takes it, which takes five flows instead of two. Only roundings differ."""
-    start = np.array([0.6, 0.0, 0.8])
-    pose = np.array([0.6, 0.0, 0.8, 0.0, 0.3, -0.4, 0.5])
-    y0 = {"frame": np.eye(3), "vector": np.ones(2), "pose": pose, "heat": start}
-    y0 = problems.arrays(y0 | {"points": np.stack([start, start[::-1]])})
-    ends = (
-        cfjax.integrate(cfjax.LieTerm(several), solver, 0.0, 1.0, y0, num_steps=2).ys
-        for solver in (cfjax.CF4(), MAGNUS["Magnus4Lobatto"])
-    )
-    problems.assert_close(*ends, 1e-14)
+def test_a_step_of_complex_matrices_in_numpy():
+    """Its flows are a loop."""
+    rng = np.random.default_rng(0)
+    parts = rng.normal(size=(3, 3, 3)) + 1j * rng.normal(size=(3, 3, 3))
+    y0 = rng.normal(size=(3, 3)) + 1j * rng.normal(size=(3, 3))
+    field = lambda t, y, _: cfjax.LeftMatrix(jnp.tensordot(omega(jnp, t) + 0j, parts, 1))  # noqa: E731
+    run = lambda step, y0: jax.jit(step, compiler_options=problems.QUICK)(y0)  # noqa: E731
+    check_step("Magnus6", field, parts, y0, run)
 
 
 # Derivatives
@@ -174,7 +143,8 @@ def test_derivatives_in_a_batch():
             return cfjax.Rotation(scale * turning(t, args))
 
         term, y0 = cfjax.LieTerm(field), jnp.asarray(FRAME)
-        return cfjax.integrate(term, MAGNUS["Magnus6"], 0.0, 2.0, y0, x, num_steps=20).ys[-1]
+        solver = MAGNUS["Magnus4Lobatto"]
+        return cfjax.integrate(term, solver, 0.0, 2.0, y0, x, num_steps=400).ys[-1]
 
     def derivatives(x, direction):
         gradient = jax.grad(lambda x: jnp.sum(end(x) * weights))(x)
@@ -189,14 +159,14 @@ def test_derivatives_in_a_batch():
         return batch(jax.tree.map(pair, x, at_zero), jax.tree.map(pair, direction, direction_there))
 
     ys, tangents, gradients = both(x)
-    # Steps of a tenth: an error of 1e-6 times that to the power of 6, with rates up to 2.
+    # Steps of 1/200: an error of that to the power of 4, with rates up to 2, over 2^4 5!.
     np.testing.assert_allclose(ys, [exact_matrix(2.0) @ FRAME, FRAME], rtol=0, atol=1e-9)
     quotient = problems.central_difference(lambda x: both(x)[0][0], x, direction, 1e-3)
     # 1e-12 times a fifth derivative, and rounding over 1e-3.
     np.testing.assert_allclose(tangents[0], quotient, rtol=0, atol=2e-11)
     rate = np.array([np.sin(NU * 2), 1 - np.cos(NU * 2)]) / NU
     integral = [B[0] * rate[0] - B[1] * rate[1], B[0] * rate[1] + B[1] * rate[0], 2 * B[2]]
-    # Quadrature of order 8.
+    # Quadrature of order 4: at most twice the step of 1/200, to this power, over 2880.
     np.testing.assert_allclose(tangents[1], hat(integral) @ FRAME, rtol=0, atol=1e-9)
     for k, v in enumerate((direction, direction_there)):
         found = problems.inner(jax.tree.map(lambda g: g[k], gradients), v)  # noqa: B023
@@ -208,7 +178,7 @@ def test_derivatives_in_a_batch():
 
 
 @pytest.mark.parametrize(
-    "name", ["Magnus6", *(pytest.param(x, marks=pytest.mark.slow) for x in ("Magnus4", "Magnus8"))]
+    "name", ["Magnus4", *(pytest.param(x, marks=pytest.mark.slow) for x in ("Magnus6", "Magnus8"))]
 )
 def test_controlled_steps(name):
     solver, term, args = MAGNUS[name], cfjax.LieTerm(rotation), problems.arrays(ARGS)
@@ -216,15 +186,13 @@ def test_controlled_steps(name):
 
     @jax.jit
     def solve(atol, dt0):
-        start = cfjax.starting_step(term, solver, 0.0, 6.0, y0, args, atol=atol)
-        dt0 = jnp.where(dt0 > 0, dt0, start)
         controller = diffrax.PIDController(rtol=0.0, atol=atol)
         return diffrax.diffeqsolve(
             term, solver, 0.0, 6.0, dt0, y0, args, stepsize_controller=controller
         )
 
     tolerances = np.array([1e-5, 1e-7])
-    solutions = [solve(*map(jnp.asarray, (atol, 0.0))) for atol in tolerances]
+    solutions = [solve(*map(jnp.asarray, (atol, 0.02))) for atol in tolerances]
     # A step that is rejected leaves what the next one starts with.
     rejected = solve(*map(jnp.asarray, (1e-7, 6.0)))
     assert rejected.stats["num_rejected_steps"] > 0
@@ -260,22 +228,6 @@ def test_the_estimate_sees_the_error_of_every_kind_of_field(subtests):
             with subtests.test(case=(kind, name)):
                 off = np.linalg.norm(end - exact)
                 assert np.linalg.norm(end - other) > max(off, 1e-9)
-
-
-@pytest.mark.slow
-def test_step_doubling():
-    sol = diffrax.diffeqsolve(
-        cfjax.LieTerm(rotation),
-        cfjax.Richardson(cfjax.Magnus4()),
-        0.0,
-        3.0,
-        0.3,
-        jnp.asarray(FRAME),
-        problems.arrays(ARGS),
-        stepsize_controller=diffrax.PIDController(rtol=0.0, atol=1e-6),
-    )
-    # As its docstring says.
-    np.testing.assert_allclose(sol.ys[-1], exact_matrix(3.0) @ FRAME, rtol=0, atol=6e-6)
 
 
 # Cost

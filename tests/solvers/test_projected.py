@@ -12,7 +12,7 @@ import problems
 import pytest
 import scipy.linalg
 from matrix_checks import product
-from matrix_problems import BOTH, PROBLEMS, Problem, skew
+from matrix_problems import PROBLEMS, Problem, skew
 from scipy.linalg import expm
 
 import cfjax
@@ -20,7 +20,7 @@ import cfjax
 PROJECTED: Any = {"coordinates": "projected"}
 RKMK5, RKMK8 = cfjax.RKMK5(**PROJECTED), cfjax.RKMK8(**PROJECTED)
 # Programs with one stage for all compile faster, and so do those of few stages.
-SHORT = cfjax.RKMK(diffrax.Bosh3.tableau, **PROJECTED)
+SHORT = cfjax.RKMK(diffrax.Heun.tableau, **PROJECTED)
 ROLLED = {
     "RKMK5": cfjax.RKMK5(**PROJECTED, unroll=False),
     "RKMK8": cfjax.RKMK8(**PROJECTED, unroll=False),
@@ -33,17 +33,16 @@ def some(*names):
     return {name: PROBLEMS[name] for name in names}
 
 
-OTHERS = some("orthonormal columns, low rank", "bordered", "Toda", "conjugation", "Riccati")
-MATRICES = {name: x for name, x in PROBLEMS.items() if name not in OTHERS}
+# Each class of fields and of coordinates.
+FEW = some("SU(3)", "columns", "rows", "orthonormal columns, low rank", "Toda", "Riccati")
 
 
 @pytest.mark.parametrize(
     "given, name",
     [
-        pytest.param(MATRICES, "RKMK5", id="matrices-RKMK5"),
-        pytest.param(OTHERS, "RKMK8", id="others-RKMK8"),
-        pytest.param(MATRICES, "RKMK8", id="matrices-RKMK8", marks=pytest.mark.slow),
-        pytest.param(OTHERS, "RKMK5", id="others-RKMK5", marks=pytest.mark.slow),
+        pytest.param(FEW, "RKMK5", id="few-RKMK5"),
+        pytest.param(PROBLEMS, "RKMK5", id="all-RKMK5", marks=pytest.mark.slow),
+        pytest.param(PROBLEMS, "RKMK8", id="all-RKMK8", marks=pytest.mark.slow),
     ],
 )
 def test_order_and_manifold_against_exact_answers(given, name, subtests):
@@ -57,14 +56,14 @@ def spinning(t, y, args):
     return cfjax.LeftMatrix(jnp.cos(t) * b + jnp.sin(2 * t) * y @ c @ y.T)
 
 
-@pytest.mark.parametrize("num_steps", [10_000, pytest.param(100_000, marks=pytest.mark.slow)])
-def test_many_steps_stay_on_the_manifold(num_steps, subtests):
+@pytest.mark.slow
+def test_many_steps_stay_on_the_manifold(subtests):
     fields = {
         "SO(5)": (spinning, np.eye(5), (skew(5), skew(5))),
         "columns": (spinning, matrix_problems.COLUMNS, (skew(6), skew(3) / 3)),
     }
     given = {name: Problem(*x, exact=None) for name, x in fields.items()}
-    matrix_checks.check_many_steps(subtests, ROLLED["RKMK5"], given, num_steps, is_relative=True)
+    matrix_checks.check_many_steps(subtests, ROLLED["RKMK5"], given, 100_000, is_relative=True)
 
 
 def test_columns_that_start_off_by_rounding_become_orthonormal():
@@ -78,19 +77,8 @@ def test_columns_that_start_off_by_rounding_become_orthonormal():
 # One step against formulas written by hand
 
 
-def one_step(given, solver):
-    """The end and the estimate of a step of any size."""
-    y0, args = problems.arrays((given.y0, given.args))
-
-    @jax.jit
-    def step(h):
-        return problems.first_step(solver, given.term, jnp.asarray(0.0), h, y0, args)[:2]
-
-    return step
-
-
 def by_hand(problem, tableau, h):
-    """The end of the step in plain space, its estimate, and the stages' velocities."""
+    """The end of the step in plain space, and its estimate."""
     rates = []
     for c, row in zip((0.0, *tableau.c), ((), *tableau.a_lower), strict=True):
         y = problem.y0 + sum((a * k for a, k in zip(row, rates, strict=True)), 0 * problem.y0)
@@ -101,66 +89,59 @@ def by_hand(problem, tableau, h):
     return problem.y0 + sum(x for x, _ in weighted), sum(x for _, x in weighted)
 
 
-def test_one_step_is_the_unitary_matrix_nearest_to_that_of_plain_space():
-    """With the estimate of plain space."""
+def test_one_step_and_its_estimates():
+    """The unitary matrix nearest to the end in plain space, with the estimate from there.
+
+    Where matrices act from both sides, the estimate is by an element d of the algebra, which moves
+    the end by `d y + y d^H`. Between the ends of both methods is the same but for products of d and
+    the element of the step, whose norm is at most 1.5 times the length of the step.
+    """
     # Not first same as last: there the last velocity is that at the projected end.
-    given, tableau, h = some("SU(3)", "SO(5)"), diffrax.Dopri8.tableau, 0.7
-    ends, errors = one_step(product(given), cfjax.RKMK(tableau, **PROJECTED))(jnp.asarray(h))
-    for name, flow in given.items():
-        plain, estimate = by_hand(flow, tableau, h)
+    given, tableau = some("SU(3)", "Riccati"), diffrax.Heun.tableau
+    flows = product(given)
+    y0, args = problems.arrays((flows.y0, flows.args))
+
+    @jax.jit
+    def step(h):
+        by_algebra, by_ends = (
+            problems.first_step(solver, flows.term, jnp.asarray(0.0), h, y0, args)[:2]
+            for solver in (SHORT, cfjax.RKMK(tableau, **PROJECTED, estimate="group"))
+        )
+        return *by_algebra, by_ends[1]["Riccati"]
+
+    for h in (0.2, 0.1):
+        ends, errors, by_ends = step(jnp.asarray(h))
+        plain, estimate = by_hand(given["SU(3)"], tableau, h)
         nearest, _ = scipy.linalg.polar(plain)
         assert np.abs(plain - nearest).max() > 1e-9
         # Stages of a few rounded products.
-        np.testing.assert_allclose(ends[name], nearest, rtol=0, atol=2e-14)
-        np.testing.assert_allclose(errors[name], estimate, rtol=0, atol=2e-14)
-
-
-def test_the_estimate_of_a_flow_from_both_sides_is_of_its_end():
-    """By an element d of the algebra, which moves the end by `d y + y d^H`.
-
-    Between the ends of both methods is the same but for products of d and the element of the step,
-    whose norm is at most 1.5 times the length of the step.
-    """
-    group = cfjax.RKMK8(**PROJECTED, unroll=False, estimate="group")
-    steps = [one_step(PROBLEMS["Riccati"], x) for x in (ROLLED["RKMK8"], group)]
-    for h in (0.2, 0.1):
-        by_algebra, by_ends = (step(jnp.asarray(h))[1] for step in steps)
-        assert np.linalg.norm(by_algebra - by_ends) < 1.5 * h * np.linalg.norm(by_ends)
-
-
-def test_control_keeps_to_its_tolerance():
-    y0, args = problems.arrays((BOTH.y0, BOTH.args))
-
-    @jax.jit
-    def end(tolerance):
-        control = diffrax.PIDController(rtol=0.0, atol=tolerance)
-        options: Any = {"stepsize_controller": control}
-        sol = diffrax.diffeqsolve(BOTH.term, RKMK5, 0.0, 2.0, 0.05, y0, args, **options)
-        return jax.tree_util.tree_map(lambda y: y[-1], sol.ys)
-
-    exact, tolerances = problems.flat(BOTH.exact(2.0)), (1e-5, 1e-7, 1e-9)
-    off = [np.abs(problems.flat(end(x)) - exact).max() / x for x in tolerances]
-    # The estimate is of a step, and errors of steps add up.
-    assert max(off) < 10
-    assert min(off) > 1e-3
+        np.testing.assert_allclose(ends["SU(3)"], nearest, rtol=0, atol=2e-14)
+        np.testing.assert_allclose(errors["SU(3)"], estimate, rtol=0, atol=2e-14)
+        off = np.linalg.norm(errors["Riccati"] - by_ends)
+        assert off < 1.5 * h * np.linalg.norm(by_ends)
 
 
 # Output within steps, derivatives, batches, precision
 
 
 @pytest.mark.parametrize(
-    "names, name, steps",
+    "solver, steps",
     [
-        (("SO(5)", "Toda"), "RKMK8", (4, 8)),
-        pytest.param(("SO(5)", "bordered"), "RKMK5", (10, 20), marks=pytest.mark.slow),
+        (cfjax.RKMK(diffrax.Bosh3.tableau, **PROJECTED), (10, 20)),
+        pytest.param(ROLLED["RKMK8"], (4, 8), marks=pytest.mark.slow),
     ],
+    ids=["Bosh3", "RKMK8"],
 )
-def test_output_within_steps(names, name, steps, subtests):
-    matrix_checks.check_output(subtests, ROLLED[name], some(*names), steps)
+def test_output_within_steps(solver, steps, subtests):
+    matrix_checks.check_output(subtests, solver, some("SO(5)", "Toda"), steps)
+
+
+# Constant steps compute no estimate.
+CONSTANT = cfjax.RKMK(diffrax.Heun.tableau, **PROJECTED, estimate=None)
 
 
 def test_derivatives_are_those_of_difference_quotients():
-    matrix_checks.check_derivatives(SHORT, some("columns", "Toda"), 2e-11)
+    matrix_checks.check_derivatives(CONSTANT, some("columns", "Toda"), 2e-11)
 
 
 @pytest.mark.parametrize(
@@ -174,7 +155,7 @@ def test_derivatives_are_those_of_difference_quotients():
     ],
 )
 def test_vmap_and_leading_axes_are_single_solves(names):
-    matrix_checks.check_batches(SHORT, some(*names))
+    matrix_checks.check_batches(CONSTANT, some(*names))
 
 
 def test_single_precision():
@@ -195,32 +176,35 @@ def test_more_columns_than_rows_are_refused():
 
 
 def test_a_matrix_that_is_not_skew_is_an_error(subtests):
-    """But for rounding."""
+    """But for rounding. From the start, within the first step, or in the last stage of all alone;
+    also one of two elements.
+    """
     a, unit = skew(3), np.eye(3)
     spoilt = np.zeros((3, 3))
     spoilt[0, 0] = 1.0
     fields = {"left": cfjax.LeftMatrix, "right": cfjax.RightMatrix, "batch": cfjax.LeftMatrix}
     y0 = problems.arrays({"left": unit, "right": unit, "batch": np.stack([unit] * 2)})
-    good = {"left": a, "right": a, "batch": np.stack([a] * 2)}
-    term = cfjax.LieTerm(lambda t, y, args: {x: cls(args[x]) for x, cls in fields.items()})
+    skews = {"left": a, "right": a, "batch": np.stack([a] * 2)}
+    none = {name: 0 * x for name, x in skews.items()}
 
-    def end(args):
-        args = problems.arrays(args)
-        return cfjax.integrate(term, ROLLED["RKMK8"], 0.0, 1.0, y0, args, num_steps=10).ys
+    def field(t, y, args):
+        more, since = args
+        # The projection alone would bring the end back.
+        return {x: cls(skews[x] + jnp.where(t > since, more[x], 0)) for x, cls in fields.items()}
 
-    ends = end({name: x + 1e-14 * spoilt for name, x in good.items()})
-    for found in (ends["left"][-1], ends["right"][-1], *ends["batch"][-1]):
-        np.testing.assert_allclose(found, expm(a + 1e-14 * spoilt), rtol=0, atol=1e-12)
-    bad = good | {"left": a + 1e-9 * spoilt}
-    others = {"right": a + 1e-9 * spoilt, "batch": np.stack([a, a + 1e-9 * spoilt])}
-    for name, args in {"left": bad, **{x: good | {x: y} for x, y in others.items()}}.items():
-        with subtests.test(name=name), pytest.raises(RuntimeError, match="skew-Hermitian"):
-            end(args)
-    control = diffrax.PIDController(rtol=0.0, atol=1e-5)
-    with pytest.raises(RuntimeError, match="skew-Hermitian"):
-        diffrax.diffeqsolve(
-            *(term, SHORT, 0.0, 1.0, 0.1, y0, problems.arrays(bad)), stepsize_controller=control
-        )
+    def end(more, since):
+        args = problems.arrays((none | more, since))
+        return cfjax.integrate(cfjax.LieTerm(field), SHORT, 0.0, 1.0, y0, args, num_steps=2).ys
+
+    rounding = {name: x + 1e-14 * spoilt for name, x in none.items()}
+    problems.assert_close(end(rounding, -1.0), end({}, -1.0), 1e-12)
+    cases = {"left": 1e-9 * spoilt, "right": 1e-9 * spoilt, "batch": none["batch"].copy()}
+    cases["batch"][1] = 1e-9 * spoilt
+    for name, more in cases.items():
+        for since in (-1.0, 0.1, 0.999):
+            match = "skew-Hermitian" if since < 0 else matrix_checks.FAILS
+            with subtests.test(case=(name, since)), pytest.raises(RuntimeError, match=match):
+                end({name: more}, since)
 
 
 def test_a_matrix_of_nan_fails_alone():
@@ -230,18 +214,16 @@ def test_a_matrix_of_nan_fails_alone():
     @jax.jit
     @jax.vmap
     def solve(a):
-        sol = diffrax.diffeqsolve(term, SHORT, 0.0, 1.0, 0.1, y0, a, throw=False)
+        sol = cfjax.integrate(term, SHORT, 0.0, 1.0, y0, a, num_steps=50, throw=False)
         return sol.ys[-1], sol.result == diffrax.RESULTS.successful
 
     good = skew(3)
     bad = good * np.array([[1, np.nan, 1], [1, 1, 1], [1, 1, 1]])
     ys, are_successful = solve(np.stack([good, bad]))
     np.testing.assert_array_equal(are_successful, [True, False])
-    # Ten steps of order 3, of angles of 0.1.
+    # Steps of order 2, of angles of 0.02: the square over 6.
     np.testing.assert_allclose(ys[0], expm(good), rtol=0, atol=1e-4)
     assert np.isnan(ys[1]).all()
-    with pytest.raises(RuntimeError, match="without bound, or the steps"):
-        cfjax.integrate(term, SHORT, 0.0, 1.0, y0, jnp.asarray(bad), num_steps=2)
 
 
 def test_columns_without_full_rank_are_an_error(subtests):
@@ -253,22 +235,7 @@ def test_columns_without_full_rank_are_an_error(subtests):
                 cfjax.integrate(term, SHORT, 0.0, 1.0, y0, num_steps=2)
 
 
-def test_a_matrix_that_is_not_skew_later_is_an_error(subtests):
-    """From within the first step on, or in the last stage of all alone; one of two elements."""
-    a, y0 = jnp.asarray(skew(3)), jnp.stack([jnp.eye(3)] * 2)
-
-    def field(t, y, since):
-        # The projection alone would bring the end back.
-        later = jnp.where(t > since, 1e-9, 0.0)
-        return cfjax.LeftMatrix(jnp.stack([a, a.at[0, 0].add(later)]))
-
-    term = cfjax.LieTerm(field)
-    for since in (0.3, 0.999):
-        with subtests.test(since=str(since)):
-            with pytest.raises(RuntimeError, match=matrix_checks.FAILS):
-                cfjax.integrate(term, RKMK5, 0.0, 1.0, y0, since, num_steps=4)
-
-
+@pytest.mark.slow
 def test_output_of_a_matrix_that_is_not_skew_is_nan():
     """The last of the stages for output alone has no other after it that would show it."""
     a, time = jnp.asarray(skew(3)), RKMK8._extension.times[-1]
@@ -288,23 +255,11 @@ def test_output_of_a_matrix_that_is_not_skew_is_nan():
     assert np.isnan(output(time)).all()
 
 
-@pytest.mark.slow
-def test_control_does_not_pass_a_matrix_that_is_not_skew():
-    a = jnp.asarray(skew(3))
-    term = cfjax.LieTerm(
-        lambda t, y, args: cfjax.LeftMatrix(a.at[0, 0].add(jnp.maximum(t - 0.3, 0.0)))
-    )
-    control = diffrax.PIDController(rtol=0.0, atol=1e-5)
-    options: Any = {"stepsize_controller": control, "max_steps": 99}
-    with pytest.raises(RuntimeError):
-        diffrax.diffeqsolve(term, RKMK5, 0.0, 1.0, 0.1, jnp.eye(3), **options)
-
-
 def test_a_step_that_is_too_long_fails_and_is_taken_again(subtests):
     """Nearly half a turn for an element in Cayley's coordinates; of columns, an end too far off."""
     cases: Any = {"Congruence": (cfjax.Congruence, np.array(3.0))}
     cases["LeftMatrix"] = cfjax.LeftMatrix, np.array(4.0)
-    matrix_checks.check_steps_that_are_too_long(subtests, RKMK5, cases)
+    matrix_checks.check_steps_that_are_too_long(subtests, ROLLED["RKMK5"], cases)
 
 
 @pytest.mark.slow

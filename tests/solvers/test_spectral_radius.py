@@ -93,7 +93,7 @@ def test_spectral_radius_without_x64():
     term = cfjax.LieTerm(lambda t, y, args: -jnp.arange(1, 5, dtype=y.dtype) * y)
     jax.config.update("jax_enable_x64", False)
     try:
-        radius = cfjax.spectral_radius(term, 0.0, jnp.ones(4))
+        radius = jax.jit(lambda y: cfjax.spectral_radius(term, 0.0, y))(np.ones(4, np.float32))
     finally:
         jax.config.update("jax_enable_x64", True)
     # The rates are 1 to 4, and 30 rounds leave (3/4)^60 of the others.

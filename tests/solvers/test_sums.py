@@ -46,20 +46,14 @@ FRAME = np.linalg.qr(np.random.default_rng(4).standard_normal((3, 3)))[0]
 # entries by a unit times its square: 10^6 * 2^-53 * 2 * 0.05^2 = 5.6e-13.
 STEADY = {
     "(3,)": (cfjax.Rotation(AXIS), FRAME[0], 3e-14),
-    "(3, 3)": (cfjax.Rotation(AXIS), FRAME, 3e-14),
     "left (3, 3)": (cfjax.LeftMatrix(problems.hat(AXIS)), FRAME, 5.6e-13),
     "right (3, 3)": (cfjax.RightMatrix(problems.hat(AXIS)), FRAME, 5.6e-13),
     "left (3,)": (cfjax.LeftMatrix(problems.hat(AXIS)), FRAME[0], 5.6e-13),
     "left (6,)": (cfjax.LeftMatrix(doubled(problems.hat(AXIS))), doubled(FRAME)[0], 5.6e-13),
-    "left (9,)": (
-        cfjax.LeftMatrix(np.kron(np.eye(3), problems.hat(AXIS))),
-        np.tile(FRAME[0], 3),
-        5.6e-13,
-    ),
 }
 
 
-@pytest.mark.representatives(1)
+@pytest.mark.slow
 @pytest.mark.parametrize("shape", STEADY)
 def test_a_steady_rotation_over_a_million_steps(shape):
     field, y0, most = STEADY[shape]
@@ -75,36 +69,6 @@ def test_a_steady_rotation_over_a_million_steps(shape):
     y = np.asarray(sol.ys[-1], np.longdouble)
     change = y.T @ y - np.asarray(y0, np.longdouble).T @ np.asarray(y0, np.longdouble)
     assert np.abs(change).max() < most
-
-
-def orthogonality(q) -> np.ndarray:
-    """The largest entry of Q^T Q - I for each matrix of a sequence."""
-    q = np.asarray(q)
-    return np.abs(np.swapaxes(q, 1, 2) @ q - np.eye(q.shape[-1])).max(axis=(1, 2))
-
-
-@pytest.mark.slow
-def test_a_large_matrix_stays_orthogonal():
-    generators = np.random.default_rng(1).standard_normal((3, 8, 8))
-
-    def field(t, y, args):
-        a = jnp.cos(t) * args[0] + jnp.sin(1.3 * t) * args[1] + args[2] @ y / 4
-        return cfjax.LeftMatrix((a - a.T) / 2)
-
-    steps = 10**6
-    sol = cfjax.integrate(
-        cfjax.LieTerm(field),
-        cfjax.CF4(),
-        0.0,
-        0.02 * steps,
-        jnp.eye(8),
-        jnp.asarray(generators),
-        num_steps=steps,
-        save_every=10_000,
-    )
-    # 2^-53 * 0.1 * 10^3 = 1.1e-14, and 9e-15 measured: the errors of the steps are random. That of
-    # 1/2! in the exponential is the same in every step: rounded carelessly it gave 7.5e-14.
-    assert orthogonality(sol.ys).max() < 3e-14
 
 
 @pytest.mark.slow
