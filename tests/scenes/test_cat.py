@@ -2,8 +2,6 @@
 
 from itertools import pairwise
 
-import jax
-import jax.numpy as jnp
 import numpy as np
 from scipy.integrate import solve_ivp
 
@@ -42,13 +40,6 @@ def test_the_reference_against_matrices():
     want = solution.y[:, -1].reshape(n, n)
     # Some hundred steps of that tolerance.
     np.testing.assert_allclose(cat.reference(0.5, SMALL, start), want, rtol=0, atol=1e-10)
-
-
-def test_the_velocity_is_that_of_the_field():
-    y = jnp.asarray(cat.coherent(0.5 + 0.3j, 10))
-    found = jax.jit(lambda y: cfjax.tangent(cat.field(0.3, y, SMALL), y))(y)
-    # Entries up to 1, and jumps of norm up to 70.
-    np.testing.assert_allclose(cat.velocity(0.3, y, SMALL), found, rtol=0, atol=1e-14)
 
 
 def test_it_ends_in_an_even_superposition():
@@ -108,11 +99,3 @@ def test_an_unstable_solve_has_no_error():
     one, other = cat.y0(4), cat.y0(4)[::-1, ::-1]
     np.testing.assert_allclose(cat.error(one, other), 2**0.5, rtol=1e-15)
     assert np.isnan(cat.error(1e100 * one, other))
-
-
-def test_picture(monkeypatch):
-    monkeypatch.setattr(cat, "y0", lambda: cat.coherent(0.0, 10))  # With fewer levels.
-    figure = cat.picture()
-    # Three maps, their colours, and a chart.
-    assert len(figure.axes) == 5
-    figure.draw_without_rendering()

@@ -107,10 +107,3 @@ def test_a_fit_is_nearly_as_likely_as_the_truth():
     truth = np.mean(flow_on_spheres.log_density_of(args, new))
     # By Gibbs' inequality no density has a greater mean, up to four standard errors of 0.02.
     assert -0.04 < float(jnp.mean(flow_on_spheres.log_likelihood(found, new))) - truth < 0.02
-
-
-@pytest.mark.slow
-def test_the_picture():
-    figure = flow_on_spheres.picture()
-    assert len(figure.axes) == 5
-    figure.draw_without_rendering()

@@ -71,13 +71,6 @@ def test_fields_are_the_equation():
         np.testing.assert_allclose(linear, m @ u, rtol=0, atol=2 * atol)
 
 
-def test_eigenvalues():
-    """For mu = 1 - x^2 the fast ones are -k (k + 1), as in Legendre's equation."""
-    a = jax.jacfwd(lambda u: heat.grid_field(0.0, u, arguments(100)))(jnp.zeros(99))
-    k = np.arange(99, 59, -1)
-    np.testing.assert_allclose(np.linalg.eigvalsh(a)[:40], -k * (k + 1.0), rtol=0, atol=1e-10)
-
-
 def test_reference():
     mu = np.asarray(heat.diffusivity(8).mu)
     with mpmath.workdps(30):
@@ -98,6 +91,11 @@ def test_reference_solves_the_large_system():
     u = heat.reference(0.3 + 1e-3 * np.arange(-2, 3), mu)
     slope = (u[0] - u[4] - 8 * (u[1] - u[3])) / 0.012
     np.testing.assert_allclose(slope, matrix(mu) @ u[2], rtol=0, atol=1e-8)
+    # For mu = 1 - x^2 the fast rates are -k (k + 1), as in Legendre's equation.
+    k = np.arange(99, 59, -1)
+    np.testing.assert_allclose(
+        np.linalg.eigvalsh(matrix(mu))[:40], -k * (k + 1.0), rtol=0, atol=1e-10
+    )
 
 
 # Methods
@@ -126,6 +124,7 @@ def test_translations_make_the_classical_runge_kutta_method():
     np.testing.assert_allclose(end(found), wanted, rtol=0, atol=1e-14)
 
 
+@pytest.mark.slow
 def test_grid_values_with_a_transform_give_the_same_steps():
     def field(t, u, args):
         spectrum = heat.field(t, u, args).spectrum
@@ -151,6 +150,7 @@ def test_a_step_costs_eight_transforms():
     assert text is not None and text.count(" fft(") == 8
 
 
+@pytest.mark.slow
 def test_float32():
     y0, args = jnp.asarray(heat.y0(100), jnp.float32), arguments(100)
     args = jax.tree.map(lambda x: x.astype(jnp.float32), args)
@@ -203,7 +203,3 @@ def test_second_derivative_of_a_solution():
     wanted = problems.central_difference(jax.jit(jax.grad(value)), constant, 1.0, 1e-3)
     assert float(jax.grad(jax.grad(value))(constant)) == pytest.approx(float(wanted), abs=1e-8)
     assert float(jax.jacfwd(jax.grad(value))(constant)) == pytest.approx(float(wanted), abs=1e-8)
-
-
-def test_the_picture():
-    assert len(heat.picture(num_intervals=16).axes) == 4

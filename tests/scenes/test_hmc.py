@@ -113,8 +113,3 @@ def test_the_order_of_dh(name, num_steps, start):
     # Energies are about 100, so this is above their rounding.
     assert second > 1e-11
     assert order - 0.2 < np.log2(first / second) < order + 0.3
-
-
-@pytest.mark.slow
-def test_the_picture_has_three_panels():
-    assert len(hmc.picture(num_trajectories=5, most_steps=1).axes) == 3

@@ -45,7 +45,3 @@ def test_without_noise_the_vehicle_drives_in_a_circle():
     # Some sixty steps of a few roundings each, on lengths of 60.
     np.testing.assert_allclose(imu.samples(4000, args)[0], exact, rtol=0, atol=1e-12)
     np.testing.assert_allclose(imu.reference(TIMES, args), exact, rtol=0, atol=1e-11)
-
-
-def test_the_picture_has_two_panels():
-    assert len(imu.picture(4000).axes) == 2

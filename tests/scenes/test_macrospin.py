@@ -51,7 +51,3 @@ def test_the_noise_of_a_cold_particle_is_that_of_the_equation():
     args, b = macrospin.Particle(damping=0.5, temperature=0.04), np.array([1.0, 0.0, 0.0])
     found = macrospin.thermal(0.0, macrospin.y0(), args, jnp.asarray(b)).omega
     np.testing.assert_allclose(found, np.array([1.0, 0.5, 0.0]) * 0.2 / 1.25, rtol=1e-15)
-
-
-def test_the_picture_has_three_panels():
-    assert len(macrospin.picture(num_samples=20).axes) == 3

@@ -62,6 +62,7 @@ def test_a_cosine_of_squares_grows_and_falls_by_its_eigenvalue():
     np.testing.assert_allclose(found, -e * eigenvalue * wave, rtol=0, atol=1e-12)
 
 
+@pytest.mark.slow
 def test_the_radius_is_near_the_bound():
     y = jnp.asarray(porous_medium.y0())
     found = cfjax.spectral_radius(TERM, 1.0, y, porous_medium.SIDE)
@@ -113,8 +114,3 @@ def test_steps_grow():
     assert ratios.max() / ratios.min() < 2
     peaks = jax.vmap(jnp.max)(sol.ys[: len(times)])
     assert np.all(np.diff(peaks) < 0)
-
-
-@pytest.mark.slow
-def test_the_picture_has_two_spots_their_profiles_and_the_steps():
-    assert len(porous_medium.picture(n=N).axes) == 4

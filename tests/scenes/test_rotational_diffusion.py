@@ -30,7 +30,3 @@ def test_means_of_samples():
         assert np.all(np.abs(sides.mean(axis=1)) < 4 * sides.std(axis=1) / np.sqrt(len(ys)))
         # A unit of rounding at each of a few places, as sums over the steps are compensated.
         np.testing.assert_allclose(np.linalg.norm(ys, axis=-1), 1, rtol=0, atol=1e-15)
-
-
-def test_the_picture_has_three_spheres_and_the_decay():
-    assert len(rotational_diffusion.picture(num_samples=50).axes) == 4

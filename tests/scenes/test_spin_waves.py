@@ -78,8 +78,3 @@ def test_the_amplitudes_are_those_of_the_waves_in_it():
     kx, ky = 2 * np.pi * np.array([1, 2]) / SIDE
     phase = np.cos(0.3) * (4 - 2 * np.cos(kx) - 2 * np.cos(ky)) * 0.7
     np.testing.assert_allclose(a, [np.sin(0.3) * np.exp(1j * phase), 0, 0], rtol=0, atol=1e-15)
-
-
-@pytest.mark.slow
-def test_the_picture_has_three_panels_and_a_scale():
-    assert len(spin_waves.picture(side=4, time=5.0).axes) == 4

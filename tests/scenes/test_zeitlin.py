@@ -142,12 +142,6 @@ def test_order_and_what_is_kept():
     assert abs(zeitlin.energy(want, INVERSE) - energy) < 1e-12
 
 
-def test_what_plain_space_loses():
-    off = end(diffrax.Tsit5(), 1, term=diffrax.ODETerm(zeitlin.velocity))
-    values = np.linalg.eigvalsh((off + off.conj().T) / 2)
-    assert np.abs(values - np.linalg.eigvalsh(START)).max() > 1e-10
-
-
 def test_energy_and_momentum_on_the_sphere():
     # A fluid that turns as a whole, with w = 2 z: its velocity is the distance from the axis, of
     # mean square 2 / 3, and the mean of z^2 is 1 / 3.
@@ -180,8 +174,3 @@ def test_the_spectrum_at_32():
     y = np.asarray(sol.ys[-1])
     np.testing.assert_allclose(np.linalg.eigvalsh(y), np.linalg.eigvalsh(start), rtol=0, atol=3e-14)
     assert np.abs(y - zeitlin.reference(10.0, start)).max() < 1e-4
-
-
-@pytest.mark.slow
-def test_the_picture_has_two_panels_a_time_and_two_scales():
-    assert len(zeitlin.picture(n=8).axes) == 12
