@@ -20,7 +20,7 @@ Y0 = jnp.asarray(problems.MOMENTUM)
 ARGS = jnp.asarray(problems.INERTIA)
 Y0_SINGLE, ARGS_SINGLE = Y0.astype(np.float32), ARGS.astype(np.float32)
 TERM = cfjax.LieTerm(problems.driven_body)
-CF4 = cfjax.CF4()
+EULER = cfjax.LieEuler()
 
 
 def close(found, expected, atol=1e-14):
@@ -32,8 +32,10 @@ def ode(t, y, args):
     return jnp.sin(y * t) - y[::-1] / args
 
 
-def solve(term=TERM, solver=CF4, t0=0.0, t1=1.0, y0=Y0, args=ARGS, num_steps=16, **options) -> Any:
-    """Tests that leave the static arguments as they are share one program."""
+def solve(
+    term=TERM, solver=EULER, t0=0.0, t1=1.0, y0=Y0, args=ARGS, num_steps=16, **options
+) -> Any:
+    """Tests that leave the static arguments as they are share one program, the shortest."""
     return cfjax.integrate(term, solver, t0, t1, y0, args, num_steps=num_steps, **options)
 
 
@@ -48,12 +50,10 @@ def newton():
 @pytest.mark.parametrize(
     "term, solver, t1",
     [
-        (TERM, CF4, -2.0),
+        (TERM, cfjax.CF2(), -2.0),
         (TERM, cfjax.RKMK4(), 2.0),
         (diffrax.ODETerm(ode), diffrax.Tsit5(), 2.0),
-        (diffrax.ODETerm(ode), diffrax.Midpoint(), -2.0),
         (diffrax.ODETerm(ode), newton(), 2.0),
-        (diffrax.ODETerm(ode), CF4, 2.0),
     ],
     ids=lambda x: type(x).__name__,
 )
@@ -81,11 +81,11 @@ def test_it_takes_the_steps_of_diffeqsolve(term, solver, t1):
 
 def test_a_wrapped_solver():
     """Both go on from two half steps. For diffrax they are instances of what they wrap."""
-    euler = cfjax.LieEuler()
-    wrapped: Any = [diffrax.HalfSolver(euler), cfjax.Richardson(euler)]
-    expected = solve(solver=euler, num_steps=8)
+    wrapped: Any = [diffrax.HalfSolver(EULER), cfjax.Richardson(EULER)]
+    term = cfjax.LieTerm(ode)
+    expected = solve(term)
     for solver in wrapped:
-        found = solve(solver=solver, num_steps=4)
+        found = solve(term, solver, num_steps=8)
         close(found.ys, expected.ys)
         assert found.result == diffrax.RESULTS.successful
 
@@ -110,39 +110,30 @@ def test_times_and_states_of_the_output():
             close(sol.ys, every[16 // n - 1 :: 16 // n], atol=1e-15 * 16)
 
 
-@cache
-def gradient(save_initial=False, checkpoint_every=None):
-    """Times and states, and the derivative of the sum of their sines."""
-
-    def loss(y0):
-        options = dict(save_initial=save_initial, checkpoint_every=checkpoint_every)
-        sol = solve(solver=cfjax.LieEuler(), t0=0.25, y0=y0, save_every=8, **options)
-        return jnp.sum(jnp.sin(sol.ys)), (sol.ts, sol.ys)
-
-    by_start, (ts, ys) = jax.jit(jax.grad(loss, has_aux=True))(Y0)
-    return ts, ys, by_start
-
-
-def test_the_initial_state_is_saved_on_request():
-    (ts, ys, by_start), without = gradient(save_initial=True), gradient()
-    assert ts[0] == 0.25
-    np.testing.assert_array_equal(ys[0], Y0)
-    np.testing.assert_array_equal(ts[1:], without[0])
-    # One step is one program in both, but fusion may differ in the last bits.
-    close(ys[1:], without[1], atol=1e-15 * 16)
-    # Its derivative is the identity, and those of the others are as before.
-    close(by_start - jnp.cos(Y0), without[2])
-
-
 @pytest.mark.parametrize(
     "checkpoint_every",
     # One that leaves steps behind the last checkpoint, and one that leaves nothing else.
     [3, *(pytest.param(n, marks=pytest.mark.slow) for n in (1, 30))],
 )
-def test_fewer_checkpoints_give_the_same_numbers(checkpoint_every):
-    # The same steps, in which fusion may differ in the last bits.
-    for found, expected in zip(gradient(False, checkpoint_every), gradient(), strict=True):
-        close(found, expected)
+def test_the_initial_state_on_request_and_fewer_checkpoints(checkpoint_every):
+    """Neither changes a number of the others, nor of a derivative."""
+
+    def loss(y0, **options):
+        sol = solve(cfjax.LieTerm(ode), t0=0.25, y0=y0, save_every=8, **options)
+        return jnp.sum(jnp.sin(sol.ys)), (sol.ts, sol.ys)
+
+    def gradient(**options):
+        return jax.jit(jax.grad(lambda y0: loss(y0, **options), has_aux=True))(Y0)
+
+    by_start, (ts, ys) = gradient(save_initial=True, checkpoint_every=checkpoint_every)
+    expected, (times, states) = gradient()
+    assert ts[0] == 0.25
+    np.testing.assert_array_equal(ys[0], Y0)
+    np.testing.assert_array_equal(ts[1:], times)
+    # One step is one program in both, but fusion may differ in the last bits.
+    close(ys[1:], states, atol=1e-15 * 16)
+    # The derivative of the start is the identity, and those of the others are as before.
+    close(by_start - np.cos(Y0), expected)
 
 
 def test_many_steps_reach_the_end_of_the_time():
@@ -150,9 +141,8 @@ def test_many_steps_reach_the_end_of_the_time():
 
     y' = 3 t^2, which the classical method integrates exactly: y(1) = 1 at the sum of 10^5 steps.
     """
-    sol = solve(
-        diffrax.ODETerm(lambda t, y, args: 3 * t**2), y0=jnp.asarray(0.0), num_steps=100_000
-    )
+    term = diffrax.ODETerm(lambda t, y, args: 3 * t**2)
+    sol = solve(term, cfjax.CF4(), y0=jnp.asarray(0.0), num_steps=100_000)
     # A random walk of roundings of y: sqrt(1e5) * 1e-16 = 3e-14. An added-up time errs by 1e-12.
     close(sol.ys[-1], 1.0, atol=2e-13)
 
@@ -181,10 +171,10 @@ def test_a_complex_state_has_real_times():
 
 
 def test_python_numbers_in_the_state_and_args():
-    """As `diffeqsolve` takes them. y' = -2 y in one step of the classical method."""
+    """As `diffeqsolve` takes them. y' = -2 y in one step of the midpoint rule."""
     term = diffrax.ODETerm(lambda t, y, args: -args * y)
-    sol = solve(term, t0=0, t1=1, y0=1.0, args=2.0, num_steps=1)
-    close(sol.ys, [1 - 2 + 2 - 8 / 6 + 16 / 24], atol=1e-15)
+    sol = solve(term, cfjax.CF2(), t0=0, t1=1, y0=1.0, args=2.0, num_steps=1)
+    close(sol.ys, [1 - 2 + 2], atol=1e-15)
 
 
 # Tracing
@@ -205,7 +195,7 @@ def test_new_values_do_not_trace_again():
     def traces(scale=1.0, args=ARGS, rate=1.0, **options):
         before = calls
         term = cfjax.LieTerm(Counting(jnp.asarray(scale)))
-        solve(term, cfjax.CF2(), args=(args, rate), **options)
+        solve(term, args=(args, rate), **options)
         return calls - before
 
     assert traces() > 0
@@ -237,8 +227,7 @@ POINT = (jnp.asarray(0.2), jnp.asarray(0.9), Y0, ARGS)
 
 @pytest.mark.slow
 def test_inside_jit_and_vmap():
-    expected = end(*POINT)
-    close(jax.jit(end)(*POINT), expected, atol=1e-15)
+    close(jax.jit(end)(*POINT), end(*POINT), atol=1e-15)
     batch = jtu.tree_map(lambda x: jnp.stack([x, 0.9 * x, 1.1 * x]), POINT)
     one_by_one = jnp.stack([end(*(x[i] for x in batch)) for i in range(3)])
     close(jax.vmap(end)(*batch), one_by_one, atol=2e-15)
@@ -252,15 +241,15 @@ def test_the_derivative_in_the_end_time_is_the_velocity():
     t0, t1, y0, args = POINT
 
     def fine(t0, t1, y0):
-        end = solve(t0=t0, t1=t1, y0=y0, num_steps=200).ys[-1]
+        end = solve(solver=cfjax.CF3(), t0=t0, t1=t1, y0=y0, num_steps=2000).ys[-1]
         return end, end
 
-    velocity = lambda t, y: cfjax.tangent(problems.driven_body(t, y, args), y)  # noqa: E731
+    velocity = lambda t, y: problems.driven_body_ode(t, np.asarray(y), problems.INERTIA)  # noqa: E731
     program = jax.jit(jax.jacfwd(fine, (0, 1, 2), has_aux=True))
     (d_t0, d_t1, d_y0), y1 = program(t0, t1, y0)
-    # The derivative of the method's error: 1e-8 at 32 steps, so 1e-11 at 200.
+    # The derivative of the method's error: 1e-7 at 40 steps, so 1e-12 at 2000.
     close(d_t1, velocity(t1, y1), atol=1e-10)
-    close(d_t0, -d_y0 @ velocity(t0, y0), atol=1e-10)
+    close(d_t0, -np.asarray(d_y0) @ velocity(t0, y0), atol=1e-10)
 
 
 # What the compiler makes of it
@@ -273,12 +262,12 @@ def test_a_step_of_a_small_system_is_few_operations_also_backwards():
     term = cfjax.LieTerm(problems.rigid_body)
 
     def fun(y0, inertia):
-        return jnp.sum(solve(term, y0=y0, args=inertia, num_steps=100).ys)
+        return jnp.sum(solve(term, cfjax.CF2(), y0=y0, args=inertia, num_steps=100).ys)
 
     def fusions(fun):
         return jax.jit(fun).lower(Y0, ARGS).compile().as_text().count(" fusion(")
 
-    # 16 and 36 as measured. A derivative that XLA breaks into pieces has more than 80.
+    # 24 and 41 as measured. A derivative that XLA breaks into pieces has more than 80.
     assert fusions(fun) < 25
     assert fusions(jax.grad(fun, (0, 1))) < 50
 
@@ -301,7 +290,7 @@ def temporary_bytes(num_steps, reverse=False, y0=jnp.eye(BIG), **options) -> int
 
 
 def test_the_memory_forwards_does_not_grow_with_the_steps():
-    few, many = (temporary_bytes(n, solver=cfjax.LieEuler()) for n in (100, 100_000))
+    few, many = (temporary_bytes(n, y0=Y0) for n in (100, 100_000))
     assert few == many
 
 
@@ -371,7 +360,7 @@ WRONG_TYPES: list[tuple[str, dict[str, Any]]] = [
         ("solver must be a diffrax solver", {"solver": solver})
         for solver in (None, cfjax.CF4, cfjax.CF4.tableau, "CF4")
     ),
-    ("CF4 takes a term of the form", {"term": (TERM, TERM)}),
+    ("LieEuler takes a term of the form", {"term": (TERM, TERM)}),
     ("SemiImplicitEuler takes a term of the form", {"solver": diffrax.SemiImplicitEuler()}),
     ("KenCarp4 takes a term of the form .*MultiTerm", {"solver": diffrax.KenCarp4()}),
 ]
@@ -409,14 +398,14 @@ def test_a_number_of_steps_that_is_traced(no_shape_hook):
 
 def test_more_traced_steps_than_can_be_counted():
     """`work_precision` traces the number of steps. It does not run those that are too many."""
+    y0 = np.ones(1, np.float32)
     work = cfjax.work_precision(
-        TERM,
+        cfjax.LieTerm(lambda t, y, args: -y),
         -1.0,
         1.0,
-        Y0_SINGLE,
-        ARGS_SINGLE,
-        methods={"LieEuler": cfjax.LieEuler()},
-        reference=Y0_SINGLE,
+        y0,
+        methods={"LieEuler": EULER},
+        reference=y0,
         num_steps=[3, 2**24 + 2],
         repeats=1,
     )
@@ -426,16 +415,15 @@ def test_more_traced_steps_than_can_be_counted():
 
 
 def test_steps_shorter_than_the_rounding_of_the_times():
+    still = cfjax.LieTerm(lambda t, y, args: 0 * y)
     for dtype in (np.float32, np.float64):
-        y0, args, t0 = Y0.astype(dtype), ARGS.astype(dtype), 1000.0
+        y0, t0 = jnp.ones(1, dtype), 1000.0
         # The distance of neighbours around t0.
         unit = np.spacing(dtype(t0))
 
         @eqx.filter_jit
-        def times(t0, t1, y0=y0, args=args):
-            return solve(
-                solver=cfjax.LieEuler(), t0=t0, t1=t1, y0=y0, args=args, num_steps=4, save_every=1
-            ).ts
+        def times(t0, t1, y0=y0):
+            return solve(still, t0=t0, t1=t1, y0=y0, num_steps=4, save_every=1).ts
 
         for a, sign in [(t0, 1), (t0 + 4 * unit, -1), (-t0, -1)]:
             steps = np.diff(np.asarray(times(a, a + sign * 4 * unit)), prepend=dtype(a))
@@ -451,16 +439,15 @@ EMPTY = {"none": None, "without": {"a": None, "b": jnp.ones(2)}, "empty": {"b": 
 
 @pytest.mark.representatives(1)
 @pytest.mark.parametrize("name", EMPTY)
-@pytest.mark.parametrize("solver", [CF4, cfjax.RKMK4(), cfjax.CK34()])
+@pytest.mark.parametrize("solver", [cfjax.CF2(), cfjax.RKMK4(), cfjax.CK34()])
 def test_a_state_without_arrays_or_with_empty_parts(name, solver):
     y0 = EMPTY[name]
     term = cfjax.LieTerm(lambda t, y, args: jtu.tree_map(jnp.ones_like, y))
     controller = diffrax.PIDController(rtol=0.0, atol=1e-3)
     solutions = [
         solve(term, solver, y0=y0, num_steps=2),
-        diffrax.diffeqsolve(term, solver, 0.0, 1.0, 0.5, y0),
         diffrax.diffeqsolve(
-            term, cfjax.Richardson(cfjax.CF3()), 0.0, 1.0, 0.5, y0, stepsize_controller=controller
+            term, cfjax.Richardson(solver), 0.0, 1.0, 0.5, y0, stepsize_controller=controller
         ),
     ]
     expected = jtu.tree_map(lambda y: y[None] + 1, y0)
@@ -478,7 +465,7 @@ def test_a_time_that_is_infinite():
     # 1e39 is none in single precision.
     still = cfjax.LieTerm(lambda t, y, args: 0 * y)
     y0 = jnp.ones(1, jnp.float32)
-    end = jax.jit(lambda t1: solve(still, cfjax.LieEuler(), t1=t1, y0=y0).ys)
+    end = jax.jit(lambda t1: solve(still, t1=t1, y0=y0).ys)
     with pytest.raises(RuntimeError, match=r"t1 must be finite, got infinity \(in float32"):
         jax.block_until_ready(end(1e39))
 
@@ -487,14 +474,15 @@ IMPLICIT = [
     *("ImplicitEuler", "Kvaerno3", "Kvaerno4", "Kvaerno5"),
     *("KenCarp3", "KenCarp4", "KenCarp5", "Sil3"),
 ]
-DECAY = diffrax.ODETerm(lambda t, y, args: -y)
+# With args zero the second part rests. Where they are large, an implicit step has no solution.
+DECAY = diffrax.ODETerm(lambda t, y, args: -y + args * (1 + y**2))
 
 
-def with_implicit(solver):
+def with_implicit(solver, args=0.0, y0: Any = 1.0):
     is_split = type(solver).__name__ in ("KenCarp3", "KenCarp4", "KenCarp5", "Sil3")
     still = diffrax.ODETerm(lambda t, y, args: 0 * y)
     term = diffrax.MultiTerm(still, DECAY) if is_split else DECAY
-    return solve(term, solver, t1=0.1, num_steps=2)
+    return solve(term, solver, t1=0.1, y0=y0, args=args, num_steps=2)
 
 
 @cache
@@ -529,19 +517,12 @@ def test_implicit_solvers_without_tolerances_are_refused():
 @pytest.mark.representatives(1)
 @pytest.mark.parametrize("name", IMPLICIT)
 def test_what_is_said_of_an_implicit_solver_without_tolerances_can_be_pasted(name):
+    solver = advice(name)
     # The first order method: 2 steps of error (h^2 / 2) exp(-0.1).
-    found = with_implicit(advice(name)).ys[-1]
-    np.testing.assert_allclose(found, Y0 * np.exp(-0.1), rtol=3e-3)
-
-
-def test_a_failure_of_the_solver_is_an_error():
-    """An implicit solver whose root finder may not move."""
-    solver: Any = diffrax.ImplicitEuler(
-        root_finder=diffrax.VeryChord(rtol=1e-12, atol=1e-12), root_find_max_steps=1
-    )
-    term = diffrax.ODETerm(lambda t, y, args: -(y**3) * 100)
-    with pytest.raises(eqx.EquinoxRuntimeError):
-        jax.block_until_ready(solve(term, solver, t1=10.0, y0=jnp.ones(2), num_steps=4).ys)
+    np.testing.assert_allclose(with_implicit(solver).ys[-1], np.exp(-0.1), rtol=3e-3)
+    # A failure of the solver is an error: y = 1 + h (100 (1 + y^2) - y) has no solution.
+    with pytest.raises(eqx.EquinoxRuntimeError, match="(?i)nonlinear solve"):
+        with_implicit(solver, args=100.0)
 
 
 # A blow-up is never a number. Here y' = y^2, infinite at t = 1 / y0.
@@ -552,8 +533,11 @@ def exploding(t, y, args):
     return {"a": y["a"] ** 2, "b": cfjax.Rotation(jnp.ones(3)), "c": -y["c"]}
 
 
-def explosion(y0=1.0, **options):
-    y0 = {"a": jnp.asarray([0.1, y0]), "b": Y0, "c": jnp.eye(2)}
+STARTS = 0.1, 1.0
+
+
+def explosion(y0=STARTS[1], **options):
+    y0 = {"a": jnp.stack([STARTS[0], jnp.asarray(y0)]), "b": Y0, "c": jnp.eye(2)}
     term = cfjax.LieTerm(exploding)
     return solve(term, t1=2.0, y0=y0, args=None, num_steps=100, save_every=25, **options)
 
@@ -569,8 +553,11 @@ def test_the_result_tells_of_a_blow_up():
     assert np.isfinite(np.asarray(sol.ys["b"])).all()
     calm = explosion(0.4, throw=False)
     assert calm.result == diffrax.RESULTS.successful
-    # y(2) = y0 / (1 - 2 y0), to the error of 100 steps of order 4.
-    close(calm.ys["a"][-1], [0.1 / 0.8, 0.4 / 0.2], atol=1e-6)
+    expected = np.array([STARTS[0], 0.4])
+    for _ in range(100):
+        expected += 0.02 * expected**2
+    # 100 roundings of numbers up to 2.
+    close(calm.ys["a"][-1], expected, atol=1e-13)
     for value in (np.nan, np.inf, -np.inf):
         with pytest.raises(eqx.EquinoxRuntimeError, match="y0 must be finite"):
             explosion(value)
@@ -600,7 +587,7 @@ def test_in_a_batch_the_result_tells_which_blew_up():
 
 def linear(t, y, args):
     """An array and a matrix: linear in the state, and not symmetric."""
-    a = jnp.asarray([[0.1, 1.0, -0.3], [-2.0, 0.2, 0.5], [0.4, 0.7, -0.1]])
+    a = jnp.asarray([[0.1, 1.0], [-2.0, 0.2]])
     return {"x": cfjax.LeftMatrix(a * jnp.cos(t)), "y": y["x"][:, 0] - 2.0 * y["y"]}
 
 
@@ -608,7 +595,7 @@ def linear(t, y, args):
 @pytest.mark.parametrize(
     "solver, throw, rewrite",
     [
-        (cfjax.CF2(), True, False),
+        (EULER, True, False),
         (cfjax.CF2(), False, True),
         (cfjax.Magnus4(), True, True),
         (cfjax.Magnus4(), False, False),
@@ -616,7 +603,7 @@ def linear(t, y, args):
 )
 def test_the_transpose_of_a_solve_that_is_linear_in_its_start(solver, throw, rewrite):
     """The checks are of the values of what is linear, and in the way of it they are not."""
-    Y = {"x": jnp.ones((3, 2)), "y": jnp.ones(3)}
+    Y = {"x": jnp.ones((2, 1)), "y": jnp.ones(2)}
     is_magnus = isinstance(solver, cfjax.Magnus4)
     field = linear if not is_magnus else lambda t, y, args: linear(t, Y, args)["x"]
     start = Y["x"] if is_magnus else Y
@@ -626,17 +613,21 @@ def test_the_transpose_of_a_solve_that_is_linear_in_its_start(solver, throw, rew
         ys = solve(term, solver, y0=y0, num_steps=4, save_every=2, throw=throw).ys
         return jtu.tree_map(lambda y: y[-1], ys)
 
-    y, w = problems.random_like(start, 1), problems.random_like(start, 2)
+    y, w = problems.random_like(start, 2), problems.random_like(start, 3)
     with cfjax.rewriting(rewrite):
-        (back,) = jax.linear_transpose(end, start)(w)
+        found, expected = jax.jit(
+            lambda y, w: (
+                problems.inner(jax.linear_transpose(end, start)(w)[0], y),
+                problems.inner(w, end(y)),
+            )
+        )(y, w)
         # What a transpose is. Some thousand products of numbers below 10.
-        expected = problems.inner(w, end(y))
         assert abs(expected) > 0.1
-        np.testing.assert_allclose(problems.inner(back, y), expected, rtol=0, atol=1e-12)
+        np.testing.assert_allclose(found, expected, rtol=0, atol=1e-12)
 
 
 @pytest.mark.representatives(1)
-@pytest.mark.parametrize("solver", [cfjax.CF2(), cfjax.CF54(), cfjax.RKMK8()])
+@pytest.mark.parametrize("solver", [EULER, cfjax.CF54(), cfjax.RKMK8()])
 def test_the_transpose_of_a_small_solve_that_is_rewritten(rewritten, solver):
     """The numbers of its steps, on which the field depends through the time, are known to it."""
     a = jnp.asarray([[0.2, -1.0, 0.5], [0.7, 0.3, -0.4], [-0.6, 0.9, 1.2]])
@@ -648,10 +639,10 @@ def test_the_transpose_of_a_small_solve_that_is_rewritten(rewritten, solver):
     def end(y0):
         return solve(cfjax.LieTerm(field), solver, y0=y0).ys[-1]
 
-    (back,) = jax.linear_transpose(end, jnp.ones(3))(jnp.arange(3.0))
+    (back,) = jax.jit(jax.linear_transpose(end, jnp.ones(3)))(np.arange(3.0))
     # The matrix of the solve, column by column; a hundred products of numbers below 10.
-    matrix = jnp.stack([end(e) for e in jnp.eye(3)], axis=1)
-    np.testing.assert_allclose(back, jnp.arange(3.0) @ matrix, rtol=0, atol=1e-13)
+    matrix = np.stack([end(e) for e in np.eye(3)], axis=1)
+    np.testing.assert_allclose(back, np.arange(3.0) @ matrix, rtol=0, atol=1e-13)
 
 
 # Starts off the manifold
@@ -663,7 +654,7 @@ TURN = cfjax.LieTerm(
 
 
 def turning(y0, rate: Any = 1.0, term=TURN, **options):
-    return solve(term, cfjax.LieEuler(), y0=y0, args=rate, save_initial=True, **options)
+    return solve(term, y0=y0, args=rate, save_initial=True, **options)
 
 
 FAR, NEAR = jnp.array([1.1, 0.0, 0.0, 0.0]), jnp.array([1.0, 0.0, 0.0, 0.0])

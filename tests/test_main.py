@@ -9,6 +9,7 @@ import subprocess
 import sys
 from pathlib import Path
 
+import equinox as eqx
 import jax
 import jax.tree_util as jtu
 import numpy as np
@@ -34,7 +35,7 @@ def short(monkeypatch):
     """The same command with fewer programs."""
 
     def work_precision(*args, **options):
-        methods = dict(list(options.pop("methods").items())[-2:])
+        methods = dict(list(options.pop("methods").items())[-1:])
         return original(*args, methods=methods, **(options | dict(num_steps=[500, 1000])))
 
     original = cfjax.work_precision
@@ -53,9 +54,9 @@ def figures(monkeypatch):
     found = {}
     savefig = Figure.savefig
 
-    def seen(self, path, **options):
+    def seen(self, path, dpi):
         found[Path(path).name] = self
-        savefig(self, path, **options)
+        savefig(self, path, dpi=dpi / 10)
 
     monkeypatch.setattr(Figure, "savefig", seen)
     return found
@@ -65,7 +66,7 @@ def test_files_and_table(short, blank, figures, tmp_path, capsys):
     output = tmp_path / "new" / "folder"
     assert main(["chart", "rigid_body", "--output", str(output), "--budget", "0.1"]) == 0
     out, error = capsys.readouterr()
-    # The flops of these methods are not known.
+    # The flops of this method are not known.
     assert "nan" not in out and "flops" not in out
     # The picture is that of `cfjax scene`.
     pictures = ["rigid_body_picture.pdf", "rigid_body_picture.png"]
@@ -78,9 +79,8 @@ def test_files_and_table(short, blank, figures, tmp_path, capsys):
     assert (output / "rigid_body.pdf").read_bytes().startswith(b"%PDF")
     with open(output / "rigid_body.csv", newline="") as file:
         rows = list(csv.DictReader(file))
-    assert [(row["method"], row["num_steps"]) for row in rows] == [
-        (name, n) for name in ("Dopri5", "Tsit5") for n in ("500", "1000")
-    ]
+    found = [(row["method"], row["num_steps"]) for row in rows]
+    assert found == [("Tsit5", "500"), ("Tsit5", "1000")]
     for row in rows:
         assert row["method"] in out
         assert 0 < float(row["error"]) < 1e-3
@@ -159,6 +159,7 @@ def test_a_scene(blank, monkeypatch, tmp_path, capsys):
         return original(y, args) | dict(zip(names, values, strict=True))
 
     monkeypatch.setattr(scenes.rigid_body, "invariants", invariants)
+    monkeypatch.setattr(scenes.rigid_body, "solver", cfjax.CF4())
     monkeypatch.setenv("COLUMNS", "80")
     # It is replaced.
     picture = tmp_path / "rigid_body_picture.png"
@@ -176,7 +177,7 @@ def test_a_scene(blank, monkeypatch, tmp_path, capsys):
     assert row[1] == "0.63422"
     assert 0 < float(row[3]) < 1e-3
     assert "Compiled in" in text and "s a step: the fastest of" in text
-    assert "1000 equal steps of RKMK8, t = 0 to 100" in text
+    assert "1000 equal steps of CF4, t = 0 to 100" in text
     assert max(map(len, out.splitlines())) <= 80 + len(str(tmp_path))
     for name in (*names, "length of the momentum"):
         assert any(name in line for line in out.splitlines()), name
@@ -196,21 +197,35 @@ def test_scenes_solve_with_the_method_that_readme_recommends():
     assert len(methods) > 10
     projected = 'RKMK8(coordinates="projected")'
     seen = set()
+
+    def start_and_field(make):
+        problem = {"args": None} | make()
+        if isinstance(problem["term"], cfjax.VariationTerm):
+            # With variations by the method for the state.
+            problem |= {"term": problem["term"].term, "y0": problem["y0"].state}
+        if isinstance(problem["term"], cfjax.LieTerm):
+            arrays = problem["t0"], problem["y0"], problem["args"]
+            arrays = jtu.tree_map(jax.numpy.asarray, arrays)
+            return arrays[1], problem["term"].vf(*arrays)
+        return None
+
     for name, module in SCENES.items():
-        problem = module.problem()
+        make = module.problem
+        if name == "preintegration":
+            # Its start is NumPy's of what JAX computes.
+            problem = make()
+            make = lambda problem=problem: problem  # noqa: E731
+        # Of shapes: some problems take a while to make.
+        found = eqx.filter_eval_shape(start_and_field, make)
         chosen = type(module.solver).__name__
         coordinates = getattr(module.solver, "coordinates", "exponential")
         if coordinates != "exponential":
             chosen = f'{chosen}(coordinates="{coordinates}")'
-        if isinstance(problem["term"], cfjax.VariationTerm):
-            # With variations by the method for the state.
-            problem |= {"term": problem["term"].term, "y0": problem["y0"].state}
-        if not isinstance(problem["term"], cfjax.LieTerm):
+        if found is None:
             # The pages on splittings and on noise recommend these.
             assert chosen in ("BlanesMoan4", "Strang", "WeakOrder2"), name
             continue
-        arrays = problem["t0"], problem["y0"], problem.get("args")
-        fields = jax.eval_shape(problem["term"].vf, *jtu.tree_map(jax.numpy.asarray, arrays))
+        y0, fields = found
         parts = jtu.tree_leaves(fields, is_leaf=lambda x: type(x).__name__ in methods)
         kinds = {methods.get(type(part).__name__) for part in parts}
         if name in WITH_REASONS:
@@ -220,7 +235,7 @@ def test_scenes_solve_with_the_method_that_readme_recommends():
         elif any(str(kind).startswith("`ETD54`") for kind in kinds):
             assert chosen == "ETD54", name
         elif any("`Kraus4`" in str(kind) for kind in kinds):
-            levels = jtu.tree_leaves(problem["y0"])[0].shape[-1]
+            levels = jtu.tree_leaves(y0)[0].shape[-1]
             assert chosen == ("Magnus4" if levels <= 4 else "Kraus4"), name
         else:
             assert all(f"`{chosen}`" in str(kind) for kind in kinds), (name, kinds)
@@ -244,8 +259,11 @@ TO_ITS_ORDER = {
 }
 
 
-@pytest.mark.representatives(1)
-@pytest.mark.parametrize("name", SCENES)
+# One with the quickest program.
+@pytest.mark.parametrize(
+    "name",
+    [pytest.param(name, marks=[pytest.mark.slow] * (name != "spin_waves")) for name in SCENES],
+)
 def test_every_scene_keeps_its_invariants(name):
     module = SCENES[name]
     problem = module.problem()
@@ -373,7 +391,7 @@ def read_until(stream, text):
     raise AssertionError(f"{text!r} was not printed.")
 
 
-@pytest.mark.representatives(1)
+@pytest.mark.slow
 @pytest.mark.parametrize(
     "number, status, message",
     [(signal.SIGINT, 130, "cfjax: interrupted"), (signal.SIGTERM, 143, "cfjax: terminated")],
@@ -407,6 +425,7 @@ def test_files_are_written_whole_or_not_at_all(start, tmp_path):
     code = """
 import sys, time
 from pathlib import Path
+import numpy as np
 
 class Figure:
     def savefig(self, path, dpi):
@@ -418,7 +437,12 @@ sys.argv[0] = "cfjax"
 import cfjax
 from cfjax import scenes
 from cfjax.__main__ import main
+def problem():
+    return dict(term=cfjax.LieTerm(lambda t, y, args: y), t0=0.0, t1=1.0, y0=np.ones(1))
+
+# The quickest program.
 scenes.rigid_body.picture, scenes.rigid_body.solver = Figure, cfjax.LieEuler()
+scenes.rigid_body.problem, scenes.rigid_body.invariants = problem, lambda y, args: {}
 main(["scene", "rigid_body", "--output", sys.argv[1]])
 time.sleep(60)
 """
