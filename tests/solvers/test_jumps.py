@@ -62,15 +62,14 @@ def takes_any(name):
     return SOLVERS[name].takes in ("any", "brackets", "time only") and name != "CG5"
 
 
-# The rest has the same evaluations.
-QUICK = "CF4 Magnus6".split()
-EXACT = [
-    pytest.param(name, marks=() if name in QUICK else pytest.mark.slow)
-    for name in filter(takes_any, SOLVERS)
-]
-
-
-@pytest.mark.parametrize("name", EXACT)
+# All have their evaluations from one place.
+@pytest.mark.parametrize(
+    "name",
+    [
+        pytest.param(name, marks=[pytest.mark.slow] * (name != "CF4"))
+        for name in filter(takes_any, SOLVERS)
+    ],
+)
 def test_a_field_that_is_constant_in_each_step_is_solved_exactly(name):
     def solve(t0, t1, y0):
         term, solver = cfjax.LieTerm(rotation), SOLVERS[name].make()
@@ -163,6 +162,7 @@ def test_splittings():
     assert_is(sol.ys[-1], propagators()[-1])
 
 
+@pytest.mark.slow
 def test_a_qubit_that_is_driven_and_loses_energy():
     pauli = np.array([[[0, 1], [1, 0]], [[0, -1j], [1j, 0]], [[1, 0], [0, -1]]], complex)
     lowering, rates = np.array([[0, 1], [0, 0]], complex), jnp.full((3, 1), 0.7)

@@ -24,7 +24,6 @@ variants = pytest.mark.parametrize("as_in_paper", [False, True], ids=["default",
 CASES: dict[str, tuple[diffrax.AbstractSolver, int, Any]] = {
     "CF3": (cfjax.CF3(), 3, (TERM, Y0, ARGS)),
     "CF4": (cfjax.CF4(), 4, (TERM, Y0, ARGS)),
-    "RKMK4": (cfjax.RKMK4(), 4, (TERM, Y0, ARGS)),
     "Euler": (diffrax.Euler(), 1, (ODE, ODE_Y0, ODE_ARGS)),
     "Tsit5": (diffrax.Tsit5(), 5, (ODE, ODE_Y0, ODE_ARGS)),
 }
@@ -60,10 +59,8 @@ def close(a, b, atol=1e-14):
 
 
 def test_estimate_and_result_of_a_step(subtests):
-    for name, as_in_paper in (
-        *((name, False) for name in ("CF4", "RKMK4", "Euler", "Tsit5")),
-        *((name, True) for name in ("CF3", "Tsit5")),
-    ):
+    # The last stage of Tsit5 is the first of its next step.
+    for name, as_in_paper in (("CF3", False), ("Tsit5", True)):
         with subtests.test(case=(name, str(as_in_paper))):
             check_a_step(name, as_in_paper)
 

@@ -97,7 +97,6 @@ def test_a_step_is_its_flows(subtests):
     suzuki = np.repeat([s, s, 1 - 4 * s, s, s], 2) / 2
     for name, solver, stages in (
         ("Splitting", cfjax.Splitting((0.3, 0.7)), (0.3, 0.7)),
-        ("BlanesMoan4", cfjax.BlanesMoan4(), cfjax.BlanesMoan4.stages),
         ("Composition", cfjax.Composition(cfjax.Strang(), 4), suzuki),
     ):
 

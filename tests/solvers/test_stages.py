@@ -18,11 +18,9 @@ import cfjax
 from cfjax._methods.continuous_extension import continuous_extension
 
 SOLVERS = {
-    "CF3": cfjax.CF3(),
     "CF4": cfjax.CF4(),
     "CG3": cfjax.CG3(),
     "RKMK(Tsit5)": cfjax.RKMK(diffrax.Tsit5.tableau),
-    "RKMK(Bosh3)": cfjax.RKMK(diffrax.Bosh3.tableau),
     "RKMK(Dopri8)": cfjax.RKMK(diffrax.Dopri8.tableau),
 }
 

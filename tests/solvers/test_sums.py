@@ -20,7 +20,7 @@ ARGS = jnp.asarray(problems.INERTIA)
 def test_the_length_of_the_momentum_over_a_million_steps():
     sol = cfjax.integrate(
         cfjax.LieTerm(problems.rigid_body),
-        cfjax.CF4(),
+        cfjax.CF2(),
         0.0,
         1e5,
         Y0,
