@@ -238,7 +238,7 @@ def test_inside_jit_and_vmap():
 
 def test_the_derivative_in_the_end_time_is_the_velocity():
     """d y(t1) / d t1 = f(t1, y(t1)), and d y(t1) / d t0 = -dy/dy0 f(t0, y0), up to the method."""
-    t0, t1, y0, args = POINT
+    t0, t1, y0, _ = POINT
 
     def fine(t0, t1, y0):
         end = solve(solver=cfjax.CF3(), t0=t0, t1=t1, y0=y0, num_steps=2000).ys[-1]
@@ -521,7 +521,7 @@ def test_what_is_said_of_an_implicit_solver_without_tolerances_can_be_pasted(nam
     # The first order method: 2 steps of error (h^2 / 2) exp(-0.1).
     np.testing.assert_allclose(with_implicit(solver).ys[-1], np.exp(-0.1), rtol=3e-3)
     # A failure of the solver is an error: y = 1 + h (100 (1 + y^2) - y) has no solution.
-    with pytest.raises(eqx.EquinoxRuntimeError, match="(?i)nonlinear solve"):
+    with pytest.raises(eqx.EquinoxRuntimeError, match=r"(?i)nonlinear solve"):
         with_implicit(solver, args=100.0)
 
 
