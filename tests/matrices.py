@@ -138,6 +138,15 @@ def inverse_derivative_of_exp(a, basis, b):
     return np.linalg.lstsq(np.stack(columns, -1).reshape(-1, len(basis)), right.ravel())[0]
 
 
+def rkmk3_step(generator, t, h, y):
+    """A step of RKMK3 for `y' = generator(t, y) y`."""
+    flow = scipy.linalg.expm
+    k1 = h * generator(t, y)
+    k2 = h * generator(t + h / 2, flow(k1 / 2) @ y)
+    k3 = h * generator(t + h, flow(2 * k2 - k1) @ y)
+    return flow((k1 + 4 * k2 + k3 - k1 @ k2 + k2 @ k1) / 6) @ y
+
+
 def motions(module: Any, v: Any, states: Any, places: Any, other: Any) -> Any:
     """Of angular velocities, with the velocity v, by one program: the velocity and the increment of
     states in frames, the bracket with another motion, and the inverse derivative.

@@ -48,39 +48,39 @@ def test_every_entry_is_relatively_accurate():
 
 
 def test_signs_zeros_and_moduli():
-    rate = jnp.array([-1e6, -800.0, -1.0, 0.0, 1.0, 700.0])
-    for point in (jnp.full(6, 0.3), jnp.full(6, -0.3), jnp.zeros(6), -jnp.zeros(6)):
-        flow = Scaling(rate).flow(point)
-        np.testing.assert_array_equal(jnp.signbit(flow), jnp.signbit(point))
-        np.testing.assert_array_equal(flow[3], point[3])
-        np.testing.assert_array_equal(flow == 0, (point == 0) | (rate < -760))
-    phases = Scaling(1j * jnp.linspace(-1e3, 1e3, 101).astype(complex)).flow(
-        jnp.full(101, 0.6 + 0.8j)
-    )
-    np.testing.assert_allclose(jnp.abs(phases), 1, rtol=0, atol=4 * EPS)
+    rate = np.array([-1e6, -800.0, -1.0, 0.0, 1.0, 700.0])
+    points = np.outer([0.3, -0.3, 0.0, -0.0], np.ones(6))
+    turns = 1j * np.linspace(-1e3, 1e3, 101)
+    flows, phases = jax.jit(
+        lambda x, z: (Scaling(rate[None]).flow(x), jnp.abs(Scaling(turns).flow(z)))
+    )(points, np.full(101, 0.6 + 0.8j))
+    for point, end in zip(points, flows, strict=True):
+        np.testing.assert_array_equal(np.signbit(end), np.signbit(point))
+        np.testing.assert_array_equal(end[3], point[3])
+        np.testing.assert_array_equal(end == 0, (point == 0) | (rate < -760))
+    np.testing.assert_allclose(phases, 1, rtol=0, atol=4 * EPS)
 
 
 def test_populations_stay_positive_however_long_the_step():
     """With rates of 5 and more in each step, where methods in plain space make them negative."""
     y0 = jnp.array([0.1, 3.0, 40.0])
 
-    def smallest(field, solver):
+    def smallest(field):
         term = cfjax.LieTerm(lambda t, y, args: field(5 * (1 - y) / (1 + jnp.abs(y)), y))
-        sol = cfjax.integrate(term, solver, 0.0, 10.0, y0, num_steps=5, save_every=1)
+        sol = cfjax.integrate(term, cfjax.CF2(), 0.0, 10.0, y0, num_steps=5, save_every=1)
         return float(jnp.min(sol.ys))
 
-    for solver in (cfjax.CF4(), cfjax.RKMK5()):
-        assert smallest(lambda rate, y: rate * y, solver) < 0
-        assert smallest(lambda rate, y: Scaling(rate), solver) > 0
+    assert smallest(lambda rate, y: rate * y) < 0
+    assert smallest(lambda rate, y: Scaling(rate)) > 0
 
 
 def test_what_is_small_decays_as_accurately_as_what_is_large():
     """A compensated sum would lose it: the entries are 1 and 1e-20 of what a step takes away."""
     term = cfjax.LieTerm(lambda t, y, args: Scaling(jnp.full(3, -7.0)))
     y0 = jnp.array([1.0, 1e-20, -1e-200])
-    y1 = cfjax.integrate(term, cfjax.CF4(), 0.0, 30.0, y0, num_steps=60).ys[-1]
-    # Five flows in each of 60 steps, each with three units and with a rate of up to 3.5.
-    np.testing.assert_allclose(y1, y0 * np.exp(-210.0), rtol=5 * 60 * 6 * EPS)
+    y1 = cfjax.integrate(term, cfjax.CF2(), 0.0, 30.0, y0, num_steps=60).ys[-1]
+    # Two flows in each of 60 steps, each with three units and with a rate of up to 3.5.
+    np.testing.assert_allclose(y1, y0 * np.exp(-210.0), rtol=2 * 60 * 6 * EPS)
 
 
 def test_derivatives_of_what_decays():
@@ -104,7 +104,7 @@ def test_derivatives_of_what_decays():
 
 
 def test_rates_are_broadcast():
-    shapes = [(), (1,), (4,), (1, 4), (3, 1), (3, 4), (2, 1, 1), (2, 3, 4)]
+    shapes = [(), (4,), (1, 4), (3, 1), (2, 1, 1)]
     x = jnp.asarray(normal(2, 2, 3, 4))
 
     def motions(fields):
@@ -118,10 +118,6 @@ def test_rates_are_broadcast():
         # An exponential of a rate is computed once.
         jaxpr = str(jax.make_jaxpr(field.flow)(x))
         assert f"f64[{','.join(map(str, shape))}] = exp" in jaxpr
-    term = cfjax.LieTerm(lambda t, y, args: fields[4])
-    y1 = cfjax.integrate(term, cfjax.CF2(), 0.0, 1.0, x, num_steps=2).ys[-1]
-    # Four flows, each of some units.
-    np.testing.assert_allclose(y1, wants[4][0], rtol=20 * EPS)
 
 
 def test_the_algebra_commutes():
@@ -133,7 +129,7 @@ def test_the_algebra_commutes():
 
 def test_a_munthe_kaas_method_acts_on_logarithms():
     """It is the method of its tableau for them, exactly."""
-    solver = cfjax.RKMK5()
+    solver = cfjax.RKMK(diffrax.Bosh3.tableau)
 
     def rate(t, y):
         return jnp.stack([1 - y[1] + jnp.sin(t), y[0] - 1])
@@ -143,8 +139,8 @@ def test_a_munthe_kaas_method_acts_on_logarithms():
     y0 = jnp.array([0.4, 1.2])
     y1 = cfjax.integrate(amounts, solver, 0.0, 5.0, y0, num_steps=8).ys[-1]
     z1 = cfjax.integrate(logarithms, solver, 0.0, 5.0, jnp.log(y0), num_steps=8).ys[-1]
-    # 6 stages of 8 steps, each with some units, and a flow of the equation that enlarges them.
-    np.testing.assert_allclose(y1, jnp.exp(z1), rtol=5e2 * EPS)
+    # 3 stages of 8 steps, each with some units, and a flow of the equation that enlarges them.
+    np.testing.assert_allclose(y1, np.exp(z1), rtol=250 * EPS)
 
 
 def test_refuses(no_shape_hook, subtests):
@@ -215,7 +211,8 @@ TERMS = diffrax.MultiTerm(
 )
 
 
-@pytest.mark.parametrize(("solver", "order"), [(cfjax.BlanesMoan4(), 4), (cfjax.Strang(), 2)])
+@pytest.mark.representatives(1)
+@pytest.mark.parametrize(("solver", "order"), [(cfjax.Strang(), 2), (cfjax.BlanesMoan4(), 4)])
 def test_the_order_of_a_splitting_for_a_soliton(solver, order):
     y0 = jnp.asarray(soliton(0.0))
 
