@@ -127,6 +127,7 @@ def test_correlation_functions_move_any_operator():
     np.testing.assert_allclose(scope["correlation"], scope["exact"], rtol=0, atol=1e-5)
 
 
+@pytest.mark.slow
 def test_quasienergies_are_those_of_a_constant_hamiltonian():
     with jax.numpy_dtype_promotion("standard"), jax.numpy_rank_promotion("allow"):
         code = blocks(section("state/quantum.md", "Many periods, and pulses"))

@@ -49,7 +49,7 @@ FAMILIES = {
 
 
 def by_integrate(term, y0, args, throw):
-    solution = cfjax.integrate(term, cfjax.CF4(), 0.0, 1.0, y0, args, num_steps=3, throw=throw)
+    solution = cfjax.integrate(term, cfjax.CF2(), 0.0, 1.0, y0, args, num_steps=3, throw=throw)
     return solution.ys
 
 

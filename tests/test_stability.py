@@ -150,19 +150,6 @@ def test_known_intervals_of_stability():
         assert np.all(growth(limit * np.array([1 + 1e-9, 1.01, 2])) > 1)
 
 
-def test_the_limit_is_that_of_many_steps():
-    """CF4 at an exact part of z = -20: just inside the limit steps decay, outside they grow."""
-    z, tableau = -20.0, cfjax.CF4.tableau
-    w = np.linspace(-30, 0, 300_001)
-    stable = np.abs(cfjax.stability_function(tableau, z, w)) <= 1
-    limit = w[np.flatnonzero(stable)[0]]
-    # More than the 2.785 without an exact part: the flow damps what the explicit part excites.
-    assert -25 < limit < -20
-    factors = np.array([0.99, 1.01])
-    step = one_step(cfjax.CF4(), jnp.full(2, z + 0j), jnp.asarray(factors * limit + 0j))
-    assert (np.abs(step) ** 20 > 1).tolist() == [False, True]
-
-
 def test_phi_at_small_and_large_arguments():
     """A step of the exponential Euler method is exp(z) + w (exp(z) - 1) / z."""
     z = np.array([1e-300, 1e-17, -1e-9, 1e-5j, 1e-3 + 1e-4j, -1.0, 700j, -1e3, -1e10])
@@ -192,7 +179,7 @@ LENGTH = np.linalg.norm(rigid_body.y0)
 @pytest.mark.representatives(1)
 @pytest.mark.parametrize(
     "solver, dtype",
-    [(cfjax.CF3(), np.float32), (cfjax.RKMK4(), np.float32), (cfjax.CF4(), np.float64)],
+    [(cfjax.CF2(), np.float32), (cfjax.RKMK4(), np.float32), (cfjax.CF4(), np.float64)],
 )
 def test_large_steps_stay_on_the_sphere(solver, dtype):
     """However large the angle, a rotation is one.
@@ -208,33 +195,6 @@ def test_large_steps_stay_on_the_sphere(solver, dtype):
         length = np.linalg.norm(np.asarray(ys, float), axis=1)
         # 64 steps of two flows, each with a few roundings: a random walk of 5 sqrt(128) halves.
         assert np.abs(length - LENGTH).max() < 5 * np.sqrt(128) * eps / 2
-
-
-@pytest.mark.slow
-def test_a_huge_first_step_is_rejected():
-    tolerance = 1e-6
-
-    @jax.jit
-    def solve(dt0):
-        sol = diffrax.diffeqsolve(
-            TERM,
-            diffrax.HalfSolver(cfjax.CF4()),
-            0.0,
-            50.0,
-            dt0,
-            START,
-            INERTIA,
-            stepsize_controller=diffrax.PIDController(rtol=0.0, atol=tolerance),
-            adjoint=diffrax.ForwardMode(),
-        )
-        return sol.ys[-1], sol.stats["num_rejected_steps"]
-
-    for dt0 in (0.01, 10.0, 50.0):
-        end, rejected = solve(jnp.asarray(dt0))
-        # Some 500 steps with errors of both signs below the tolerance, which grow with time.
-        assert np.linalg.norm(np.asarray(end) - rigid_body.reference(50.0)) < 100 * tolerance
-        # Each rejection divides the step by at most ten, down to about 0.1.
-        assert rejected >= np.log10(dt0 / 0.1)
 
 
 # Near-singular parameters of the third-order families
@@ -327,18 +287,13 @@ def growth(solver, h):
 
 
 LAMBDA = 0.1931833275037836  # Omelyan, Mryglod & Folk, doi:10.1016/S0010-4655(02)00754-3
-OMELYAN = (LAMBDA, 0.5 - LAMBDA, 0.5 - LAMBDA, LAMBDA)
 
 
-@pytest.mark.parametrize(
-    "stages, quartic",
-    [((0.5, 0.5), 0.0), (OMELYAN, LAMBDA * (0.5 - LAMBDA))],
-    ids=["Strang", "Omelyan2"],
-)
-def test_the_longest_step_of_an_oscillator(stages, quartic):
+def test_the_longest_step_of_an_oscillator():
     """The trace of a step's matrix is 2 - h^2 + quartic h^4, and a step is stable up to -2."""
+    quartic = LAMBDA * (0.5 - LAMBDA)
     limit = np.sqrt(8 / (1 + np.sqrt(1 - 16 * quartic)))
-    solver = cfjax.Splitting(stages)
+    solver = cfjax.Splitting((LAMBDA, 0.5 - LAMBDA, 0.5 - LAMBDA, LAMBDA))
     # Close to the limit the ellipse of a stable orbit is long, by the inverse root of the distance.
     assert growth(solver, 0.999 * limit) < 100
     # Beyond it a step grows by more than one in twenty.
