@@ -336,21 +336,16 @@ ESTIMATES = [
     if estimate == "group" or (row.embedded and "family" not in name)
 ]
 QUICK = [
-    ("CF4", "group", BODY),
     ("CF3", "algebra", BODY),
     ("RKMK4", "group", BODY),
-    ("CF4", "group", LEFT),
     ("RKMK3", "algebra", LEFT),
     ("CF3", "group", RIGHT),
 ]
 SLOW = [
     # The estimate of RKMK8 is close to rounding there.
     *((*c, BODY) for c in ESTIMATES if (*c, BODY) not in QUICK and c[0] != "RKMK8"),
-    *(
-        (name, "group", problem)
-        for problem in (LEFT, RIGHT)
-        for name in ("CF54", "Luscher3", "RKMK5")
-    ),
+    *((name, "group", LEFT) for name in ("CF4", "CF54", "RKMK5")),
+    *((name, "group", RIGHT) for name in ("CF54", "Luscher3", "RKMK5")),
 ]
 
 
