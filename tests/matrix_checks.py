@@ -80,9 +80,11 @@ VARYING = {
 }
 
 
-def check_many_steps(subtests, solver, given, num_steps, fixed=fixed_of, is_relative=False):
+def check_many_steps(
+    subtests, solver, given, num_steps, fixed=fixed_of, is_relative=False, more=VARYING
+):
     """In steps of 0.1: what stays does to 5e-14, of the largest entry above 1 if relative."""
-    given = VARYING | given
+    given = more | given
     ends: Any = product(given).end(solver, 0.1 * num_steps, num_steps)
     for name, flow in given.items():
         found, expected = (fixed(name, np.asarray(y)) for y in (ends[name], flow.y0))

@@ -1,5 +1,7 @@
 """The implicit midpoint rule: order, derivatives, and iterations that do not converge."""
 
+import functools
+
 import diffrax
 import equinox as eqx
 import jax
@@ -35,65 +37,55 @@ def test_order_of_the_midpoint(kind, request, matrix_problems):
         assert 3.8 < order(cfjax.Composition(MIDPOINT, 4), 8, 16) < 4.2
 
 
-def test_derivatives_of_the_midpoint_are_those_of_the_implicit_function():
-    def end(y, inertia):
-        return cfjax.integrate(TERM, MIDPOINT, 0.0, 1.0, y, inertia, num_steps=4).ys[-1]
+def end_of_body(y, inertia, solver=MIDPOINT):
+    """After four steps: calls with the same shapes have one program."""
+    return cfjax.integrate(TERM, solver, 0.0, 1.0, y, inertia, num_steps=4).ys[-1]
 
-    forward, reverse = (
-        jax.jit(d(end, argnums=(0, 1)), compiler_options=problems.QUICK)(START, INERTIA)
-        for d in (jax.jacfwd, jax.jacrev)
-    )
-    for k, (a, b) in enumerate(zip(forward, reverse, strict=True)):
-        # Two linear solves, each to rounding.
-        np.testing.assert_allclose(a, b, rtol=0, atol=1e-14)
+
+def test_derivatives_of_the_midpoint_are_those_of_the_implicit_function():
+    """In forward mode they are in test_fixed_point.py."""
+    weights, times = np.array([1.0, -0.5, 2.0]), problems.arrays((0.0, 0.25))
+
+    @jax.jit
+    def step(y, inertia):
+        return problems.first_step(MIDPOINT, TERM, *times, y, inertia)[0]
+
+    @functools.partial(jax.jit, compiler_options=problems.QUICK)
+    def gradients(*x):
+        return jax.vjp(step, *x)[1](jnp.asarray(weights))
+
+    x = problems.MOMENTUM, problems.INERTIA
+    for k, gradient in enumerate(gradients(START, INERTIA)):
         for j in range(3):
-            step = 1e-5 * jnp.eye(3)[j]
-            args = [START, INERTIA]
+            change = 1e-5 * np.eye(3)[j]
             plus, minus = (
-                end(*[x + sign * step if i == k else x for i, x in enumerate(args)])
-                for sign in (1, -1)
+                np.asarray(step(*[jnp.asarray(a + d if i == k else a) for i, a in enumerate(x)]))
+                for d in (change, -change)
             )
             # The square of the difference, and rounding over it.
-            np.testing.assert_allclose(a[:, j], (plus - minus) / 2e-5, rtol=0, atol=1e-9)
-    # At rest nothing moves, and the derivative is the identity.
-    rest = cfjax.LieTerm(lambda t, y, args: cfjax.Rotation(0 * y))
-    still = lambda y: cfjax.integrate(rest, MIDPOINT, 0.0, 1.0, y, num_steps=2).ys[-1]  # noqa: E731
-    found = jax.jit(jax.jacrev(still), compiler_options=problems.QUICK)(START)
-    np.testing.assert_array_equal(found, np.eye(3))
+            slope = weights @ (plus - minus) / 2e-5
+            np.testing.assert_allclose(gradient[j], slope, rtol=0, atol=1e-9)
+    # With infinite inertia nothing moves, and the derivative is the identity.
+    np.testing.assert_array_equal(gradients(START, jnp.full(3, jnp.inf))[0], weights)
 
 
 def test_a_midpoint_that_does_not_converge_fails():
-    for solver in (MIDPOINT, cfjax.Composition(MIDPOINT, 4)):
-        with pytest.raises(eqx.EquinoxRuntimeError, match="diverged"):
-            cfjax.integrate(TERM, solver, 0.0, 100.0, 5 * START, INERTIA, num_steps=3)
     with pytest.raises(eqx.EquinoxRuntimeError, match="diverged"):
-        diffrax.diffeqsolve(TERM, MIDPOINT, 0.0, 100.0, 30.0, 5 * START, INERTIA)
+        end_of_body(400 * START, INERTIA)
+    solver = cfjax.Composition(MIDPOINT, 4)
+    with pytest.raises(eqx.EquinoxRuntimeError, match="diverged"):
+        diffrax.diffeqsolve(TERM, solver, 0.0, 100.0, 30.0, 5 * START, INERTIA)
 
 
 def test_few_iterations_for_a_tolerance():
     """With rtol the solve ends earlier, and is as exact as that."""
-
-    def end(solver):
-        return cfjax.integrate(TERM, solver, 0.0, 1.0, START, INERTIA, num_steps=2).ys[-1]
-
     rtol = 1e-6
-    off = np.max(np.abs(end(cfjax.ImplicitMidpoint(rtol=rtol)) - end(MIDPOINT)))
-    # A change below rtol leaves about as much, in each of two steps.
+    low = end_of_body(START, INERTIA, cfjax.ImplicitMidpoint(rtol=rtol))
+    off = np.max(np.abs(low - end_of_body(START, INERTIA)))
+    # A change below rtol leaves about as much, in each of four steps.
     assert 1e-3 * rtol < off < 2 * rtol
     with pytest.raises(eqx.EquinoxRuntimeError, match="diverged"):
-        end(cfjax.ImplicitMidpoint(max_steps=3))
-
-
-def test_batches_and_float32():
-    starts = jnp.stack([START, 2 * START, 0.5 * START])
-    end = lambda y: cfjax.integrate(TERM, MIDPOINT, 0.0, 1.0, y, INERTIA, num_steps=4).ys[-1]  # noqa: E731
-    one_by_one = jnp.stack([end(y) for y in starts])
-    # A batch iterates until the last has converged, to rounding.
-    np.testing.assert_allclose(jax.vmap(end)(starts), one_by_one, rtol=0, atol=1e-14)
-    start, inertia = START.astype(jnp.float32), INERTIA.astype(jnp.float32)
-    low = cfjax.integrate(TERM, MIDPOINT, 0.0, 1.0, start, inertia, num_steps=4).ys[-1]
-    assert low.dtype == jnp.float32
-    np.testing.assert_allclose(low, end(START), rtol=0, atol=2e-6)
+        end_of_body(START, INERTIA, cfjax.ImplicitMidpoint(max_steps=3))
 
 
 def test_wrong_arguments(no_shape_hook, subtests):
