@@ -113,23 +113,28 @@ def test_length_is_kept_over_many_steps(n, num_steps):
     assert np.abs(wide[-1] - wide[-2]).max() > 1e-2
 
 
-def test_landing_by_cayleys_transform():
-    """Of each of two points."""
-    g, y = np.asarray(normal(2, 6)), np.asarray(unit(2, 6))
+def test_coordinates_of_cayley():
+    """Where each of two points lands, and the rate with which the end has a velocity."""
+    g, f, y = np.asarray(normal(2, 6)), np.asarray(normal(2, 6, seed=3)), np.asarray(unit(2, 6))
 
     @jax.jit
-    def landing(g, y):
+    def found(g, f, y):
         coordinates = SphereRotation(g).cayley(y)
         assert coordinates.has_rate() is None
-        return coordinates.landing(y)
+        increment, is_there = coordinates.landing(y)
+        rate = coordinates.rate(SphereRotation(f).cayley(y + increment), y)
+        return increment, rate.tangent(y), is_there
 
-    increments, are_there = landing(g, y)
+    *ends, are_there = found(g, f, y)
     assert are_there
-    for increment, g_of_one, start in zip(increments, g, y, strict=True):
-        a = dense(g_of_one, start) / 2
+    for g_of_one, f_of_one, start, increment, rate in zip(g, f, y, *ends, strict=True):
+        a, change = dense(g_of_one, start) / 2, dense(rate, start) / 2
         want = np.linalg.solve(np.eye(6) - a, 2 * a @ start)
         # Some units for numbers of size 1.
         np.testing.assert_allclose(increment, want, rtol=0, atol=4e-15)
+        moves = np.linalg.solve(np.eye(6) - a, change @ (want + 2 * start))
+        velocity = dense(f_of_one, start + want) @ (start + want)
+        np.testing.assert_allclose(moves, velocity, rtol=0, atol=4e-14)
 
 
 # What is refused
