@@ -5,6 +5,7 @@ Brownian motion. The reference is `ShiftedNoise` at the fine steps: one that kne
 order 3/2.
 """
 
+import functools
 from typing import Any
 
 import brownian_paths as paths
@@ -36,21 +37,17 @@ def but_slow(*quick):
     return pytest.mark.parametrize("solver", cases, ids=lambda x: type(x).__name__)
 
 
-@pytest.fixture(scope="module")
-def references():
-    """For each number of channels the paths and the ends of the solution."""
-    found = {}
-    for channels in (1, 2):
-        path = paths.drawn(channels, NUMBER, (channels,), FINE)
-        fine = jnp.asarray(FINE)
-        end = paths.ends(paths.terms, cfjax.ShiftedNoise(), path, paths.SPHERE_START, fine)
-        found[channels] = path, end
-    return found
+@functools.cache
+def reference(channels):
+    """Paths of so many channels, and the ends of the solution."""
+    path = paths.drawn(channels, NUMBER, (channels,), FINE)
+    fine = jnp.asarray(FINE)
+    return path, paths.ends(paths.terms, cfjax.ShiftedNoise(), path, paths.SPHERE_START, fine)
 
 
-@but_slow(cfjax.WeakOrder2())
-def test_noise_that_does_not_commute_has_order_half(references, solver):
-    path, end = references[2]
+@but_slow()
+def test_noise_that_does_not_commute_has_order_half(solver):
+    path, end = reference(2)
     errors = paths.strong_errors(paths.terms, solver, path, paths.SPHERE_START, STEPS, end)
     # The order is 1/2 with increments and areas in time, whatever the method (Clark & Cameron).
     assert 0.45 < slope(STEPS, errors) < 0.65
@@ -58,8 +55,8 @@ def test_noise_that_does_not_commute_has_order_half(references, solver):
 
 
 @but_slow(cfjax.CF4(), cfjax.ShiftedNoise())
-def test_one_channel_has_order_1_or_3_over_2(references, solver):
-    path, end = references[1]
+def test_one_channel_has_order_1_or_3_over_2(solver):
+    path, end = reference(1)
     errors = paths.strong_errors(paths.terms, solver, path, paths.SPHERE_START, STEPS, end)
     is_better = isinstance(solver, cfjax.ShiftedNoise)
     least, most = (1.4, 1.75) if is_better else (0.85, 1.2)
@@ -67,8 +64,8 @@ def test_one_channel_has_order_1_or_3_over_2(references, solver):
     assert errors[-1] < (5e-4 if is_better else 5e-3)
 
 
-def stratonovich_drift(t, y, args):
-    """The drift of the equation that is `drift` and `noise` in the sense of Itô in the frame."""
+def drift_of_both_senses(t, y, args):
+    """With a part of the state that says whether `drift` and `noise` are meant as Itô's."""
 
     def correction(channel):
         return jax.jvp(
@@ -78,27 +75,31 @@ def stratonovich_drift(t, y, args):
         )[1]
 
     total = sum(map(correction, jnp.eye(2)), start=jnp.zeros(3))
-    return {"y": cfjax.Rotation(paths.drift_of(y["y"]) - total / 2)}
+    return {"y": cfjax.Rotation(paths.drift_of(y["y"]) - y["is_ito"] * total / 2), "is_ito": None}
 
 
-def corrected(path):
-    return diffrax.MultiTerm(
-        cfjax.LieTerm(stratonovich_drift), cfjax.LieControlTerm(paths.noise, path)
-    )
+def terms_of_both_senses(path):
+    noise = lambda t, y, args, dw: paths.noise(t, y, args, dw) | {"is_ito": None}  # noqa: E731
+    return diffrax.MultiTerm(cfjax.LieTerm(drift_of_both_senses), cfjax.LieControlTerm(noise, path))
 
 
-def test_lie_euler_takes_noise_in_the_sense_of_ito_in_the_frame(references):
-    path, stratonovich_end = references[2]
-    fine = jnp.asarray(FINE)
-    end = paths.ends(corrected, cfjax.CF4(), path, paths.SPHERE_START, fine)
+def test_lie_euler_takes_noise_in_the_sense_of_ito_in_the_frame():
+    path = paths.drawn(2, NUMBER, (2,), FINE)
+
+    def end(is_ito):
+        start = paths.SPHERE_START | {"is_ito": jnp.asarray(is_ito)}
+        found = paths.ends(terms_of_both_senses, cfjax.CF4(), path, start, jnp.asarray(FINE))
+        return {"y": found["y"]}
+
+    ito, stratonovich = end(1.0), end(0.0)
     euler: Any = cfjax.LieEuler()
-    errors = paths.strong_errors(paths.terms, euler, path, paths.SPHERE_START, STEPS, end)
+    errors = paths.strong_errors(paths.terms, euler, path, paths.SPHERE_START, STEPS, ito)
     assert 0.45 < slope(STEPS, errors) < 0.65
     # From the Stratonovich equation of the same fields it stays away: its error at the finest steps
     # is the distance of both equations, which the error of order 1/2 has long fallen below.
-    gap = paths.rms(end, stratonovich_end)
+    gap = paths.rms(ito, stratonovich)
     away = paths.strong_errors(
-        paths.terms, euler, path, paths.SPHERE_START, [256, FINE], stratonovich_end
+        paths.terms, euler, path, paths.SPHERE_START, [256, FINE], stratonovich
     )
     assert gap > 0.1
     np.testing.assert_allclose(away, gap, rtol=0.1)
