@@ -63,7 +63,7 @@ def check_text(printed):
         assert text in printed
 
 
-@pytest.mark.representatives(1)
+@pytest.mark.slow
 @pytest.mark.parametrize("extra", ["matplotlib", "rich"])
 def test_missing_extra(extra):
     code = f"""

@@ -4,7 +4,6 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import problems
-import pytest
 from scipy.linalg import expm
 
 import cfjax
@@ -92,20 +91,3 @@ def test_choi_of_a_known_map():
     # A transpose is positive, but not completely.
     turned = damped_qubit.choi(lambda t, rho, _: rho.T, jnp.zeros(()), None)
     np.testing.assert_allclose(np.linalg.eigvalsh(turned), [-1, 1, 1, 1], atol=1e-15)
-
-
-@pytest.mark.slow
-def test_the_derivative_in_the_rate():
-    def excited(decay):
-        args = QUBIT._replace(decay=decay)
-        sol = cfjax.integrate(
-            TERM, cfjax.Magnus4(), 0.0, 5.0, damped_qubit.y0(), args, num_steps=320
-        )
-        return sol.ys[-1, 1, 1].real
-
-    exact = [
-        damped_qubit.reference(5.0, QUBIT._replace(decay=0.2 + h))[1, 1].real for h in (-1e-3, 1e-3)
-    ]
-    # The quotient is off by 1e-6 of a third derivative, the method by some 1e-8.
-    _, slope = jax.jvp(excited, (0.2,), (1.0,))
-    np.testing.assert_allclose(slope, (exact[1] - exact[0]) / 2e-3, rtol=0, atol=1e-5)

@@ -77,6 +77,7 @@ def test_the_field_descends_the_energy():
         np.testing.assert_allclose(tangent, want, rtol=0, atol=1e-14)
 
 
+@pytest.mark.slow
 def test_the_radius_is_bounded():
     y = jnp.asarray(harmonic_maps.y0(6))
     later = jnp.asarray(end(y, 0.0, 2.5, 5.0))

@@ -5,7 +5,6 @@ import jax.numpy as jnp
 import mpmath
 import numpy as np
 import problems
-import pytest
 
 import cfjax
 from cfjax.scenes import heat
@@ -32,29 +31,19 @@ def end(solution) -> jax.Array:
 # The problem
 
 
-def test_diffusivity_and_initial_value():
-    # A JAX array made at import would be in float32 if x64 comes on later.
-    for constant in (heat.y0(), *heat.diffusivity()):
-        assert type(constant) is np.ndarray
-        assert constant.dtype == np.float64
+def test_fields_are_the_equation():
     mu, constant = heat.diffusivity()
     x = -1 + 0.02 * np.arange(101)
     np.testing.assert_allclose(mu, 1 - ((x[1:] + x[:-1]) / 2) ** 2, rtol=1e-13)
     # By hand: the mean of 1 - x^2 over N midpoints is 2/3 + 1/(3 N^2).
     np.testing.assert_allclose(constant, 2 / 3 + 1 / 30000, rtol=1e-14)
-    for n in (10, 99):
-        x = np.linspace(-1, 1, n + 1)[1:-1]
-        found = heat.to_grid(jnp.asarray(heat.y0(n)))
-        np.testing.assert_allclose(found, 1 - np.abs(x), rtol=0, atol=1e-13)
-        np.testing.assert_allclose(heat.from_grid(found), heat.y0(n), rtol=0, atol=1e-13)
 
-
-def test_fields_are_the_equation():
     @jax.jit
     def parts(u, args):
         y = heat.from_grid(u)
         field = heat.field(0.0, y, args)
-        linear = (field.b, field.tangent(y), field.spectrum * y)
+        start = jnp.asarray(heat.y0(len(u) + 1))
+        linear = (field.b, field.tangent(y), field.spectrum * y, y, start)
         return heat.grid_field(0.0, u, args), *map(heat.to_grid, linear)
 
     for n in (10, 99):
@@ -64,11 +53,14 @@ def test_fields_are_the_equation():
         # The operator has norm n^2, points have norm sqrt(n), and a transform and its inverse add
         # rounding of 4 sqrt(n) units of the largest entry each, as its own tests bound it.
         atol = 2.0**-52 * n**2 * 8 * np.sqrt(n)
-        grid, b, tangent, linear = parts(jnp.asarray(u), arguments(n))
+        grid, b, tangent, linear, same, start = parts(jnp.asarray(u), arguments(n))
         np.testing.assert_allclose(grid, a @ u, rtol=0, atol=atol)
         np.testing.assert_allclose(b, (a - m) @ u, rtol=0, atol=atol)
         np.testing.assert_allclose(tangent, a @ u, rtol=0, atol=2 * atol)
         np.testing.assert_allclose(linear, m @ u, rtol=0, atol=2 * atol)
+        np.testing.assert_allclose(same, u, rtol=0, atol=1e-13)
+        x = np.linspace(-1, 1, n + 1)[1:-1]
+        np.testing.assert_allclose(start, 1 - np.abs(x), rtol=0, atol=1e-13)
 
 
 def test_reference():
@@ -124,22 +116,6 @@ def test_translations_make_the_classical_runge_kutta_method():
     np.testing.assert_allclose(end(found), wanted, rtol=0, atol=1e-14)
 
 
-@pytest.mark.slow
-def test_grid_values_with_a_transform_give_the_same_steps():
-    def field(t, u, args):
-        spectrum = heat.field(t, u, args).spectrum
-        b = heat.grid_field(t, u, args._replace(mu=args.mu - args.constant))
-        return cfjax.Affine(b, spectrum, cfjax.SineTransform())
-
-    def steps(term, y):
-        return end(cfjax.integrate(term, cfjax.CF4(), 0.0, 0.1, y, arguments(20), num_steps=20))
-
-    y0 = jnp.asarray(heat.y0(20))
-    found = steps(cfjax.LieTerm(field), heat.to_grid(y0))
-    wanted = heat.to_grid(steps(COEFFICIENTS, y0))
-    np.testing.assert_allclose(found, wanted, rtol=0, atol=1e-13)
-
-
 def test_a_step_costs_eight_transforms():
     y0, args = jnp.asarray(heat.y0(300)), arguments(300)
 
@@ -150,56 +126,4 @@ def test_a_step_costs_eight_transforms():
     assert text is not None and text.count(" fft(") == 8
 
 
-@pytest.mark.slow
-def test_float32():
-    y0, args = jnp.asarray(heat.y0(100), jnp.float32), arguments(100)
-    args = jax.tree.map(lambda x: x.astype(jnp.float32), args)
-    found = cfjax.integrate(COEFFICIENTS, cfjax.CF4(), 0.0, 0.5, y0, args, num_steps=50)
-    assert end(found).dtype == jnp.float32
-    double = cfjax.integrate(
-        COEFFICIENTS, cfjax.CF4(), 0.0, 0.5, heat.y0(100), arguments(100), num_steps=50
-    )
-    # Each step rounds the balance of M y and b, which are a hundred times the state, and the
-    # flow divides by M again: some ten units of rounding a step, of a state of norm 6.
-    atol = 50 * 10 * 2.0**-24 * 6
-    np.testing.assert_allclose(end(found), end(double), rtol=0, atol=atol)
-
-
 # Derivatives of whole solutions
-
-
-@pytest.mark.slow
-def test_gradient_of_a_solution():
-    """With respect to the initial value and all of the diffusivity, through the spectrum too."""
-
-    def value(x):
-        solution = cfjax.integrate(COEFFICIENTS, cfjax.CF4(), 0.0, 0.2, *x, num_steps=20)
-        return jnp.sum(np.cos(np.arange(11.0)) * heat.to_grid(end(solution)))
-
-    x = (jnp.asarray(heat.y0(12)), arguments(12))
-    found = jax.jit(jax.grad(value))(x)
-    for seed in (1, 2):
-        direction = problems.random_like(x, seed)
-        wanted = problems.central_difference(jax.jit(value), x, direction, 1e-3)
-        product = float(problems.inner(found, direction))
-        # Differences with steps of 1e-3: 1e-12 times fifth derivatives, and 1e-15 / 1e-3 of
-        # rounding.
-        assert product == pytest.approx(float(wanted), abs=1e-9)
-    forward = jax.jvp(value, (x,), (direction,))[1]
-    assert product == pytest.approx(float(forward), rel=1e-11)
-
-
-@pytest.mark.slow
-def test_second_derivative_of_a_solution():
-    def value(constant):
-        args = arguments(9)._replace(constant=constant)
-        y0 = jnp.asarray(heat.y0(9))
-        solution = cfjax.integrate(COEFFICIENTS, cfjax.CF2(), 0.0, 0.2, y0, args, num_steps=4)
-        return jnp.sum(heat.to_grid(end(solution)) ** 2)
-
-    # Without the splitting the solution would not depend on it: what is seen is the error of four
-    # long steps. The difference leaves 1e-12 times the fifth derivative of the first.
-    constant = jnp.asarray(0.7)
-    wanted = problems.central_difference(jax.jit(jax.grad(value)), constant, 1.0, 1e-3)
-    assert float(jax.grad(jax.grad(value))(constant)) == pytest.approx(float(wanted), abs=1e-8)
-    assert float(jax.jacfwd(jax.grad(value))(constant)) == pytest.approx(float(wanted), abs=1e-8)

@@ -5,7 +5,7 @@ import numpy as np
 import pytest
 
 import cfjax
-from cfjax.scenes import hmc
+from cfjax.scenes import hmc, wilson_flow
 
 BETA = 4.0
 
@@ -22,7 +22,8 @@ def end_of(start, t0, t1, num_steps, solver):
 
 @pytest.fixture(scope="module")
 def start():
-    return hmc.y0(8, 2, beta=BETA, n=3)
+    links = np.stack([wilson_flow.y0(2, seed=k, dimensions=2) for k in range(8)])
+    return {"U": links, "P": np.asarray(hmc.momenta(jax.random.key(0), links.shape))}
 
 
 def test_the_exact_plaquette():

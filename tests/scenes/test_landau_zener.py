@@ -1,12 +1,10 @@
 """The Landau-Zener problem: its closed form at any time, its limit, and the norm."""
 
 import diffrax
-import jax
 import jax.numpy as jnp
 import mpmath
 import numpy as np
 import problems
-import pytest
 
 import cfjax
 from cfjax.scenes import landau_zener
@@ -49,21 +47,6 @@ def test_the_reference_is_the_closed_form(subtests):
                 np.testing.assert_allclose(found, closed_form(t, t_start, args), rtol=0, atol=1e-13)
 
 
-# Steps in which the error is well above rounding and the order seen. Those of Magnus6 are tested
-# with the propagator.
-@pytest.mark.slow
-@pytest.mark.parametrize(
-    ("solver", "num_steps", "order"), [(cfjax.CF4(), 160, 4), (cfjax.Magnus8(), 80, 8)]
-)
-def test_order(solver, num_steps, order):
-    exact = landau_zener.reference(landau_zener.t1)
-    times = problems.arrays((landau_zener.t0, landau_zener.t1))
-    given = landau_zener.field, solver, *times, jnp.asarray(landau_zener.y0()), landau_zener.slow
-    ends = [problems.many_steps(*given, jnp.asarray(n)) for n in (num_steps, 2 * num_steps)]
-    errors = [np.abs(end - exact).max() for end in ends]
-    assert 0.7 * 2**order < errors[0] / errors[1] < 1.4 * 2**order
-
-
 def test_the_limit():
     args = landau_zener.Sweep(2.0, 0.4)
     exact = landau_zener.reference(30.0, args=args, t_start=-30.0)
@@ -91,24 +74,6 @@ def test_a_propagator_has_its_order_and_stays_unitary_where_plain_space_loses_th
     # The error of the method, of order 6, with steps of 1/20.
     np.testing.assert_allclose(u @ landau_zener.y0(), exact, rtol=0, atol=1e-7)
     assert abs(np.linalg.norm(off) - 1) > 1e-9
-
-
-@pytest.mark.slow
-def test_the_derivative_in_the_coupling():
-    def stays(coupling):
-        args = landau_zener.Sweep(1.0, coupling)
-        sol = cfjax.integrate(
-            TERM, cfjax.Magnus8(), -10.0, 10.0, landau_zener.y0(), args, num_steps=320
-        )
-        return landau_zener.staying(sol.ys[-1])
-
-    def exactly(coupling):
-        args = landau_zener.Sweep(1.0, coupling)
-        return np.abs(closed_form(10.0, -10.0, args)[0]) ** 2
-
-    slope = (exactly(0.5 + 1e-5) - exactly(0.5 - 1e-5)) / 2e-5
-    # The difference is off by 1e-10 times a third derivative, and by 1e-16 / 1e-5.
-    np.testing.assert_allclose(jax.grad(stays)(0.5), slope, rtol=0, atol=1e-8)
 
 
 def test_energies():

@@ -1,6 +1,5 @@
 """Euler's equations on the sphere as a matrix: exact solutions, harmonics, and what is kept."""
 
-import diffrax
 import jax.numpy as jnp
 import numpy as np
 import problems
@@ -154,23 +153,3 @@ def test_energy_and_momentum_on_the_sphere():
 def test_the_start_is_one_for_all_sizes():
     first, second = (zeitlin.to_harmonics(zeitlin.y0(n, degree=3))[:4, :4] for n in (N, 32))
     np.testing.assert_allclose(first, second, rtol=0, atol=1e-14)
-
-
-@pytest.mark.slow
-@pytest.mark.filterwarnings("ignore:Complex dtype support")
-def test_the_spectrum_at_32():
-    start = zeitlin.y0()
-    inverse = jnp.asarray(zeitlin.inverse_laplacian(32))
-    sol = diffrax.diffeqsolve(
-        TERM,
-        cfjax.CF43(),
-        0.0,
-        10.0,
-        0.05,
-        jnp.asarray(start),
-        inverse,
-        stepsize_controller=diffrax.PIDController(rtol=0.0, atol=1e-6),
-    )
-    y = np.asarray(sol.ys[-1])
-    np.testing.assert_allclose(np.linalg.eigvalsh(y), np.linalg.eigvalsh(start), rtol=0, atol=3e-14)
-    assert np.abs(y - zeitlin.reference(10.0, start)).max() < 1e-4
