@@ -21,9 +21,9 @@ KINDS = "explicit", "shard_map"
 
 
 def differences(
-    kind: str, programs: Iterable[tuple[str, Callable, bool]]
+    kinds: Iterable[str], programs: Iterable[tuple[str, Callable, bool]]
 ) -> dict[str, float | str]:
-    """By name, how far the values on a mesh are from those on one device, or an error.
+    """By name and kind, how far values on a mesh are from those on one device, or an error.
 
     `programs` are names, functions of a batch, and whether these may be rewritten.
     """
@@ -32,18 +32,19 @@ def differences(
     found: dict[str, float | str] = {}
     for name, fun, is_on in programs:
         with cfjax.rewriting(is_on):
-            expected = jax.jit(fun)(STARTS)
-            spread = fun
-            if kind == "shard_map":
-                spread = jax.shard_map(fun, mesh=mesh, in_specs=P("i"), out_specs=P("i"))
-            with jax.set_mesh(mesh) if kind == "explicit" else contextlib.nullcontext():
-                try:
-                    value = jax.jit(spread)(starts)
-                except Exception as error:
-                    found[name] = repr(error)
-                else:
-                    assert value.sharding.spec[0] == "i"
-                    found[name] = float(np.abs(np.asarray(value) - np.asarray(expected)).max())
+            expected = np.asarray(jax.jit(fun)(STARTS))
+            for kind in kinds:
+                place, spread = f"{name}, {kind}", fun
+                if kind == "shard_map":
+                    spread = jax.shard_map(fun, mesh=mesh, in_specs=P("i"), out_specs=P("i"))
+                with jax.set_mesh(mesh) if kind == "explicit" else contextlib.nullcontext():
+                    try:
+                        value = jax.jit(spread)(starts)
+                    except Exception as error:
+                        found[place] = repr(error)
+                    else:
+                        assert value.sharding.spec[0] == "i"
+                        found[place] = float(np.abs(np.asarray(value) - expected).max())
     return found
 
 
@@ -63,12 +64,8 @@ def check(file: str, names: list[str], *arguments: str) -> None:
 
 
 def show(kind: str, programs: Iterable[tuple[str, Callable, bool]]) -> None:
-    """Prints the differences of a kind, or of "both", then with the kind in their names."""
+    """Prints the differences of a kind, or of "both"."""
     jax.config.update("jax_enable_x64", True)
     jax.config.update("jax_disable_most_optimizations", True)
-    found = differences(kind, programs) if kind in KINDS else {}
-    if kind == "both":
-        for each in KINDS:
-            shown = differences(each, programs).items()
-            found |= {f"{name}, {each}": value for name, value in shown}
+    found = differences(KINDS if kind == "both" else [kind], programs)
     print(json.dumps(found))
