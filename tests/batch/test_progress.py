@@ -11,18 +11,20 @@ from rich.progress import Progress
 import cfjax
 
 
+def decay(t, y, args):
+    return -y
+
+
+def mistaken(t, y, args):
+    raise ArithmeticError("a mistake")
+
+
 def work(progress):
     """Compiles one of four methods, and ends with the next, which cannot be traced."""
-
-    def mistaken(t, y, args):
-        raise ArithmeticError("a mistake")
-
-    fine, wrong = (
-        (diffrax.ODETerm(field), diffrax.Euler()) for field in (lambda t, y, args: -y, mistaken)
-    )
+    fine, wrong = ((diffrax.ODETerm(field), diffrax.Euler()) for field in (decay, mistaken))
     with pytest.raises(ArithmeticError, match="a mistake"):
         cfjax.work_precision(
-            cfjax.LieTerm(lambda t, y, args: -y),
+            cfjax.LieTerm(decay),
             0.0,
             1.0,
             jnp.ones(2),
