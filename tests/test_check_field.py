@@ -30,6 +30,7 @@ F32, F64, C64 = np.float32, np.float64, np.complex64
 # Of each way through the checks: leading columns, complex numbers, a mean, structure, a chart of
 # its own, a defect, and an increment.
 BUILT_IN: dict[str, tuple[Any, Any]] = {
+    "Scaling": (lambda: cfjax.Scaling(random(C64, 3, 1)), random(C64, 3, 4)),
     "Rotation, float32": (lambda: cfjax.Rotation(random(F32, 3)), random(F32, 3, 2)),
     "LeftMatrix": (lambda: cfjax.LeftMatrix(random(C64, 2, 2)), random(C64, 2, 3)),
     "Congruence": (
@@ -41,7 +42,6 @@ BUILT_IN: dict[str, tuple[Any, Any]] = {
         lambda: cfjax.Affine(random(F64, 4), SPECTRUM, cfjax.SineTransform(), alpha=random(F64)),
         random(F64, 4),
     ),
-    "Scaling": (lambda: cfjax.Scaling(random(C64, 3, 1)), random(C64, 3, 4)),
     "LowRankSkew": (lambda: cfjax.LowRankSkew(random(F64, 5, 2)), frame(F64, 5, 2)),
     "SphereRotation": (lambda: cfjax.SphereRotation(random(F64, 5)), frame(F64, 5, 1)[:, 0]),
     "QuaternionRotation": (
@@ -121,10 +121,6 @@ def double_bracket(self, other):
     return type(self)(0 * self.a, 2 * (self.a * other.b - other.a * self.b))
 
 
-def other_bracket(self, other):
-    return type(self)(0 * self.a, self.a * self.b * other.a)
-
-
 def doubled(cls, weights, fields):
     return cls(*(2 * sum(w * x for w, x in zip(weights, xs, strict=True)) for xs in ab(fields)))
 
@@ -151,8 +147,7 @@ MISTAKES = {
         dict(bracket=opposite_bracket),
         r"bracket must .*, here \[a, b\], but it has the opposite sign\.",
     ),
-    "twice": (dict(bracket=double_bracket), r"but it is 2 times what is expected\."),
-    "other": (dict(bracket=other_bracket), r"bracket must .* but it is off by"),
+    "twice": (dict(bracket=double_bracket), r"bracket must .* but it is 2 times what is expected"),
     "tangent of half": (
         dict(tangent=lambda self, point: (self.a * point + self.b) / 2),
         r"tangent must be the derivative of the flow .* but it is 0\.5 times what is expected",
@@ -274,10 +269,10 @@ def test_a_flow_that_is_wrong_for_some_signs_or_sizes_is_named():
 
 
 def test_a_stiff_field_may_overflow_backwards():
-    spectrum, transform = -1e4 * np.arange(1.0, 5), cfjax.SineTransform()
-    fields = [cfjax.Affine(random(F64, 4), spectrum, transform, alpha=a) for a in (0.7, 1.2)]
-    assert np.isnan(cfjax.combine((-1.0,), fields[:1]).flow(random(F64, 4))).any()
-    cfjax.check_field(fields, random(F64, 4))
+    spectrum, transform = -1e4 * np.arange(1.0, 3), cfjax.SineTransform()
+    fields = [cfjax.Affine(random(F64, 2), spectrum, transform, alpha=a) for a in (0.7, 1.2)]
+    assert np.isnan(jax.jit(cfjax.Affine.flow)(cfjax.combine((-1.0,), fields[:1]), POINT)).any()
+    cfjax.check_field(fields, POINT)
 
 
 # A class that acts on a subtree.

@@ -7,10 +7,10 @@ import diffrax
 import equinox as eqx
 import jax
 import jax.numpy as jnp
-import mpmath
 import numpy as np
 import pytest
 import scipy.linalg
+from problems import hat
 
 import cfjax
 from cfjax import AbstractAlgebraElement, AbstractFrozenField, LeftMatrix, Rotation
@@ -20,36 +20,32 @@ W = np.array([0.3, -0.7, 1.1])
 V = np.array([1.0, 0.5, -2.0])
 
 
-def hat(w):
-    return jnp.array([[0, -w[2], w[1]], [w[2], 0, -w[0]], [-w[1], w[0], 0]])
+class Stretch(AbstractAlgebraElement):
+    """Affine maps of positions together with their scale, which moves under them too."""
 
-
-class Screw(AbstractAlgebraElement):
-    """A rigid motion of an attitude and a position together: SE(3) from the left."""
-
-    omega: jax.Array
+    rate: jax.Array
     velocity: jax.Array
     acts_on_subtree: ClassVar[bool] = True
 
     def flow(self, point):
-        top = jnp.concatenate([hat(self.omega), self.velocity[:, None]], axis=1)
-        # Of norms below 6: the series of a 64th leaves 0.1^13 / 13!.
-        small, e = jnp.concatenate([top, jnp.zeros((1, 4))]) / 64, jnp.eye(4)
-        for k in range(12, 0, -1):
-            e = jnp.eye(4) + small @ e / k
-        for _ in range(6):
-            e = e @ e
-        return dict(Q=e[:3, :3] @ point["Q"], x=e[:3, :3] @ point["x"] + e[:3, 3])
+        # phi_1(rate), which is 1 at zero.
+        safe = jnp.where(self.rate == 0, 1, self.rate)
+        phi = jnp.where(self.rate == 0, 1, jnp.expm1(safe) / safe)
+        scale = jnp.exp(self.rate)
+        return dict(scale=scale * point["scale"], x=scale * point["x"] + phi * self.velocity)
 
     def tangent(self, point):
-        a = hat(self.omega)
-        return dict(Q=a @ point["Q"], x=a @ point["x"] + self.velocity)
+        x = self.rate * point["x"] + self.velocity
+        return dict(scale=self.rate * point["scale"], x=x)
 
     def bracket(self, other):
-        return Screw(
-            jnp.cross(self.omega, other.omega),
-            jnp.cross(self.omega, other.velocity) - jnp.cross(other.omega, self.velocity),
-        )
+        velocity = self.rate * other.velocity - other.rate * self.velocity
+        return Stretch(jnp.zeros_like(self.rate), velocity)
+
+
+def stretched(rate, velocity, x):
+    """The end of a flow from scale one, in NumPy."""
+    return np.exp(rate), np.exp(rate) * x + np.expm1(rate) / rate * velocity
 
 
 class Phases(AbstractFrozenField):
@@ -80,13 +76,13 @@ def mixed():
 
     def field(s):
         return {
-            "body": Screw(jnp.asarray(s * W), jnp.asarray(s * V)),
+            "body": Stretch(jnp.asarray(s * 0.7), jnp.asarray(s * V)),
             "pair": (Rotation(s * V), jnp.asarray(s * W)),
             "phase": [Phases(jnp.asarray(s * 0.4), jnp.asarray(spectrum))],
         }
 
     point = {
-        "body": dict(Q=jnp.eye(3), x=jnp.asarray(V)),
+        "body": dict(scale=jnp.asarray(1.0), x=jnp.asarray(W)),
         "pair": (jnp.asarray(W), jnp.asarray(V)),
         "phase": [jnp.exp(1j * jnp.arange(3, dtype=complex))],
     }
@@ -108,21 +104,28 @@ def test_arrays_are_translations():
 
 def test_mixed_pytree_flows_part_by_part(mixed):
     field, point = mixed
-    end = cfjax.flow(field(1.0), point)
-    assert jax.tree.structure(end) == jax.tree.structure(point)
-    e = scipy.linalg.expm(np.block([[hat(W), V[:, None]], [np.zeros((1, 4))]]))
+
+    @jax.jit
+    def motions(point):
+        end, want = jax.jvp(lambda t: cfjax.flow(field(t), point), (1.0,), (1.0,))
+        start = jax.jvp(lambda t: cfjax.flow(field(t), point), (0.0,), (1.0,))[1]
+        return end, want, start, cfjax.tangent(field(1.0), end), cfjax.tangent(field(1.0), point)
+
+    end, *rates = motions(point)
+    assert all(jax.tree.structure(x) == jax.tree.structure(point) for x in (end, *rates))
     # Norms below 3 and exponentials of rotations: a few tens of units of rounding.
     close = lambda a, b: np.testing.assert_allclose(a, b, rtol=0, atol=100 * EPS)  # noqa: E731
-    close(end["body"]["Q"], e[:3, :3])
-    close(end["body"]["x"], e[:3, :3] @ V + e[:3, 3])
+    scale, x = stretched(0.7, V, W)
+    close(end["body"]["scale"], scale)
+    close(end["body"]["x"], x)
     close(end["pair"][0], scipy.linalg.expm(hat(V)) @ W)
     np.testing.assert_array_equal(end["pair"][1], V + W)
     close(end["phase"][0], np.exp(1j * (np.arange(3) + 0.4 * np.array([1, 4, 9]))))
-    # The tangent is the velocity.
-    want = jax.jvp(lambda t: cfjax.flow(field(t), point), (0.0,), (1.0,))[1]
-    got = cfjax.tangent(field(1.0), point)
-    assert jax.tree.structure(got) == jax.tree.structure(point)
-    jax.tree.map(lambda a, b: np.testing.assert_allclose(a, b, rtol=0, atol=40 * EPS), got, want)
+    # The tangent is the velocity, at the end and at the start.
+    for want, got in zip(rates[:2], rates[2:], strict=True):
+        jax.tree.map(
+            lambda a, b: np.testing.assert_allclose(a, b, rtol=0, atol=40 * EPS), got, want
+        )
 
 
 def test_none_is_a_part_at_rest():
@@ -153,8 +156,8 @@ def test_weights_take_the_precision_of_the_field():
     for dtype in (np.float32, np.float64, np.complex64, np.complex128):
         a = jnp.ones((3, 3), dtype)
         for weight in (0.5, jnp.asarray(0.5), np.float64(0.5)):
-            for field in (a, LeftMatrix(a)):
-                (leaf,) = jax.tree.leaves(cfjax.combine((weight, weight), (field, field)))
+            fields = {"translation": a, "matrix": LeftMatrix(a)}
+            for leaf in jax.tree.leaves(cfjax.combine((weight, weight), (fields, fields))):
                 assert leaf.dtype == dtype
                 np.testing.assert_array_equal(leaf, a)
     got = cfjax.combine((2.0,), (Rotation(W),))
@@ -178,16 +181,17 @@ def test_gradients_with_respect_to_weights_and_fields():
 
 
 def test_bracket_of_mixed_pytrees():
-    a = {"r": Rotation(W), "s": (Screw(*map(jnp.asarray, (W, V))), jnp.asarray(V))}
-    b = {"r": Rotation(V), "s": (Screw(*map(jnp.asarray, (V, -W))), jnp.asarray(W))}
+    a = {"r": Rotation(W), "s": (Stretch(jnp.asarray(0.7), jnp.asarray(V)), jnp.asarray(V))}
+    b = {"r": Rotation(V), "s": (Stretch(jnp.asarray(-0.4), jnp.asarray(W)), jnp.asarray(W))}
     got = cfjax.bracket(a, b)
     np.testing.assert_allclose(got["r"].omega, np.cross(W, V), rtol=0, atol=8 * EPS)
     np.testing.assert_array_equal(got["s"][1], np.zeros(3))
-    lift = lambda w, v: np.block([[np.array(hat(w)), v[:, None]], [np.zeros((1, 4))]])  # noqa: E731
-    x, y = lift(W, V), lift(V, -W)
+    lift = lambda s, v: np.block([[s * np.eye(3), v[:, None]], [np.zeros((1, 4))]])  # noqa: E731
+    x, y = lift(0.7, V), lift(-0.4, W)
+    found = got["s"][0]
     want = x @ y - y @ x
     np.testing.assert_allclose(
-        lift(got["s"][0].omega, np.asarray(got["s"][0].velocity)), want, rtol=0, atol=20 * EPS
+        lift(found.rate, np.asarray(found.velocity)), want, rtol=0, atol=20 * EPS
     )
 
 
@@ -224,45 +228,18 @@ def test_abstract_methods_are_required():
 
 
 def test_a_class_of_the_user_under_every_solver_kind():
-    """A constant field on SE(3): y(t) = exp(t xi) y0."""
+    """A constant field, y(t) = exp(t xi) y0, is solved exactly by every method here."""
 
     def field(t, y, args):
-        return Screw(jnp.asarray(W), jnp.asarray(V))
+        return Stretch(jnp.asarray(0.7), jnp.asarray(V))
 
-    start = dict(Q=jnp.eye(3), x=jnp.asarray(V))
-    e = scipy.linalg.expm(2 * np.block([[hat(W), V[:, None]], [np.zeros((1, 4))]]))
+    start = dict(scale=jnp.asarray(1.0), x=jnp.asarray(W))
+    scale, x = stretched(1.4, 2 * V, W)
     for solver in (cfjax.CF2(), cfjax.RKMK3()):
-        end = cfjax.integrate(cfjax.LieTerm(field), solver, 0.0, 2.0, start, num_steps=2)
-        # A constant field is solved exactly by every method here: rounding of two steps only.
-        ys = jax.tree.map(lambda y: y[-1], end.ys)
-        np.testing.assert_allclose(ys["Q"], e[:3, :3], rtol=0, atol=100 * EPS)
-        np.testing.assert_allclose(ys["x"], e[:3, :3] @ V + e[:3, 3], rtol=0, atol=400 * EPS)
-
-
-SPIN = np.array([[0.0, -0.3, 0.2], [0.3, 0.0, -0.7], [-0.2, 0.7, 0.0]])
-
-
-def test_increment_has_the_rounding_of_the_increment():
-    for make in (
-        lambda a: cfjax.Rotation(jnp.array([a[2, 1], a[0, 2], a[1, 0]])),
-        cfjax.LeftMatrix,
-        cfjax.RightMatrix,
-    ):
-
-        @jax.jit
-        def ends(a, make=make):
-            return make(a).increment(jnp.eye(3)), cfjax.flow(make(a), jnp.eye(3))
-
-        for size in (1e-7, 1.0, 30.0):
-            a = size * SPIN
-            moved, end = ends(jnp.asarray(a))
-            with mpmath.workdps(40):
-                exact = mpmath.expm(mpmath.matrix(a)) - mpmath.eye(3)
-                exact = np.array(exact.tolist(), float)
-            # Eight units times the largest entry; an angle beyond one multiplies its own rounding.
-            atol = 8 * EPS * np.abs(exact).max() * max(1, size)
-            np.testing.assert_allclose(moved, exact, rtol=0, atol=atol)
-            np.testing.assert_allclose(end, exact + np.eye(3), rtol=0, atol=max(atol, 1e-15))
+        ys = cfjax.integrate(cfjax.LieTerm(field), solver, 0.0, 2.0, start, num_steps=2).ys
+        # Rounding of two steps only.
+        np.testing.assert_allclose(ys["scale"][-1], scale, rtol=0, atol=100 * EPS)
+        np.testing.assert_allclose(ys["x"][-1], x, rtol=0, atol=400 * EPS)
 
 
 class Growth(AbstractFrozenField):
@@ -296,14 +273,18 @@ def test_integers_and_other_values_are_refused(subtests):
 
 
 def test_a_flow_of_another_shape_is_refused():
-    for fault, size in itertools.product(("shape", "dtype"), (2, 12)):
-        # Small states are held in components and large ones are not.
+    steps = {cfjax.integrate: {"num_steps": 2}, diffrax.diffeqsolve: {"dt0": 0.5}}
+    # Small states are held in components and large ones are not. Any two of fault, size and solve.
+    for fault, size, solve in [
+        ("shape", 2, cfjax.integrate),
+        ("dtype", 12, cfjax.integrate),
+        ("shape", 12, diffrax.diffeqsolve),
+        ("dtype", 2, diffrax.diffeqsolve),
+    ]:
         term = cfjax.LieTerm(lambda t, y, args, fault=fault: Growth(-y, fault))
-        for solve in (cfjax.integrate, diffrax.diffeqsolve):
-            step = {"num_steps": 2} if solve is cfjax.integrate else {"dt0": 0.5}
-            message = rf"Growth\.flow must return .*f64\[{size}\], got f"
-            with pytest.raises(ValueError, match=message):
-                solve(term, cfjax.CF4(), t0=0.0, t1=1.0, y0=jnp.ones(size), **step)
+        message = rf"Growth\.flow must return .*f64\[{size}\], got f"
+        with pytest.raises(ValueError, match=message):
+            solve(term, cfjax.CF2(), t0=0.0, t1=1.0, y0=jnp.ones(size), **steps[solve])
 
 
 def test_brackets_of_two_classes_are_refused():
