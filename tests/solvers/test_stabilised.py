@@ -22,6 +22,7 @@ names = pytest.mark.parametrize("name", SOLVERS)
 # RKG2 is RKL2 with other polynomials, so it has tests of those and of its order.
 both = pytest.mark.parametrize("name", ["RKL2", "RKL3"])
 slow = pytest.mark.slow
+either = pytest.mark.parametrize("name", ["RKL3", pytest.param("RKL2", marks=slow)])
 # Twice the index of the Gegenbauer polynomials.
 INDEX = {"RKL2": 1, "RKG2": 3, "RKL3": 1}
 
@@ -39,23 +40,28 @@ def stages_for(z, l):  # noqa: E741
 # Stability polynomials
 
 
-def gegenbauer(n, a, x):
+@functools.cache
+def gegenbauer(n, a):
     """By its finite sum, so from another formula than the recursion of the methods."""
-    return mpmath.fsum(
-        (-1) ** k * mpmath.rf(a, n - k) / mpmath.factorial(k) / mpmath.factorial(n - 2 * k)
-        * (2 * x) ** (n - 2 * k)
-        for k in range(n // 2 + 1)
-    )  # fmt: skip
+    coefficients = [mpmath.mpf(0)] * (n + 1)
+    for k in range(n // 2 + 1):
+        factorials = mpmath.factorial(k) * mpmath.factorial(n - 2 * k)
+        coefficients[2 * k] = (-1) ** k * mpmath.rf(a, n - k) * 2 ** (n - 2 * k) / factorials
+    return coefficients
+
+
+def at(coefficients, x):
+    return functools.reduce(lambda value, c: value * x + c, coefficients)
 
 
 def polynomial(s, l, z):  # noqa: E741
-    a = mpmath.mpf(l) / 2
     b = mpmath.mpf((l + 1) * (s - 1) * (s + l + 1)) / ((l + 3) * s * (s + l))
     w = mpmath.mpf(l + 3) / ((s - 1) * (s + l + 1))
-    return 1 - b + b * gegenbauer(s, a, 1 + w * z) / gegenbauer(s, a, 1)
+    coefficients = gegenbauer(s, mpmath.mpf(l) / 2)
+    return 1 - b + b * at(coefficients, 1 + w * z) / mpmath.fsum(coefficients)
 
 
-@functools.lru_cache
+@functools.cache
 def third_derivative(s):
     return mpmath.diff(lambda z: polynomial(s, 1, z), 0, 3) - 1
 
@@ -100,6 +106,7 @@ def radius_of_args(t, y, args):
     return args[1]
 
 
+@functools.cache
 def points_of_chosen_stages(name):
     """Points for 3 to 31 stages, each with a radius for which so many are chosen."""
     cases = [(s, z) for s in range(3, 32, 2) for z in points_of_stability(s, INDEX[name])]
@@ -145,14 +152,13 @@ def test_stability_on_the_whole_range_and_damping_at_its_end(name):
         assert (np.abs(beyond[5:]) > 10).all()
 
 
-@both
-def test_stability_polynomials_in_single_precision(name):
-    points, radius, expected = points_of_chosen_stages(name)
-    solver = SOLVERS[name](spectral_radius=radius_of_args)
+def test_stability_polynomials_in_single_precision():
+    points, radius, expected = points_of_chosen_stages("RKL3")
+    solver = cfjax.RKL3(spectral_radius=radius_of_args)
+    found = growth(solver, points, radius, np.complex64)
+    assert found.dtype == np.complex64
     # As above.
-    np.testing.assert_allclose(
-        growth(solver, points, radius, np.complex64), expected, rtol=2e-4, atol=2e-4
-    )
+    np.testing.assert_allclose(found, expected, rtol=2e-4, atol=2e-4)
 
 
 @pytest.mark.parametrize(
@@ -180,22 +186,16 @@ def clocked(t, y):
 
 
 @pytest.mark.parametrize("stages", [5, None])
-@both
-def test_the_times_of_stages(name, stages):
+def test_the_times_of_stages(stages):
     """To rounding those of the autonomous equation, whose state has the time. By time alone
-    u' = 2 t is exact, and u' = 3 t^2 where the order is 3.
+    u' = 3 t^2 is exact. A step of `RKL3` has one of `RKL2` as a part.
     """
-    power = 2 if name == "RKL3" else 1
 
     def field(t, y, args):
         by_state = clocked(y["by state"][1], y["by state"])
-        return {
-            "by time": clocked(t, y["by time"]),
-            "by state": by_state,
-            "power": (power + 1) * t**power,
-        }
+        return {"by time": clocked(t, y["by time"]), "by state": by_state, "power": 3 * t**2}
 
-    solver = SOLVERS[name](stages, spectral_radius=None if stages else lambda t, y, args: args)
+    solver = cfjax.RKL3(stages, spectral_radius=None if stages else lambda t, y, args: args)
     t0, y0 = jnp.asarray(0.3), jnp.array([0.7, 0.3])
 
     @jax.jit
@@ -207,8 +207,7 @@ def test_the_times_of_stages(name, stages):
         found = step(jnp.asarray(reach(number, 1) * 0.999))
         np.testing.assert_allclose(found["by time"], found["by state"], rtol=0, atol=1e-13)
         assert found["by time"][1] == pytest.approx(1.3, abs=1e-13)
-        exact = 1.3 ** (power + 1) - 0.3 ** (power + 1)
-        np.testing.assert_allclose(found["power"], exact, rtol=0, atol=1e-13)
+        np.testing.assert_allclose(found["power"], 1.3**3 - 0.3**3, rtol=0, atol=1e-13)
 
 
 # Orders
@@ -251,13 +250,12 @@ CHANGING = dict(spectral_radius=5000.0)
 @pytest.mark.parametrize(
     "name, options",
     [
-        *[("RKL2", dict(stages=9)), ("RKL3", dict(stages=9))],
-        *[("RKG2", CHANGING), ("RKL3", CHANGING)],
+        *[("RKL2", dict(stages=9)), ("RKG2", CHANGING), ("RKL3", CHANGING)],
         *(
             pytest.param(name, options, marks=slow)
             for name, options in [
-                *[("RKL2", CHANGING), ("RKL2", dict(stages=30)), ("RKL3", dict(stages=3))],
-                *[("RKG2", {}), ("RKG2", dict(stages=9))],
+                *[("RKL2", CHANGING), ("RKL2", dict(stages=30)), ("RKG2", {})],
+                *[("RKL3", dict(stages=9)), ("RKL3", dict(stages=3))],
             ]
         ),
     ],
@@ -268,7 +266,7 @@ def test_order_on_an_attitude(attitude_answer, name, options):
     assert_order(name, solver, attitude, np.eye(3), None, attitude_answer)
 
 
-@both
+@either
 def test_order_on_a_dictionary_of_rotations_and_an_array(flight_problem, name):
     """With an estimated radius."""
     assert_order(name, SOLVERS[name](), *flight_problem)
@@ -360,11 +358,8 @@ PROBLEMS = {
     "SU(3) link": su3_problem,
     "oscillation": oscillation_problem,
 }
-# One of each kind for each method; the others are slow.
-QUICK = [
-    *[("porous medium", "RKL2"), ("SU(3) link", "RKL2")],
-    *[("two sublattices", "RKL3"), ("oscillation", "RKL3")],
-]
+# One for each method; the others are slow.
+QUICK = [("SU(3) link", "RKL2"), ("oscillation", "RKL3")]
 
 
 # Of the error at the end over the tolerance of a step. The errors of all steps add up, and stiff
@@ -380,6 +375,7 @@ def solve(field, solver, t1, y0, args=None, tolerance=1e-5, **options):
             solver,
             *(0.0, t1, t1 / 1000, y0, args),
             stepsize_controller=diffrax.PIDController(rtol=0.0, atol=tolerance),
+            adjoint=diffrax.ForwardMode(),
             **{"max_steps": 10_000, **options},
         )
 
@@ -419,19 +415,6 @@ def test_error_over_tolerance_by_exact_answers(problem, name):
     # The parts of an error may cancel at one tolerance, as those of RKG2 for the damped spin do at
     # 1e-3.
     assert errors[2] < min(errors[:2])
-
-
-def test_on_the_manifold_for_any_length_of_a_step():
-    field, y0, _, _, _ = damped_spin_problem()
-    solver = cfjax.RKL3(spectral_radius=60.0)
-
-    @jax.jit
-    def end(t1):
-        return cfjax.integrate(cfjax.LieTerm(field), solver, 0.0, t1, y0, num_steps=3).ys[-1]
-
-    for t1 in (0.1, 1.0, 10.0, 100.0):
-        # Flows correct the length up to rounding, of angles of up to some 1000.
-        assert abs(np.linalg.norm(end(t1)) - 1) < 1e-13
 
 
 # Control and the spectral radius
@@ -485,7 +468,7 @@ def test_the_estimate_sees_all_that_a_radius_that_is_too_small_makes(name):
         assert end < UNSEEN[name] * error
 
 
-@both
+@either
 def test_a_radius_that_is_too_small_costs_steps_and_not_accuracy(name):
     """For any amplitude of the stiffest mode, at any tolerance, over many steps."""
     solver, t1 = SOLVERS[name](spectral_radius=lambda t, y, args: args), 5.0
@@ -514,16 +497,18 @@ def test_a_step_with_an_estimated_radius_is_stable(name):
     term = cfjax.LieTerm(lambda t, y, args: jnp.roll(y, 1) - 2 * y + jnp.roll(y, -1))
     # The stiffest mode, with the rate 4.
     y0, t = jnp.asarray(1.0 - 2 * (np.arange(32) % 2)), jnp.zeros(())
-    assert cfjax.spectral_radius(term, 0.0, y0) < 0.98 * 4
 
     @jax.jit
-    def end(h):
-        return problems.first_step(SOLVERS[name](), term, t, t + h, y0, None)[0]
+    def run(h):
+        end = problems.first_step(SOLVERS[name](), term, t, t + h, y0, None)[0]
+        return end, cfjax.spectral_radius(term, t, y0)
 
     for beyond in (1.01, 1.02, 1.05, 1.1):
         z = beyond * reach(21, 1)
         assert abs(exact_growth(name, 21, -z)) > 2
-        assert np.abs(end(jnp.asarray(z / 4))).max() < 1
+        end, radius = run(jnp.asarray(z / 4))
+        assert np.abs(end).max() < 1
+        assert radius < 0.98 * 4
 
 
 # A spectral radius that grows
@@ -585,8 +570,8 @@ def switched_problems():
 @pytest.mark.parametrize(
     "name, dtype",
     [
-        *[("RKL3", float), ("RKL2", np.float32)],
-        *(pytest.param(name, float, marks=slow) for name in ("RKL2", "RKG2")),
+        ("RKL2", np.float32),
+        *(pytest.param(name, float, marks=slow) for name in ("RKL3", "RKL2", "RKG2")),
     ],
 )
 def test_equal_steps_of_a_diffusion_that_is_switched_on(name, dtype):
@@ -599,11 +584,13 @@ def test_equal_steps_of_a_diffusion_that_is_switched_on(name, dtype):
 
     for p, y0, exact in switched_problems().values():
         found = end(jnp.asarray(y0, dtype), jnp.asarray(p, dtype))
+        assert found.dtype == dtype
         # The error of the methods, of second order: some (1/80)^2 times 2. An unstable step leaves
         # 1e20.
         np.testing.assert_allclose(found, exact, rtol=0, atol=3e-4)
 
 
+@slow
 def test_controlled_steps_of_a_diffusion_that_is_switched_on_are_as_with_the_radius():
     def counts(solver):
         @jax.jit
@@ -641,6 +628,7 @@ def beside(t, y, p):
     return {"a": slow * (matrix @ y["a"]), "b": fast * is_on * (matrix @ y["b"])}
 
 
+@slow
 def test_a_batch_in_which_parts_are_switched_on_later():
     """3 and 10 times as stiff as what is on from the start, at the end of a step and within one."""
     rough = np.random.default_rng(1).normal(size=(2, N_CELLS))
@@ -660,21 +648,6 @@ def test_a_batch_in_which_parts_are_switched_on_later():
         exact = diffused(N_CELLS, rough[1], fast * max(1 - start, 0))
         # A start within a step is off by part of a step, with rates of 2 of what is left.
         np.testing.assert_allclose(b, exact, rtol=0, atol=1e-3 if start != 0.613 else 2e-2)
-
-
-def test_reverse_mode_of_a_diffusion_that_is_switched_on():
-    rough = np.random.default_rng(2).normal(size=(2, N_CELLS))
-
-    def value(rate):
-        term = cfjax.LieTerm(lambda t, y, rate: rate * t * (matrix_of_diffusion(N_CELLS) @ y))
-        y0 = jnp.asarray(rough[0])
-        y = cfjax.integrate(term, cfjax.RKL2(), 0.0, 1.0, y0, rate, num_steps=60).ys[-1]
-        return jnp.vdot(rough[1], y)
-
-    slope = matrix_of_diffusion(N_CELLS) @ diffused(N_CELLS, rough[0], 0.5) / 2
-    expected = np.vdot(rough[1], slope)
-    # As accurate as the solution.
-    np.testing.assert_allclose(jax.jit(jax.grad(value))(1.0), expected, rtol=1e-2)
 
 
 def with_rate(t, y, args):
@@ -711,6 +684,7 @@ def test_a_step_that_is_unstable_as_the_radius_grew_is_taken_again():
     sol = diffrax.diffeqsolve(
         cfjax.LieTerm(with_rate), cfjax.RKL2(), 0.0, 1.0, 0.25, start, jnp.asarray(5.0),
         stepsize_controller=diffrax.PIDController(rtol=0.0, atol=1e30),
+        adjoint=diffrax.ForwardMode(),
     )  # fmt: skip
     assert sol.stats["num_rejected_steps"] > 0
     # Nothing grows in a stable step.
@@ -764,7 +738,7 @@ def test_max_stages_too_small_shortens_controlled_steps_and_has_a_derivative(nam
     assert slope == pytest.approx((exact(501.0) - exact(499.0)) / 2, abs=1e-4)
 
 
-@pytest.mark.parametrize("name", ["RKL3", pytest.param("RKL2", marks=slow)])
+@either
 def test_an_impossible_step_evaluates_no_stage(name):
     calls = []
 
@@ -773,13 +747,19 @@ def test_an_impossible_step_evaluates_no_stage(name):
         return -y
 
     solver = SOLVERS[name](spectral_radius=lambda t, y, args: args, max_stages=9)
-    term, y0 = cfjax.LieTerm(field), jnp.ones(1)
+    term, y0, t = cfjax.LieTerm(field), jnp.ones(1), jnp.zeros(())
+    start, step = map(
+        jax.jit,
+        (
+            lambda radius: solver.init(term, t, t + 1, y0, radius),
+            lambda radius, state: solver.step(term, t, t + 1, y0, radius, state, made_jump=False),
+        ),
+    )
     for radius, evaluations in ((100.0, "few"), (10.0, "all")):
-        radius, t = jnp.asarray(radius), jnp.zeros(())
-        state = solver.init(term, t, t + 1, y0, radius)
+        state = start(radius)
+        jax.effects_barrier()
         calls.clear()
-        y, error, _, _, result = solver.step(term, t, t + 1, y0, radius, state, made_jump=False)
-        jax.block_until_ready(y)
+        y, error, _, _, result = step(radius, state)
         jax.effects_barrier()
         assert np.isnan(y).all() == np.isnan(error).all() == (evaluations == "few")
         assert (result == diffrax.RESULTS.nonfinite) == (evaluations == "few")
@@ -820,11 +800,16 @@ def test_output_within_a_step_has_order_two_stays_on_the_manifold_and_meets_the_
             for x in theta[1:3]
         ]
         errors.append(np.abs(np.reshape(fine, (2, 3, 3)) - ys[1:3]).max())
+    for h in (10.0, 1000.0):
+        # Flows correct the lengths up to rounding, however long a step is.
+        _, ys = output(jnp.asarray(h), theta)
+        assert np.abs(np.einsum("kji,kjl->kil", ys, ys) - np.eye(3)).max() < 1e-13
     # Of one step: h^3.
     slopes = np.log2(np.array(errors[:-1]) / errors[1:])
     assert (slopes > 2.6).all()
 
 
+@slow
 def test_an_event_and_saved_times_within_controlled_steps():
     field, y0, _, t1, _ = damped_spin_problem()
     event = diffrax.Event(
@@ -856,17 +841,20 @@ def test_sums_are_compensated():
 
 def test_a_batch_of_different_stiffness_is_as_its_members():
     """3 to 11 stages side by side; the loop runs on for those that have most."""
-    rates = jnp.array([1.0, 100.0, 3000.0])
 
     @jax.jit
+    @jax.vmap
     def end(rate):
         term, y0 = cfjax.LieTerm(stiff), jnp.zeros(2)
         return cfjax.integrate(term, cfjax.RKL3(), 0.0, 1.0, y0, rate, num_steps=50).ys[-1]
 
-    found = jax.jit(jax.vmap(end))(rates)
-    np.testing.assert_allclose(found, jnp.stack([end(r) for r in rates]), rtol=0, atol=1e-13)
+    rates = jnp.array([1.0, 100.0, 3000.0])
+    # Each among others like it, by the same program.
+    alone = [end(jnp.full(3, rate))[0] for rate in rates]
+    np.testing.assert_allclose(end(rates), jnp.stack(alone), rtol=0, atol=1e-13)
 
 
+@slow
 def test_a_batch_of_controlled_solves_is_as_its_members():
     """As many steps, and ends that differ as those of starts that differ by a rounding."""
     rates = jnp.array([1.0, 100.0, 3000.0])
@@ -892,7 +880,7 @@ def test_backwards_in_time_what_decayed_grows():
     @jax.jit
     def run(t0, t1, y0):
         term = cfjax.LieTerm(lambda t, y, args: -3 * y)
-        return cfjax.integrate(term, cfjax.RKL3(), t0, t1, y0, num_steps=200).ys[-1]
+        return cfjax.integrate(term, cfjax.RKL2(), t0, t1, y0, num_steps=5000).ys[-1]
 
     end = run(0.0, 1.0, jnp.ones(2))
     np.testing.assert_allclose(end, np.exp(-3), rtol=1e-6)
@@ -913,42 +901,48 @@ def test_richardson_takes_them(attitude_answer):
 
 def end_of_stiff(solver):
     def end(rate):
-        sol = cfjax.integrate(
-            cfjax.LieTerm(lambda t, y, args: -args * jnp.sin(y)), solver, 0.0, 1.0,
-            jnp.array([1.0, 2.0]), rate, num_steps=10,
-        )  # fmt: skip
+        field = lambda t, y, args: -args * (jnp.sin(y) - jnp.cos(t) / 2)  # noqa: E731
+        y0 = jnp.array([1.0, 2.0])
+        sol = cfjax.integrate(cfjax.LieTerm(field), solver, 0.0, 1.0, y0, rate, num_steps=10)
         return jnp.sum(sol.ys[-1])
 
     return end
 
 
-@pytest.mark.parametrize("stages", [5, None])
-@pytest.mark.parametrize("name", ["RKL3", pytest.param("RKL2", marks=slow)])
+@pytest.mark.parametrize(
+    "name, stages",
+    [
+        *[("RKL2", 5), ("RKL3", None)],
+        *(pytest.param(*case, marks=slow) for case in [("RKL3", 5), ("RKL2", None)]),
+    ],
+)
 def test_derivatives(name, stages):
-    """Of a batch in reverse mode, and in forward mode if the stages are given."""
-    end = end_of_stiff(SOLVERS[name](stages, spectral_radius=None if stages else 50.0))
+    """Of a batch in reverse mode, and in forward mode if the stages are given.
 
-    @jax.jit
+    The radius is estimated, and not near one at which a step would have other stages.
+    """
+    end = end_of_stiff(SOLVERS[name](stages))
+
+    @functools.partial(jax.jit, compiler_options=problems.QUICK)
     def run(rate):
         values, pull = jax.vjp(jax.vmap(end), jnp.stack([rate, 3.0]))
         (slopes,) = pull(jnp.ones(2))
         forward = jax.jvp(end, (rate,), (1.0,))[1] if stages else slopes[0]
         return values[0], slopes[0], forward
 
-    expected = problems.central_difference(lambda rate: run(rate)[0], 5.0, 1.0, 1e-2)
-    _, *found = run(5.0)
+    expected = problems.central_difference(lambda rate: run(rate)[0], 60.0, 1.0, 1e-2)
+    _, *found = run(60.0)
     np.testing.assert_allclose(found, [expected] * 2, rtol=1e-7)
 
 
 def test_forward_mode_through_chosen_stages_names_what_has_it():
-    end = end_of_stiff(cfjax.RKL2())
+    end = end_of_stiff(cfjax.RKL2(spectral_radius=50.0))
 
     def slope(rate):
         return jax.jvp(end, (rate,), (1.0,))[1]
 
-    for run in (slope, jax.jit(slope)):
-        with pytest.raises(TypeError, match=r"Forward mode needs .*RKL2\(stages=9\)"):
-            run(5.0)
+    with pytest.raises(TypeError, match=r"Forward mode needs .*RKL2\(stages=9\)"):
+        slope(5.0)
     # JAX's own words come first in a batch of directions.
     with pytest.raises(TypeError, match=r"(?i)forward.mode"):
         jax.jacfwd(end)(5.0)
@@ -1036,37 +1030,22 @@ def test_what_they_do_take():
 
     y0 = {"unit": jnp.array([0.6, 0.0, 0.8]), "frame": jnp.asarray(COLUMNS)}
     answer = problems.reference(ode, 0.0, 0.1, problems.flat(y0))
-    end = cfjax.integrate(cfjax.LieTerm(field), cfjax.RKL2(), 0.0, 0.1, y0, num_steps=4).ys
+    end = cfjax.integrate(cfjax.LieTerm(field), cfjax.RKL2(3), 0.0, 0.1, y0, num_steps=4).ys
     # Four steps of a fourth of a unit of time of these rates, of order 2.
     np.testing.assert_allclose(problems.flat(end), answer, rtol=0, atol=3e-3)
 
 
-# Precision and memory
+# Memory
 
 
-@pytest.mark.parametrize("stages", [None, pytest.param(5, marks=slow)])
-def test_single_precision(stages):
-    _, y0, _, t1, answer = damped_spin_problem()
-
-    def field(t, y, args):
-        up = jnp.array([0.0, 0.0, 30.0], np.float32)
-        return cfjax.Rotation((up + jnp.float32(0.5) * jnp.cross(y, up)) / np.float32(1.25))
-
-    term, y0 = cfjax.LieTerm(field), jnp.asarray(y0, np.float32)
-    y = cfjax.integrate(term, cfjax.RKL3(stages), 0.0, t1, y0, num_steps=400).ys[-1]
-    assert y.dtype == np.float32
-    # The error of the methods, and of some 400 roundings.
-    np.testing.assert_allclose(y, answer, rtol=0, atol=1e-4)
-
-
-@pytest.mark.parametrize("name", ["RKL3", pytest.param("RKL2", marks=slow)])
+@pytest.mark.parametrize("name", ["RKL2", pytest.param("RKL3", marks=slow)])
 def test_memory_does_not_depend_on_the_stages(name):
     """As the compiler plans it, in states: y, the first field, two elements, a point."""
     n = 100_000
 
     def field(t, y, args):
         # Not entry by entry, so the stages cannot be computed one entry after another.
-        return jnp.cumsum(y) / n - y
+        return jnp.mean(y) - y
 
     def used(solver):
         def end(y0):
@@ -1075,14 +1054,8 @@ def test_memory_does_not_depend_on_the_stages(name):
         compiled = jax.jit(end, donate_argnums=0).lower(jnp.zeros(n)).compile()
         return compiled.memory_analysis().temp_size_in_bytes / (8 * n)
 
-    few, many, chosen = (
-        used(SOLVERS[name](*args, **kwargs))
-        for args, kwargs in [((9,), {}), ((41,), {}), ((), dict(spectral_radius=100.0))]
-    )
-    assert many < few + 0.1
-    # RKL3: the element of a half, a point and a field in the middle, and where stages are chosen
-    # the elements of all parts. The sums of sixteen entries each in the field take 2/15 of a state.
-    assert few < (8 if name == "RKL3" else 5) + 0.2
-    assert chosen < (10 if name == "RKL3" else 5) + 0.2
-    # The vector of the power iteration, and what tells whether a step was stable.
-    assert used(SOLVERS[name]()) < chosen + (3 if name == "RKL3" else 2) + 0.1
+    # RKL3: the element of a half, a point and a field in the middle.
+    assert used(SOLVERS[name](41)) < (8 if name == "RKL3" else 5) + 0.2
+    # Where stages are chosen the elements of all parts; the vector of the power iteration, and what
+    # tells whether a step was stable.
+    assert used(SOLVERS[name]()) < (13 if name == "RKL3" else 7) + 0.3
