@@ -4,6 +4,7 @@ Finite differences are of order 4 with step 1e-3. They err by 1e-12 / 30 times a
 and by rounding: 1e-15 / 1e-3. Each test states the size of the derivatives it assumes.
 """
 
+from functools import partial
 from typing import Any
 
 import equinox as eqx
@@ -64,7 +65,7 @@ def test_gradients_in_start_and_args(solver, problem):
     def fun(x, t1):
         return functional(end(LIE[solver], field, *x, t1))
 
-    @jax.jit
+    @partial(jax.jit, compiler_options=problems.QUICK)
     def everything(x, t1, v):
         value, gradient = jax.value_and_grad(fun, (0, 1))(x, t1)
         forward = None

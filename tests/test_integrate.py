@@ -19,8 +19,6 @@ import cfjax
 Y0 = jnp.asarray(problems.MOMENTUM)
 ARGS = jnp.asarray(problems.INERTIA)
 Y0_SINGLE, ARGS_SINGLE = Y0.astype(np.float32), ARGS.astype(np.float32)
-TERM = cfjax.LieTerm(problems.driven_body)
-EULER = cfjax.LieEuler()
 
 
 def close(found, expected, atol=1e-14):
@@ -32,10 +30,15 @@ def ode(t, y, args):
     return jnp.sin(y * t) - y[::-1] / args
 
 
+# The shortest programs; what the loop does depends on neither.
+TERM, EULER = cfjax.LieTerm(ode), cfjax.LieEuler()
+BODY = cfjax.LieTerm(problems.driven_body)
+
+
 def solve(
     term=TERM, solver=EULER, t0=0.0, t1=1.0, y0=Y0, args=ARGS, num_steps=16, **options
 ) -> Any:
-    """Tests that leave the static arguments as they are share one program, the shortest."""
+    """Tests that leave the static arguments as they are share one program."""
     return cfjax.integrate(term, solver, t0, t1, y0, args, num_steps=num_steps, **options)
 
 
@@ -51,7 +54,7 @@ def newton():
     "term, solver, t1",
     [
         (TERM, cfjax.CF2(), -2.0),
-        (TERM, cfjax.RKMK4(), 2.0),
+        (BODY, cfjax.RKMK4(), 2.0),
         (diffrax.ODETerm(ode), diffrax.Tsit5(), 2.0),
         (diffrax.ODETerm(ode), newton(), 2.0),
     ],
@@ -82,10 +85,9 @@ def test_it_takes_the_steps_of_diffeqsolve(term, solver, t1):
 def test_a_wrapped_solver():
     """Both go on from two half steps. For diffrax they are instances of what they wrap."""
     wrapped: Any = [diffrax.HalfSolver(EULER), cfjax.Richardson(EULER)]
-    term = cfjax.LieTerm(ode)
-    expected = solve(term)
+    expected = solve()
     for solver in wrapped:
-        found = solve(term, solver, num_steps=8)
+        found = solve(solver=solver, num_steps=8)
         close(found.ys, expected.ys)
         assert found.result == diffrax.RESULTS.successful
 
@@ -119,7 +121,7 @@ def test_the_initial_state_on_request_and_fewer_checkpoints(checkpoint_every):
     """Neither changes a number of the others, nor of a derivative."""
 
     def loss(y0, **options):
-        sol = solve(cfjax.LieTerm(ode), t0=0.25, y0=y0, save_every=8, **options)
+        sol = solve(t0=0.25, y0=y0, save_every=8, **options)
         return jnp.sum(jnp.sin(sol.ys)), (sol.ts, sol.ys)
 
     def gradient(**options):
@@ -241,7 +243,7 @@ def test_the_derivative_in_the_end_time_is_the_velocity():
     t0, t1, y0, _ = POINT
 
     def fine(t0, t1, y0):
-        end = solve(solver=cfjax.CF3(), t0=t0, t1=t1, y0=y0, num_steps=2000).ys[-1]
+        end = solve(BODY, cfjax.CF3(), t0, t1, y0, num_steps=2000).ys[-1]
         return end, end
 
     velocity = lambda t, y: problems.driven_body_ode(t, np.asarray(y), problems.INERTIA)  # noqa: E731
