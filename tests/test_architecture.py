@@ -1,10 +1,7 @@
 """The direction of imports: what a user calls stands on what it is made of, never the reverse."""
 
 import ast
-import json
 import re
-import subprocess
-import sys
 from functools import cache
 from pathlib import Path
 
@@ -234,36 +231,3 @@ def test_each_module_has_a_test_file_of_its_name(folder):
     modules = {path.stem for path in (PACKAGE / f"_{folder}").glob("*.py")} - {"__init__"}
     tests = {path.stem.removeprefix("test_") for path in (TESTS / folder).glob("test_*.py")}
     assert modules <= tests
-
-
-@pytest.fixture(scope="module")
-def loaded():
-    """What the import loads that `import diffrax` has not."""
-    program = """
-import json, sys
-import diffrax
-before = set(sys.modules)
-import cfjax
-print(json.dumps(sorted(set(sys.modules) - before)))
-"""
-    done = subprocess.run([sys.executable, "-c", program], capture_output=True, text=True)
-    assert done.returncode == 0, done.stderr
-    return json.loads(done.stdout)
-
-
-def test_an_import_loads_what_solves_and_nothing_else(loaded):
-    late = "scipy", "matplotlib", "rich", "pandas", "IPython", "optax"
-    assert not [name for name in loaded if room(name) in late]
-    assert not [
-        name
-        for name in loaded
-        if name.startswith("cfjax.")
-        and room(name.removeprefix("cfjax.")) in ("_measure", "scenes", "_paper")
-    ]
-
-
-def test_an_import_loads_few_modules_of_others(loaded):
-    """Time is what it is about, and a test cannot tell time. Ours are 45 small files."""
-    foreign = [name for name in loaded if room(name) != "cfjax"]
-    # Modules of jax, for batches over hosts and for attributes of calls; of Python, for fractions.
-    assert len(foreign) <= 10, foreign

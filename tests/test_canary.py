@@ -103,6 +103,7 @@ def test_the_names_are_found():
 
 X = np.linspace(0.1, 0.9, 3)
 M = np.eye(3) + 0.1
+A, FIRST = jnp.asarray(X), jnp.asarray([0])
 Z = X + 1j * X
 UNARY = (
     "abs acos acosh asin asinh atan atanh cbrt ceil cos cosh erf exp exp2 expm1 floor is_finite "
@@ -138,6 +139,8 @@ def _with_vmap(x):
 
 _with_vmap.def_vmap(lambda axis_size, in_batched, x: (x, in_batched[0]))
 
+SCATTER = "dimension_numbers", "update_jaxpr", "indices_are_sorted", "unique_indices", "mode"
+SLICE, SCAN = ("start_indices", "limit_indices", "strides"), ("length", "jaxpr", "reverse")
 EXAMPLES: dict[str, tuple[Any, tuple[Any, ...], tuple[str, ...]]] = {
     **{name: (getattr(lax, name), (X,), ()) for name in UNARY.split()},
     **{name: (getattr(lax, name), (X, X), ()) for name in BINARY.split()},
@@ -159,7 +162,7 @@ EXAMPLES: dict[str, tuple[Any, tuple[Any, ...], tuple[str, ...]]] = {
     "clamp": (lax.clamp, (X, X, X), ()),
     "concatenate": (lambda x: jnp.concatenate([x, x]), (X,), ("dimension",)),
     "cond": (lambda x: lax.cond(x[0] > 0, lambda: x, lambda: 2 * x), (X,), ("branches",)),
-    "convert_element_type": (lambda x: x.astype(jnp.float32), (jnp.asarray(X),), ()),
+    "convert_element_type": (lambda x: x.astype(jnp.float32), (A,), ()),
     "copy": (lax.copy_p.bind, (X,), ()),
     "cumprod": (lax.cumprod, (X,), ("axis",)),
     "cumsum": (lax.cumsum, (X,), ("axis",)),
@@ -172,7 +175,7 @@ EXAMPLES: dict[str, tuple[Any, tuple[Any, ...], tuple[str, ...]]] = {
     "dynamic_update_slice": (lambda x: lax.dynamic_update_slice(x, x[:2], (0,)), (X,), ()),
     "eigh": (jnp.linalg.eigh, (M,), ()),
     "fft": (jnp.fft.fft, (X,), ("fft_lengths",)),
-    "gather": (lambda x: x[jnp.asarray([0, 1])], (jnp.asarray(X),), ()),
+    "gather": (lambda x: x[jnp.asarray([0, 1])], (A,), ()),
     "integer_pow": (lambda x: lax.integer_pow(x, 3), (X,), ("y",)),
     "iota": (lambda: lax.iota(jnp.float32, 3), (), ("dtype", "shape", "dimension")),
     "lu": (lax.linalg.lu, (M,), ()),
@@ -188,22 +191,10 @@ EXAMPLES: dict[str, tuple[Any, tuple[Any, ...], tuple[str, ...]]] = {
     "reduce_sum": (jnp.sum, (X,), ("axes",)),
     "reshape": (lambda x: lax.reshape(x, (3, 1)), (X,), ()),
     "rev": (lambda x: lax.rev(x, (0,)), (X,), ("dimensions",)),
-    "scan": (
-        lambda x: lax.scan(lambda c, b: (c + b, c), x[0], x),
-        (X,),
-        ("length", "jaxpr", "reverse"),
-    ),
-    "scatter": (
-        lambda x: x.at[jnp.asarray([0])].set(1.0),
-        (jnp.asarray(X),),
-        ("dimension_numbers", "indices_are_sorted", "unique_indices", "mode", "update_jaxpr"),
-    ),
+    "scan": (lambda x: lax.scan(lambda c, b: (c + b, c), x[0], x), (X,), SCAN),
+    "scatter": (lambda x: x.at[FIRST].set(1.0), (A,), SCATTER),
     "select_n": (lambda x: lax.select(x > 0, x, x), (X,), ()),
-    "slice": (
-        lambda x: lax.slice(x, (0,), (2,)),
-        (X,),
-        ("start_indices", "limit_indices", "strides"),
-    ),
+    "slice": (lambda x: lax.slice(x, (0,), (2,)), (X,), SLICE),
     "split": (lambda x: lax.split(x, (1, 2)), (X,), ()),
     "squeeze": (lambda x: lax.squeeze(x, (0,)), (X[None],), ()),
     "transpose": (lambda x: lax.transpose(x, (1, 0)), (M,), ("permutation",)),
@@ -218,16 +209,8 @@ EXAMPLES: dict[str, tuple[Any, tuple[Any, ...], tuple[str, ...]]] = {
 # One of these names, whichever this version has, with the parameters.
 NAMED = {(name,): example for name, example in EXAMPLES.items()} | {
     ("jit", "pjit"): (jax.jit(jnp.sin), (X,), ("jaxpr",)),
-    ("scatter-add", "scatter_add"): (
-        lambda x: x.at[jnp.asarray([0])].add(1.0),
-        (jnp.asarray(X),),
-        ("dimension_numbers", "update_jaxpr"),
-    ),
-    ("scatter-mul", "scatter_mul"): (
-        lambda x: x.at[jnp.asarray([0])].mul(2.0),
-        (jnp.asarray(X),),
-        ("dimension_numbers",),
-    ),
+    ("scatter-add", "scatter_add"): (lambda x: x.at[FIRST].add(1.0), (A,), SCATTER[:2]),
+    ("scatter-mul", "scatter_mul"): (lambda x: x.at[FIRST].mul(2.0), (A,), SCATTER[:1]),
     ("checkpoint", "remat2"): (jax.checkpoint(jnp.sin), (X,), ("jaxpr",)),
 }
 # Written down beside the others, for versions and programs in which they occur.

@@ -90,14 +90,6 @@ def blocks(text):
     return "\n".join(re.findall(r"^```python\n(.*?)^```", text, re.DOTALL | re.MULTILINE))
 
 
-def substitute(code, **values):
-    """The code with other values of variables."""
-    for name, value in values.items():
-        code, count = re.subn(rf"^{name} = .*$", f"{name} = {value}", code, flags=re.MULTILINE)
-        assert count == 1, name
-    return code
-
-
 @pytest.mark.slow
 def test_correlation_functions_move_any_operator():
     text = (ROOT / "docs" / "state" / "density.md").read_text()
@@ -125,17 +117,6 @@ def test_correlation_functions_move_any_operator():
     np.testing.assert_allclose(moved[jax.numpy.array([0, -1])], want, rtol=0, atol=1e-5)
     # 12 levels lack 1e-7 of the bath.
     np.testing.assert_allclose(scope["correlation"], scope["exact"], rtol=0, atol=1e-5)
-
-
-@pytest.mark.slow
-def test_quasienergies_are_those_of_a_constant_hamiltonian():
-    with jax.numpy_dtype_promotion("standard"), jax.numpy_rank_promotion("allow"):
-        code = blocks(section("state/quantum.md", "Many periods, and pulses"))
-        # Levels at 1/4 and 1/2, without a drive.
-        code = substitute(code, **{"X, Z": "jnp.zeros((2, 2)), jnp.diag(jnp.array([0.5, 1.0]))"})
-        scope = {}
-        exec(code.partition("def shaped")[0], scope)
-    np.testing.assert_allclose(np.sort(scope["quasienergies"]), [0.25, 0.5], rtol=1e-12)
 
 
 def test_every_block_of_code_is_seen():

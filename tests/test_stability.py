@@ -237,40 +237,6 @@ def test_a_far_stage_makes_the_error_constant_grow():
         np.testing.assert_allclose(constants, constants[-1], rtol=0.01)
 
 
-# float32
-
-
-@pytest.mark.slow
-def test_single_precision_does_not_get_worse_with_more_steps():
-    """The distance to the same steps in float64, for sixteen starts close to each other."""
-    starts = rigid_body.y0 + 0.01 * np.random.default_rng(7).normal(size=(16, 3))
-    # Exact in both precisions, and so are the moments of inertia.
-    starts = starts.astype(np.float32)
-
-    def ends(num_steps, dtype):
-        def solve(y0):
-            inertia = jnp.asarray(rigid_body.inertia, dtype)
-            return cfjax.integrate(
-                TERM, cfjax.CF4(), 0.0, 10.0, y0, inertia, num_steps=num_steps
-            ).ys[-1]
-
-        return np.asarray(jax.jit(jax.vmap(solve))(jnp.asarray(starts, dtype)), float)
-
-    # Powers of two, so that the times and the step are exact as well.
-    steps = np.array([1024, 4096, 16_384, 65_536])
-    floor = np.array(
-        [
-            np.sqrt(np.mean(np.sum((ends(n, np.float32) - ends(n, np.float64)) ** 2, axis=1)))
-            for n in steps
-        ]
-    )
-    # The sums of the steps are compensated. So what is lost is the last rounding of three entries
-    # of at most 1, and of each increment, which is smaller than they are by h; to t = 10 the
-    # flow itself lets an error grow a few times. Without, it is a random walk.
-    assert np.all((floor > 0.3 * 2.0**-24) & (floor < 6 * 2.0**-24))
-    assert abs(problems.slope(steps, floor)) < 0.25
-
-
 # Splittings
 
 
