@@ -23,13 +23,16 @@ _RNG = np.random.default_rng(4)
 H0, H1, JUMP = (_RNG.normal(size=(2, 3, 5, 5)) / 4).transpose(1, 2, 3, 0) @ [1, 1j]
 H0, H1 = ((h + h.conj().T) / 2 for h in (H0, H1))
 LOWER = np.diag(np.sqrt(np.arange(1.0, 5)), 1)
+# Of the same rank, with no zeros: a known jump that stays as it is in output within steps.
+_Q = np.linalg.qr(_RNG.normal(size=(5, 5)))[0]
+LOSS = _Q @ LOWER @ _Q.T
 # Of two levels, beside the others.
 DECAY, SZ = np.diag([1.0, 0, 0, 0], 1), np.diag([1.0, -1, 0, 0, 0])
 SX = DECAY + DECAY.T
 
 
 class Problem(NamedTuple):
-    """An h and two jumps, of which the second is `LOWER`. Values, so that all have one program."""
+    """An h and two jumps, of which the second is `LOSS`. Values, so that all have one program."""
 
     # The weights of 1, sin(2t), cos(3t) and t.
     h: tuple[Any, ...] = ()
@@ -69,7 +72,7 @@ def parts(xp, t, values):
     with jax.numpy_dtype_promotion("standard"):
         h = xp.tensordot(xp.stack([one, xp.sin(2 * t), xp.cos(3 * t), t]), h, 1)
         jump = xp.tensordot(xp.stack([one, xp.cos(t), xp.sin(t)]), jump, 1)
-        return h, [jump, LOWER], rates @ xp.stack([one, xp.sin(3 * t)])
+        return h, [jump, LOSS], rates @ xp.stack([one, xp.sin(3 * t)])
 
 
 def field(t, y, values):
@@ -371,7 +374,7 @@ def test_leading_axes_and_a_state_of_several_density_matrices():
                 for shift, problem in ((0.0, general), (late, general), (0.0, turning))
             )
             h, (jump, _), rates = jax.tree.map(lambda *x: jnp.stack(x), early, after)
-            a = cfjax.Lindblad(h * (0.5 + sign), [jump, LOWER], rates * (0.5 - sign))
+            a = cfjax.Lindblad(h * (0.5 + sign), [jump, LOSS], rates * (0.5 - sign))
             h, jumps, rates = alone
             b = cfjax.Lindblad(h * (0.5 + sign), jumps, rates * (0.5 - sign))
             return {"a": a, "b": b}
