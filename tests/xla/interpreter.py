@@ -8,6 +8,7 @@ import math
 import operator
 from collections import Counter
 from collections.abc import Callable, Sequence
+from functools import partial
 from typing import Any
 
 import jax
@@ -18,6 +19,8 @@ from jax.extend.core import ClosedJaxpr, DropVar, Jaxpr, Literal, jaxpr_as_fun
 
 # How often each primitive has been met.
 calls: Counter[str] = Counter()
+# What operations of this run are lowered to, which a loop needs again.
+_made: dict[int, ClosedJaxpr] = {}
 
 _CALLS = {"jit": "jaxpr", "pjit": "jaxpr", "closed_call": "call_jaxpr", "core_call": "call_jaxpr",
           "custom_jvp_call": "call_jaxpr", "custom_vjp_call": "call_jaxpr", "checkpoint": "jaxpr",
@@ -29,6 +32,7 @@ def run(fun: Callable[..., Any], *args: Any) -> Any:
     """`fun(*args)`, traced and evaluated here."""
     closed, out = jax.make_jaxpr(fun, return_shape=True)(*args)
     leaves = map(array, jax.tree_util.tree_leaves(args))
+    _made.clear()
     with np.errstate(all="ignore"):
         outs = evaluate(closed.jaxpr, closed.consts, *leaves)
     return jax.tree_util.tree_unflatten(jax.tree_util.tree_structure(out), outs)
@@ -103,9 +107,13 @@ def _apply(jaxpr: Jaxpr, eqn: Any, values: list[Any]) -> Sequence[Any]:
         if isinstance(inner, ClosedJaxpr):
             return evaluate(inner.jaxpr, inner.consts, *values)
         return evaluate(inner, (), *values)
-    if name == "cfjax_step":
-        # What it is lowered to.
-        made = jax.make_jaxpr(lambda *xs: eqn.primitive.impl(*xs, **params))(*values)
+    if name in ("cfjax_step", "call_hi_primitive"):
+        # What it is lowered to. From jax 0.12 on, some functions of `jnp` are of the other kind.
+        if id(eqn) not in _made:
+            lower = partial(eqn.primitive.impl, **params)
+            lower = params["_prim"].expand if "_prim" in params else lower
+            _made[id(eqn)] = jax.make_jaxpr(lower)(*values)
+        made = _made[id(eqn)]
         return evaluate(made.jaxpr, made.consts, *values)
     if name in _CONTROL:
         return _CONTROL[name](values, params)

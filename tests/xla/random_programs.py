@@ -434,26 +434,19 @@ class Program(NamedTuple):
         return namespace["fun"]
 
 
-def is_dyadic(x: Any) -> Any:
+def is_dyadic(x: Any, xp: Any = jnp) -> Any:
     """Whether sums and products of such numbers have no rounding."""
-    x = jnp.asarray(x)
-    if jnp.iscomplexobj(x):
-        return is_dyadic(x.real) & is_dyadic(x.imag)
-    return (x * 8 == jnp.round(x * 8)) & (jnp.abs(x) < 2**12) | ~jnp.isfinite(x)
+    if xp.iscomplexobj(x):
+        return is_dyadic(x.real, xp) & is_dyadic(x.imag, xp)
+    return (x * 8 == xp.round(x * 8)) & (xp.abs(x) < 2**12) | ~xp.isfinite(x)
 
 
 def is_exact(x: Any) -> bool:
     x = np.asarray(x)
     if x.dtype.kind in "iub":
         return True
-    if x.dtype.kind != "c":
-        x = x.astype(float)
-    parts = (x.real, x.imag) if x.dtype.kind == "c" else (x,)
     with np.errstate(all="ignore"):
-        return all(
-            np.all((a * 8 == np.round(a * 8)) & (np.abs(a) < 2**12) | ~np.isfinite(a))
-            for a in parts
-        )
+        return bool(np.all(is_dyadic(x if x.dtype.kind == "c" else x.astype(float), np)))
 
 
 class Maker(string.Formatter):
@@ -667,11 +660,8 @@ class Maker(string.Formatter):
         at = self._traced_at()
         n = np.ndim(self.x)
         moving = self.rng.randrange(max(n, 1))
-        return (
-            "("
-            + "".join(f"{at if k == moving else f'jnp.zeros_like({at})'}, " for k in range(n))
-            + ")"
-        )
+        starts = (at if k == moving else f"jnp.zeros_like({at})" for k in range(n))
+        return "(" + "".join(f"{start}, " for start in starts) + ")"
 
     def _sizes(self) -> str:
         sizes = [self.rng.choice([1, n, max(n - 1, 0)]) for n in np.shape(self.x)]
@@ -708,12 +698,8 @@ class Maker(string.Formatter):
         return repr([(self.rng.randint(0, 2), self.rng.randint(0, 2)) for _ in np.shape(self.x)])
 
     def _lax_pads(self) -> str:
-        return repr(
-            [
-                (self.rng.randint(-1, 2), self.rng.randint(-1, 2), self.rng.choice([0, 0, 1]))
-                for _ in np.shape(self.x)
-            ]
-        )
+        one, rng = lambda: self.rng.randint(-1, 2), self.rng
+        return repr([(one(), one(), rng.choice([0, 0, 1])) for _ in np.shape(self.x)])
 
     def _square(self) -> str:
         shape = np.shape(self.x)
@@ -976,16 +962,9 @@ KINDS: dict[str, tuple[Callable[[Callable[..., Any]], Callable[..., Any]], bool]
 
 
 CHANCES = {
-    "value": 1.0,
-    "grad": 0.3,
-    "jvp": 0.1,
-    "vmap": 0.1,
-    "grad of vmap": 0.03,
-    "jvp of grad": 0.03,
-    "jit": 0.02,
-    "jit of grad": 0.01,
-    "jit of vmap": 0.01,
-}
+    "value": 1.0, "grad": 0.3, "jvp": 0.1, "vmap": 0.1, "grad of vmap": 0.03, "jvp of grad": 0.03,
+    "jit": 0.02, "jit of grad": 0.01, "jit of vmap": 0.01,
+}  # fmt: skip
 
 
 def rewritten(fun: Callable[..., Any]) -> Callable[..., Any]:

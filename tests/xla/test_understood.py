@@ -74,8 +74,8 @@ def test_values_and_gradients(subtests):
         }
 
     states = {name: jnp.asarray(y) for name, (_, y) in SMALL.items()}
-    found = jax.jit(lambda s: all_of(lambda fun: lambda y: scalarised(fun, y), s))(states)
-    expected = jax.jit(lambda s: all_of(lambda fun: fun, s))(states)
+    found = run(lambda s: all_of(lambda fun: lambda y: scalarised(fun, y), s), states)
+    expected = run(lambda s: all_of(lambda fun: fun, s), states)
     for name in SMALL:
         with subtests.test(name=name):
             # Each entry is the same few operations in one order or another.
@@ -146,7 +146,7 @@ def test_a_quotient_by_any_number_is_that_of_jax(dtype):
 @pytest.mark.parametrize("estimate", ["group", "algebra"])
 def test_a_step_with_its_estimate_is_smooth(estimate):
     """It compares norms of errors, and yet has as many divisions as without those of the field."""
-    y, solver = jnp.asarray(SIX[:3]), cfjax.CF4(estimate=estimate)
+    y, solver = jnp.asarray(SIX[:3]), cfjax.CF2(estimate=estimate)
 
     def count(field):
         term = cfjax.LieTerm(lambda t, y, a: cfjax.Rotation(field(y, a)))
@@ -193,11 +193,11 @@ LATTICES = {
         lambda t, s, k: cfjax.Rotation(jnp.roll(s, 1, 0) + jnp.roll(s, -1, 1)),
         SPINS.reshape(1, 100, 3),
     ),
-    "neighbours": (neighbours, GRID, cfjax.CF4()),
+    "neighbours": (neighbours, GRID),
     # Long ones are cut at the stages.
     "neighbours, many stages": (neighbours, GRID, cfjax.RKMK8()),
 }
-QUICK = "shifted by a number of the program", "sides of length 1", "neighbours"
+QUICK = "shifted by a number of the program", "sides of length 1"
 
 
 @pytest.mark.parametrize(
@@ -215,7 +215,10 @@ def test_solves_of_lattices(name):
         return solve(y0, k), grad(lambda y0: solve(y0, k), y0)
 
     given = jax.tree.map(jnp.asarray, y0), jnp.asarray(5)
-    ours = jax.jit(both)(*given)
+    ours = run(both, *given)
+    # Only XLA overwrites arrays.
+    if name == "shifted by a number of the program":
+        ours = jax.jit(solve)(*given), ours[1]
     with cfjax.rewriting(False):
         plain = run(both, *given)
     # Tens of operations on numbers of size 1 in two steps, hundreds with many stages.
