@@ -775,7 +775,7 @@ WITH_DEXPINV = {
 SLOW_DEXPINV = {
     *("InertialMotion of matrices", "LeftMatrix", "LinearAffine", "RigidMotion of a point"),
     *("PlanarMotion of a complex number and a position", "QuaternionRotation, fixed"),
-    "ExtendedMotion of a quaternion and two vectors",
+    *("RigidMotion of matrices, body", "ExtendedMotion of a quaternion and two vectors"),
 }
 
 
