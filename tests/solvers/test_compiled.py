@@ -31,7 +31,7 @@ def shifts(fun, *args):
     [cfjax.CF4(), cfjax.WeakOrder2(), cfjax.ShiftedNoise()],
     ids=lambda solver: type(solver).__name__,
 )
-@pytest.mark.representatives(2)
+@pytest.mark.representatives(1)
 def test_numbers_are_drawn_once_a_step(solver, shape, is_rewritten):
     """XLA would draw them again for each flow that uses them, of which there are 5 and more."""
     key, y0 = jax.random.key(0), jnp.broadcast_to(jnp.asarray([1.0, 0.0, 0.0]), shape)

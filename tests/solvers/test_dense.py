@@ -18,6 +18,7 @@ from scipy.integrate import solve_ivp
 from solver_table import MUNTHE_KAAS, SOLVERS, problem_for
 
 import cfjax
+from cfjax._solvers.dense import Substeps
 
 # `RKMK5` and `RKMK8` are Tsit5 and Dopri8.
 METHODS = MUNTHE_KAAS | {name: SOLVERS[name] for name in ("RKMK3", "RKMK4", "CF4")}
@@ -91,6 +92,33 @@ def test_the_error_between_the_steps_falls_with_the_order_of_the_solution(name):
     assert kept.sum() >= 3
     slope = problems.slope(steps[kept], errors[kept])
     assert abs(slope - (order + 1)) < 0.15
+
+
+def test_output_of_substeps_of_several_kinds():
+    """Each has the same part of the time, and the first and the last what is outside of the step.
+
+    Here all are linear.
+    """
+    ends = np.array([0.0, 1.0, 3.0, 7.0])
+    linear, cubic = (
+        diffrax.LocalLinearInterpolation,
+        diffrax.ThirdOrderHermitePolynomialInterpolation,
+    )
+    path = Substeps(
+        [
+            linear(t0=0.0, t1=0.2, **problems.arrays({"y0": 0.0, "y1": 1.0})),
+            cubic(t0=0.2, t1=0.5, **problems.arrays({"y0": 1.0, "y1": 3.0, "k0": 2.0, "k1": 2.0})),
+            linear(t0=0.5, t1=0.6, **problems.arrays({"y0": 3.0, "y1": 7.0})),
+        ]
+    )
+    thetas = np.array([-0.1, 0.1, 0.3, 0.4, 0.5, 0.6, 0.7, 0.9, 1.1])
+    values, slopes = jax.jit(jax.vmap(jax.value_and_grad(path.point)))(thetas)
+    part = np.clip(np.floor(3 * thetas), 0, 2).astype(int)
+    rates = np.diff(ends)[part]
+    # Some roundings of numbers up to 10.
+    expected = ends[part] + (3 * thetas - part) * rates
+    np.testing.assert_allclose(values, expected, rtol=0, atol=1e-14)
+    np.testing.assert_allclose(slopes, 3 * rates, rtol=0, atol=1e-13)
 
 
 # The output of Richardson's steps is that of its substeps, which is that of CF2.

@@ -190,63 +190,7 @@ def test_derivatives_in_start_args_and_field(name, adjoint):
                 np.testing.assert_allclose(found, expected[member], rtol=0, atol=DIFFERENCE_ERROR)
 
 
-def in_the_times(adjoint, t0, t1):
-    """The end of a step and a half; diffrax holds the size of the first and ends the last at t1."""
-    sol = diffrax.diffeqsolve(
-        TERM, cfjax.CF2(), t0, t1, 0.5, Y0, ARGS, adjoint=adjoint, max_steps=4
-    )
-    return jnp.sum(jnp.sin(sol.ys[-1]))
-
-
-@pytest.mark.slow
-@pytest.mark.parametrize("adjoint", ADJOINTS)
-def test_derivatives_in_the_times(adjoint):
-    fun = lambda times: in_the_times(ADJOINTS[adjoint], *times)  # noqa: E731
-    times, direction = (jnp.asarray(0.1), jnp.asarray(0.85)), (jnp.asarray(1.0), jnp.asarray(-0.5))
-
-    def derivative(times):
-        if adjoint == "forward":
-            return jax.jvp(fun, (times,), (direction,))[1]
-        return problems.inner(jax.grad(fun)(times), direction)
-
-    expected = problems.central_difference(jax.jit(fun), times, direction, DIFFERENCE_STEP)
-    assert abs(expected) > 0.1
-    found = jax.jit(derivative, compiler_options=problems.QUICK)(times)
-    np.testing.assert_allclose(found, expected, rtol=0, atol=DIFFERENCE_ERROR)
-
-
-@pytest.mark.slow
-@pytest.mark.parametrize("adjoint", ["checkpointed", "direct"])
-def test_hessian_vector_products(adjoint):
-    """The same steps as `cfjax.integrate`, whose products are tested against differences."""
-    solver = cfjax.CF2(estimate=None)
-    _, v, _ = problems.random_like(X, 2)
-
-    def by_diffrax(y):
-        sol = solve(solver, dt0=0.5, y0=y, adjoint=ADJOINTS[adjoint], max_steps=2)
-        return jnp.sum(jnp.sin(sol.ys[-1]))
-
-    def by_integrate(y):
-        sol = cfjax.integrate(TERM, solver, 0.0, 1.0, y, ARGS, num_steps=2)
-        return jnp.sum(jnp.sin(sol.ys[-1]))
-
-    def forward_over_reverse(fun):
-        product = lambda y: jax.jvp(jax.grad(fun), (y,), (v,))[1]  # noqa: E731
-        return jax.jit(product, compiler_options=problems.QUICK)(Y0)
-
-    def reverse_over_forward(fun):
-        product = jax.grad(lambda y: jax.jvp(fun, (y,), (v,))[1])
-        return jax.jit(product, compiler_options=problems.QUICK)(Y0)
-
-    expected = forward_over_reverse(by_integrate)
-    assert np.abs(expected).max() > 0.1
-    # Sums of some 1000 products in another order.
-    close(forward_over_reverse(by_diffrax), expected, atol=1e-13)
-    if adjoint == "direct":
-        close(reverse_over_forward(by_diffrax), expected, atol=1e-13)
-
-
-# Transformations
+# Tracing
 
 
 def test_a_step_is_traced_once():
@@ -282,7 +226,7 @@ def explosion(y0, t1, throw=False, solver=CF4):
 
 
 def test_failures_are_results_and_errors():
-    """Those of members of a batch are in test_events.py."""
+    """Those of members of a batch are in batch/test_batch.py."""
     y0 = jnp.asarray([1.0, 0.2])
     too_long, infinite, ended = (
         explosion(y, t1) for y, t1 in ((y0 / 10, 3.0), (y0, 3.0), (y0 / 4, 2.8))

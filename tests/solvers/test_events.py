@@ -4,7 +4,6 @@ from typing import Any
 
 import diffrax
 import equinox as eqx
-import jax
 import jax.numpy as jnp
 import jax.tree_util as jtu
 import numpy as np
@@ -200,36 +199,3 @@ def test_events_of_every_kind_at_once(name):
     # by 0.05 or more in a unit of time.
     np.testing.assert_allclose(problems.flat(found.ys)[: start.size], at, rtol=0, atol=1e-6)
     np.testing.assert_allclose(found.ts[-1], time, rtol=0, atol=1e-5)
-
-
-@pytest.mark.slow
-def test_each_member_of_a_batch_has_an_event_and_a_result_of_its_own():
-    """`y' = y^2` is `y0 / (1 - t y0)`: one blows up, one passes its level, one does neither."""
-
-    def passes(t, y, args, **kwargs):
-        return y[0] > args
-
-    def one(y0, level):
-        return diffrax.diffeqsolve(
-            cfjax.LieTerm(lambda t, y, args: y * y),
-            cfjax.CF4(estimate=None),
-            0.0,
-            10.0,
-            0.2,
-            y0,
-            level,
-            event=diffrax.Event(passes),
-            throw=False,
-        )
-
-    y0 = jnp.asarray([[5.0], [0.2], [1e-3]])
-    levels = jnp.asarray([np.inf, 0.6, np.inf])
-    sol = eqx.filter_jit(jax.vmap(one))(y0, levels)
-    results = diffrax.RESULTS
-    for k, result in enumerate([results.nonfinite, results.event_occurred, results.successful]):
-        assert jtu.tree_map(lambda x, k=k: x[k], sol.result) == result
-    assert sol.event_mask.tolist() == [False, True, False]
-    # 5 - 1 / 0.6 is 3.33.
-    np.testing.assert_allclose(sol.ts[1:, -1], [3.4, 10.0], rtol=0, atol=1e-12)
-    # Errors of h^4, times how much they grow, which is (y / y0)^2.
-    np.testing.assert_allclose(sol.ys[1:, -1, 0], [0.2 / (1 - 0.68), 1e-3 / 0.99], rtol=1e-4)

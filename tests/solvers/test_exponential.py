@@ -217,7 +217,7 @@ def test_stiff_order(solver, name, least, most):
 def loop_operations(term, y0, num_steps=10):
     """The operations in the body of the loop."""
     program = jax.make_jaxpr(
-        lambda y0: cfjax.integrate(term, cfjax.ETD54(), 0.0, 1.0, y0, num_steps=num_steps).ys
+        lambda y0: cfjax.integrate(term, cfjax.ETD43(), 0.0, 1.0, y0, num_steps=num_steps).ys
     )(y0)
     found = set()
 
