@@ -10,7 +10,9 @@ import diffrax
 import jax
 import jax.numpy as jnp
 import numpy as np
+import problems
 import pytest
+from brownian_paths import GivenStep
 from scipy.linalg import expm
 
 import cfjax
@@ -110,80 +112,27 @@ def test_brownian_motion_of_unit_vectors_and_of_orthonormal_columns():
     assert_mean(found["frame"], np.exp(-2 * s**2 / 2) * frame, 0.36**2 / 16 / 4)
 
 
-# Equilibrium
+def test_a_bath_in_a_splitting():
+    """Friction and noise are one term, between two halves of a turn: an Ornstein-Uhlenbeck step."""
+    h, rate, amplitudes = 0.7, 1.3, np.array([0.5, 0.8, 1.1])
+    turn, w, start = np.array([0.3, -0.7, 0.5]), np.array([0.4, -0.3, 0.6]), np.array([0.6, 0, 0.8])
 
+    def friction(t, y, args):
+        return cfjax.LinearAffine(-rate * jnp.eye(3), jnp.zeros(3))
 
-def langevin(x: float) -> float:
-    return 1 / np.tanh(x) - 1 / x
+    def torques(t, y, args, dw):
+        return cfjax.LinearAffine(jnp.zeros((3, 3)), amplitudes * dw)
 
-
-INERTIA = np.array([1.0, 2.0, 3.0])
-FRICTION, DIPOLE, HEAT = 1.0, 2.0, 1.0
-
-
-def turn(w):
-    return cfjax.QuaternionRotation(w, frame="body", layout="wxyz")
-
-
-def kick(t, y, args):
-    """The torque of a vertical field on a dipole along the body's third axis."""
-    vertical = cfjax.quaternion_to_matrix(y["q"], layout="wxyz")[:, 2, :]
-    axis = jnp.asarray([[0.0, 0.0, 1.0]])
-    return {"q": None, "m": DIPOLE * jnp.cross(axis, vertical)}
-
-
-def spin(inverse):
-    """A part of the kinetic energy, given by moments of inertia, that is constant on its flow."""
-
-    def field(t, y, args):
-        w = y["m"] * inverse[None]
-        return {"q": turn(w), "m": cfjax.Rotation(-w)}
-
-    return cfjax.LieTerm(field)
-
-
-def friction(t, y, args):
-    eye = jnp.eye(3)[None]
-    return {"q": None, "m": cfjax.LinearAffine(-FRICTION * eye, jnp.zeros((1, 3)))}
-
-
-def torques(t, y, amplitudes, dw):
-    return {"q": None, "m": cfjax.LinearAffine(jnp.zeros((1, 3, 3)), amplitudes * dw)}
-
-
-def amplitudes_of(h):
-    """The amplitudes with which the flow of friction and noise has the exact law, for steps h."""
-    x = FRICTION * h / 2
-    return np.sqrt(2 * FRICTION * HEAT * INERTIA * x / np.tanh(x))[None]
-
-
-@pytest.mark.slow
-def test_a_body_at_a_temperature():
-    """`<m_k^2 / J_k> = kT` and `<cos> = L(dipole / kT)`, by BAOAB with the exact friction."""
-    number, h = 20_000, 0.25
-    path, parts = brownian((number, 3)), [e / INERTIA for e in np.eye(3)]
-    bath = diffrax.MultiTerm(cfjax.LieTerm(friction), cfjax.LieControlTerm(torques, path))
-    term = diffrax.MultiTerm(cfjax.LieTerm(kick), *map(spin, parts), bath)
-    y0 = {"q": copies([1.0, 0.0, 0.0, 0.0], number), "m": jnp.zeros((number, 3))}
-    args = jnp.asarray(amplitudes_of(h))
-    ys = cfjax.integrate(term, cfjax.Strang(), 0.0, 10.0, y0, args, num_steps=40).ys
-    assert ys is not None
-    height = cfjax.quaternion_to_matrix(ys["q"][-1], layout="wxyz")[:, 2, 2]
-    # Weak errors at these steps, measured with more paths: 1 % of the temperature, and 0.002.
-    assert_mean(np.asarray(ys["m"][-1]) ** 2 / INERTIA, HEAT, 0.02)
-    assert_mean(height, langevin(DIPOLE / HEAT), 3e-3)
-
-
-@pytest.mark.slow
-def test_friction_and_noise_in_a_splitting_have_the_exact_law():
-    """The variance of momenta after any step, from the increment's own variance."""
-    h = 0.7
-    unit = jnp.full((1, 3), h**0.5)
-    kicks = torques(0.0, None, amplitudes_of(h), unit)["m"]
-    field = cfjax.combine((h, 1.0), (friction(0.0, None, None)["m"], kicks))
-    m = field.flow(jnp.zeros((1, 3)))[0]
-    exact = HEAT * INERTIA * (1 - np.exp(-2 * FRICTION * h))
-    np.testing.assert_allclose(m**2, exact, rtol=1e-14)
+    given = GivenStep(jnp.asarray(w), None)
+    bath = diffrax.MultiTerm(cfjax.LieTerm(friction), cfjax.LieControlTerm(torques, given))
+    term = diffrax.MultiTerm(cfjax.LieTerm(lambda t, y, args: cfjax.Rotation(turn)), bath)
+    step = lambda h, y0: problems.first_step(cfjax.Strang(), term, 0 * h, h, y0, None)[0]  # noqa: E731
+    found = jax.jit(step, compiler_options=problems.QUICK)(h, jnp.asarray(start))
+    half = expm(h / 2 * problems.hat(turn))
+    kept = np.exp(-rate * h)
+    expected = half @ (kept * half @ start + (1 - kept) / (rate * h) * amplitudes * w)
+    # Three flows of a few roundings.
+    np.testing.assert_allclose(found, expected, rtol=0, atol=1e-14)
 
 
 # Path by path

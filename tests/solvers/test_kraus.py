@@ -252,26 +252,6 @@ def test_stiff_dissipation():
             assert 0.8 * error < np.abs(estimate).max() < 20 * error
 
 
-@pytest.mark.slow
-@pytest.mark.filterwarnings("ignore:Complex dtype support in Diffrax")
-def test_controlled_steps():
-    general = PROBLEMS["general"]
-
-    @jax.jit
-    def solve(rtol):
-        sol = diffrax.diffeqsolve(
-            *(cfjax.LieTerm(field), SOLVER, 0.0, 2.0, 0.1, jnp.asarray(START), general.values()),
-            stepsize_controller=diffrax.PIDController(rtol=rtol, atol=rtol),
-        )
-        return sol.ys[-1], sol.stats["num_steps"]
-
-    for rtol in (1e-4, 1e-7):
-        rho, num_steps = solve(rtol)
-        # The estimate is far above the error of short steps.
-        assert np.abs(rho - answer(general, 0.0, 2.0)).max() < rtol
-        assert num_steps < 200
-
-
 def test_constant_steps_compute_no_estimate():
     def operations(solver):
         def step(t):

@@ -9,7 +9,6 @@ import jax
 import jax.numpy as jnp
 import mpmath
 import numpy as np
-import optimistix as optx
 import problems
 import pytest
 import scipy.integrate
@@ -275,59 +274,6 @@ def test_order_on_a_dictionary_of_rotations_and_an_array(flight_problem, name):
 # Exact answers, with control of the error
 
 
-def porous_problem():
-    """u' = (u^2)'' from X with (X^2)'' = -X, by Newton's method: u = X / (1 + t)."""
-    n = 15
-    laplacian = (n + 1) ** 2 * (np.eye(n, k=1) - 2 * np.eye(n) + np.eye(n, k=-1))
-    w = 0.005 * np.sin(np.pi * np.arange(1, n + 1) / (n + 1))
-    for _ in range(30):
-        jacobian = laplacian + np.diag(0.5 / np.sqrt(w))
-        w = np.maximum(w - np.linalg.solve(jacobian, laplacian @ w + np.sqrt(w)), 1e-6)
-    x = np.sqrt(w)
-    assert np.abs(laplacian @ x**2 + x).max() < 1e-14
-
-    def field(t, y, args):
-        w = jnp.pad(y**2, 1)
-        return (n + 1) ** 2 * (w[2:] - 2 * y**2 + w[:-2])
-
-    return field, 50 * x, None, 0.2, 50 * x / (1 + 50 * 0.2)
-
-
-def neighbours(y):
-    return sum(jnp.roll(y, shift, axis) for axis in (0, 1) for shift in (1, -1))
-
-
-def spins(t, y, args):
-    """Spins on a square lattice that turn towards their neighbours."""
-    return cfjax.Rotation(jnp.cross(y, neighbours(y)))
-
-
-def sublattices(a):
-    """Two sublattices of spins, with an angle a between neighbours."""
-    sign = jnp.asarray(1.0 - 2 * (np.indices((4, 4)).sum(0) % 2))
-    return jnp.stack([jnp.sin(sign * a / 2), 0 * sign, jnp.cos(sign * a / 2)], axis=-1)
-
-
-def sublattices_problem():
-    """The stiffest mode, nonlinear: tan(a / 2) falls as exp(-8 t)."""
-    a = 2 * np.arctan(np.exp(-8 * 0.25) * np.tan(1.2))
-    return spins, np.asarray(sublattices(2.4)), None, 0.25, np.asarray(sublattices(a))
-
-
-def damped_spin_problem(b=30.0, alpha=0.5, t=0.2, theta=2.0):
-    def field(t, y, args):
-        up = jnp.array([0.0, 0.0, b])
-        return cfjax.Rotation((up + alpha * jnp.cross(y, up)) / (1 + alpha**2))
-
-    def at(t):
-        rate = b / (1 + alpha**2)
-        angle = 2 * np.arctan(np.exp(-alpha * rate * t) * np.tan(theta / 2))
-        p = rate * t
-        return np.array([np.sin(angle) * np.cos(p), np.sin(angle) * np.sin(p), np.cos(angle)])
-
-    return field, at(0.0), None, t, at(t)
-
-
 def link(t, y, args):
     """A link that moves to the unit: minus the traceless skew part."""
     skew = (jnp.conj(y.T) - y) / 2
@@ -352,9 +298,6 @@ def oscillation_problem():
 
 
 PROBLEMS = {
-    "porous medium": porous_problem,
-    "two sublattices": sublattices_problem,
-    "damped spin": damped_spin_problem,
     "SU(3) link": su3_problem,
     "oscillation": oscillation_problem,
 }
@@ -380,14 +323,6 @@ def solve(field, solver, t1, y0, args=None, tolerance=1e-5, **options):
         )
 
 
-def distance_from_manifold(name, y):
-    if "spin" in name or "sublattices" in name:
-        return np.abs(np.sum(np.asarray(y) ** 2, axis=-1) - 1).max()
-    if "link" in name:
-        return np.abs(np.asarray(y).conj().T @ np.asarray(y) - np.eye(len(y))).max()
-    return 0.0
-
-
 @pytest.mark.filterwarnings("ignore:Complex dtype support in Diffrax")
 @pytest.mark.parametrize(
     "problem, name",
@@ -410,10 +345,11 @@ def test_error_over_tolerance_by_exact_answers(problem, name):
         y, steps = run(jnp.asarray(tolerance))
         errors.append(np.abs(np.asarray(y) - answer).max())
         assert low < errors[-1] / tolerance < high
-        # As rounding adds up over the steps.
-        assert distance_from_manifold(problem, y) < 1e-14 * (10 + steps)
-    # The parts of an error may cancel at one tolerance, as those of RKG2 for the damped spin do at
-    # 1e-3.
+        if "link" in problem:
+            # As rounding adds up over the steps.
+            defect = np.abs(np.asarray(y).conj().T @ np.asarray(y) - np.eye(3)).max()
+            assert defect < 1e-14 * (10 + steps)
+    # The parts of an error may cancel at one tolerance.
     assert errors[2] < min(errors[:2])
 
 
@@ -590,26 +526,6 @@ def test_equal_steps_of_a_diffusion_that_is_switched_on(name, dtype):
         np.testing.assert_allclose(found, exact, rtol=0, atol=3e-4)
 
 
-@slow
-def test_controlled_steps_of_a_diffusion_that_is_switched_on_are_as_with_the_radius():
-    def counts(solver):
-        @jax.jit
-        def run(y0, p):
-            sol = solve(switched, solver, 1.0, y0, p, 1e-3, max_steps=2000)
-            return sol.ys[-1], sol.stats["num_steps"]
-
-        for name in ("sine", "ramp", "from zero"):
-            p, y0, exact = switched_problems()[name]
-            y, number = run(jnp.asarray(y0), jnp.asarray(p))
-            # A few times the tolerance, as errors of steps add up.
-            np.testing.assert_allclose(y, exact, rtol=0, atol=1e-2)
-            yield int(number)
-
-    estimated, given = counts(cfjax.RKL2()), counts(cfjax.RKL2(spectral_radius=exact_radius))
-    for found, expected in zip(estimated, given, strict=True):
-        assert found < 1.25 * expected
-
-
 def test_a_radius_of_a_function_is_that_of_both_ends_of_a_step():
     """At t = 0 it is zero, and 20 steps of a sine with a period of 0.3 are few."""
     p, y0, exact = switched_problems()["sine"]
@@ -628,7 +544,6 @@ def beside(t, y, p):
     return {"a": slow * (matrix @ y["a"]), "b": fast * is_on * (matrix @ y["b"])}
 
 
-@slow
 def test_a_batch_in_which_parts_are_switched_on_later():
     """3 and 10 times as stiff as what is on from the start, at the end of a step and within one."""
     rough = np.random.default_rng(1).normal(size=(2, N_CELLS))
@@ -637,11 +552,12 @@ def test_a_batch_in_which_parts_are_switched_on_later():
     members = jnp.array([[0.33, 1.0, 0.5], [0.1, 1.0, 0.613], [0.1, 1.0, 2.0], [0.1, 0.0, 0.0]])
 
     @jax.jit
+    @jax.vmap
     def end(p):
         sol = cfjax.integrate(cfjax.LieTerm(beside), cfjax.RKL2(), 0.0, 1.0, y0, p, num_steps=100)
         return sol.ys["a"][-1], sol.ys["b"][-1]
 
-    found = jax.jit(jax.vmap(end))(members)
+    found = end(members)
     for k, (slow, fast, start) in enumerate(np.asarray(members)):
         a, b = (leaf[k] for leaf in found)
         np.testing.assert_allclose(a, diffused(N_CELLS, rough[0], slow), rtol=0, atol=1e-3)
@@ -809,25 +725,6 @@ def test_output_within_a_step_has_order_two_stays_on_the_manifold_and_meets_the_
     assert (slopes > 2.6).all()
 
 
-@slow
-def test_an_event_and_saved_times_within_controlled_steps():
-    field, y0, _, t1, _ = damped_spin_problem()
-    event = diffrax.Event(
-        lambda t, y, args, **kwargs: y[2], optx.Newton(rtol=1e-8, atol=1e-8), direction=None
-    )
-    ts = jnp.linspace(0, 0.03, 7)
-    saveat = diffrax.SaveAt(ts=ts, t1=True)
-    options = dict(tolerance=1e-7, event=event, saveat=saveat)
-    sol = solve(field, cfjax.RKL3(), 10 * t1, jnp.asarray(y0), **options)
-    exact = np.stack([damped_spin_problem(t=float(t))[4] for t in ts])
-    # As many steps as of an end, and output of an order less.
-    assert np.abs(sol.ys[:7] - exact).max() < 1e-5
-    assert np.abs(np.linalg.norm(sol.ys[:8], axis=-1) - 1).max() < 1e-13
-    # tan(theta / 2) = 1.
-    rate = 30.0 / 1.25
-    assert sol.ts[7] == pytest.approx(np.log(np.tan(1.0)) / (0.5 * rate), abs=1e-5)
-
-
 def test_sums_are_compensated():
     """Of 1e5 steps in single precision, which would round to a hundred units otherwise."""
 
@@ -839,43 +736,6 @@ def test_sums_are_compensated():
     np.testing.assert_allclose(y, [np.cos(1), np.sin(1), 0], rtol=0, atol=3e-6)
 
 
-def test_a_batch_of_different_stiffness_is_as_its_members():
-    """3 to 11 stages side by side; the loop runs on for those that have most."""
-
-    @jax.jit
-    @jax.vmap
-    def end(rate):
-        term, y0 = cfjax.LieTerm(stiff), jnp.zeros(2)
-        return cfjax.integrate(term, cfjax.RKL3(), 0.0, 1.0, y0, rate, num_steps=50).ys[-1]
-
-    rates = jnp.array([1.0, 100.0, 3000.0])
-    # Each among others like it, by the same program.
-    alone = [end(jnp.full(3, rate))[0] for rate in rates]
-    np.testing.assert_allclose(end(rates), jnp.stack(alone), rtol=0, atol=1e-13)
-
-
-@slow
-def test_a_batch_of_controlled_solves_is_as_its_members():
-    """As many steps, and ends that differ as those of starts that differ by a rounding."""
-    rates = jnp.array([1.0, 100.0, 3000.0])
-
-    @jax.jit
-    def end(rate, start):
-        sol = solve(stiff, cfjax.RKL2(), 1.0, jnp.zeros(2) + start, rate, 1e-4)
-        return sol.ys[-1], sol.stats["num_steps"], sol.stats["num_rejected_steps"]
-
-    found, *numbers = jax.vmap(end, (0, None))(rates, 0.0)
-    for k, rate in enumerate(rates):
-        expected, *expected_numbers = end(rate, 0.0)
-        assert [int(n[k]) for n in numbers] == [int(n) for n in expected_numbers]
-        # The length of a step follows from the estimate, in which the rounding of stiff parts
-        # counts z times, and the step has an error of the tolerance.
-        moved = [jnp.abs(end(rate, x)[0] - expected).max() for x in (1e-16, -1e-16, 1e-15, -1e-15)]
-        assert jnp.abs(found[k] - expected).max() <= 1e-13 + 4 * max(moved)
-        # Far less than an error that anything else would make.
-        assert max(moved) < 1e-8
-
-
 def test_backwards_in_time_what_decayed_grows():
     @jax.jit
     def run(t0, t1, y0):
@@ -885,15 +745,6 @@ def test_backwards_in_time_what_decayed_grows():
     end = run(0.0, 1.0, jnp.ones(2))
     np.testing.assert_allclose(end, np.exp(-3), rtol=1e-6)
     np.testing.assert_allclose(run(1.0, 0.0, end), 1, rtol=1e-5)
-
-
-@slow
-def test_richardson_takes_them(attitude_answer):
-    """Though a method without an estimate needs it more."""
-    solver = cfjax.Richardson(cfjax.RKL2())
-    sol = solve(attitude, solver, 1.0, jnp.eye(3), tolerance=1e-5)
-    error = np.abs(sol.ys[-1].ravel() - attitude_answer).max()
-    assert 1e-8 < error < 1e-4
 
 
 # Derivatives
