@@ -280,11 +280,14 @@ def test_the_memory_forwards_does_not_grow_with_the_steps():
 
 @pytest.mark.slow
 def test_the_memory_backwards_is_one_state_for_each_step():
-    few, many = temporary_bytes(100, reverse=True), temporary_bytes(1100, reverse=True)
+    def at(num_steps, **options):
+        return temporary_bytes(num_steps, reverse=True, solver=cfjax.CF4(), **options)
+
+    few, many = at(100), at(1100)
     # The state, and at most four numbers more: the count, the result, and their padding.
     assert BIG**2 * 8 <= (many - few) / 1000 <= (BIG**2 + 4) * 8
     # Of a small system, its state and a count.
-    few, many = (temporary_bytes(n, reverse=True, y0=Y0) for n in (100, 10_100))
+    few, many = (at(n, y0=Y0) for n in (100, 10_100))
     assert (many - few) / 10_000 <= 3 * 8 + 4
 
 
@@ -293,7 +296,8 @@ def test_the_memory_backwards_grows_with_the_root_of_the_steps_on_request():
     """A block keeps the state and what the last sum lost; within one block a step keeps a state."""
 
     def states(root):
-        return temporary_bytes(root**2, reverse=True, checkpoint_every=root) / (BIG**2 * 8)
+        options = dict(reverse=True, solver=cfjax.CF4(), checkpoint_every=root)
+        return temporary_bytes(root**2, **options) / (BIG**2 * 8)
 
     assert 3 * 90 <= states(100) - states(10) <= 3.1 * 90
 
