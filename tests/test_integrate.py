@@ -192,7 +192,7 @@ def test_new_values_do_not_trace_again():
             nonlocal calls
             calls += 1
             inertia, rate = args
-            return cfjax.Rotation(-self.scale * rate * y / inertia)
+            return -self.scale * rate * y / inertia
 
     def traces(scale=1.0, args=ARGS, rate=1.0, **options):
         before = calls
