@@ -16,6 +16,10 @@ import numpy as np
 
 import cfjax
 
+# For interpreters of steps.
+from cfjax._methods.continuous_extension import continuous_extension as continuous_extension
+from cfjax._methods.continuous_extension import runge_kutta_extension as runge_kutta_extension
+
 Kind = Literal[
     "commutator-free",
     "low-storage",

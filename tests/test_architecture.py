@@ -63,7 +63,7 @@ PRIVATE_IN_TESTS = {
     "numerics/test_expm_source.py": "the norms that another exponential has polynomials for",
     "paper/test_command.py": "the command without its experiments, which take minutes",
     "paper/test_experiments.py": "numbers and figures that the command shows as text and pictures",
-    "solvers/test_step.py": "coefficients within a step, for an interpreter of them",
+    "solver_table.py": "coefficients within a step, for interpreters of them",
     "test_canary.py": "tables of the names that other libraries have",
     "xla/random_programs.py": "programs rewritten, which no solve is",
     "xla/test_materialise.py": "calls that keep XLA from fusing",

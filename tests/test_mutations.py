@@ -136,6 +136,7 @@ tests/a.py::test_b PASSED
 1.25s setup    tests/a.py::test_b
 2.50s call     tests/a.py::test_b
 12.00s call     tests/a.py::test_b[c - d]
+1.50s call     tests/a.py::test_b
 """
     found = kill_matrix.seconds_of(printed)
     assert found == {"tests/a.py::test_b": 2.5, "tests/a.py::test_b[c - d]": 12.0}

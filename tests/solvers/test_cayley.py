@@ -12,9 +12,9 @@ import pytest
 from matrix_checks import fixed_of, product
 from matrix_problems import PROBLEMS, Problem, skew
 from scipy.linalg import expm
+from solver_table import runge_kutta_extension
 
 import cfjax
-from cfjax._methods.continuous_extension import runge_kutta_extension
 
 CAYLEY: Any = {"coordinates": "cayley"}
 RKMK5, RKMK8 = cfjax.RKMK5(**CAYLEY), cfjax.RKMK8(**CAYLEY)

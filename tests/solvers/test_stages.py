@@ -13,9 +13,9 @@ import numpy as np
 import problems
 import pytest
 from scipy.linalg import expm
+from solver_table import continuous_extension
 
 import cfjax
-from cfjax._methods.continuous_extension import continuous_extension
 
 SOLVERS = {
     "CF4": cfjax.CF4(),

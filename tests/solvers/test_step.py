@@ -13,10 +13,16 @@ import numpy as np
 import problems
 import pytest
 import scipy.linalg
-from solver_table import COMMUTATOR_FREE, MUNTHE_KAAS, Row, named
+from solver_table import (
+    COMMUTATOR_FREE,
+    MUNTHE_KAAS,
+    Row,
+    continuous_extension,
+    named,
+    runge_kutta_extension,
+)
 
 import cfjax
-from cfjax._methods.continuous_extension import continuous_extension, runge_kutta_extension
 
 COMMUTATOR_FREE = named("commutator-free", "low-storage") | {
     name: COMMUTATOR_FREE[name] for name in ("family A, 1", "family B, 0.1")
