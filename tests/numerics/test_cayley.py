@@ -1,5 +1,7 @@
 """Cayley's transform: small systems, determinants, and where half a turn begins."""
 
+from functools import partial
+
 import jax
 import jax.numpy as jnp
 import matrices
@@ -7,6 +9,7 @@ import mpmath
 import numpy as np
 import pytest
 from scipy.linalg import expm, logm
+from xla.interpreter import run
 
 from cfjax._numerics.cayley import (
     TangentCoordinates,
@@ -50,15 +53,17 @@ def assert_solved(m, z, factor):
     inverse = np.linalg.inv(m.astype(wide))
     atol = factor * UNIT[np.dtype(m.dtype).name] * np.linalg.cond(m)
     wants = inverse @ z, inverse @ z[:, 0], z @ inverse
-    for found, want in zip(systems(m, z), wants, strict=True):
+    for found, want in zip(run(systems, m, z), wants, strict=True):
         assert found.dtype == m.dtype
         np.testing.assert_allclose(found, want, rtol=0, atol=atol)
 
 
 def test_systems_against_numpy(subtests):
-    single = [(n, dtype) for n in (4, 5) for dtype in (np.float32, np.complex64)]
-    double = [(n, dtype) for n in (1, 2, 3, 4, 5, 17) for dtype in (np.float64, np.complex128)]
-    for n, dtype in single + double:
+    single = [(4, np.float32), (5, np.complex64)]
+    real, other = ([(n, dtype) for n in sizes] for sizes, dtype in (
+        ((1, 3, 5, 17), np.float64), ((2, 4, 17), np.complex128)
+    ))  # fmt: skip
+    for n, dtype in single + real + other:
         m = (np.eye(n) - 0.4 * matrices.random((n, n), 1)).astype(dtype)
         m = m + (0.2 * matrices.random((n, n), 2, dtype)).astype(dtype)
         with subtests.test(case=f"{n} {np.dtype(dtype).name}"):
@@ -78,7 +83,7 @@ def test_systems_from_both_sides(subtests):
         left = np.linalg.solve(m, z)
         with subtests.test(case=f"{n} {dtype}"):
             for other in (m.conj().T, right):
-                found, congruent = both(m, z, other)
+                found, congruent = run(both, m, z, other)
                 # Some roundings of entries of some units.
                 np.testing.assert_allclose(found, left @ np.linalg.inv(other), rtol=0, atol=1e-14)
             want = left @ np.linalg.inv(m.conj().T)
@@ -90,7 +95,7 @@ def test_units_scale_rounding():
     for n in (2, 3, 4):
         m, d = np.eye(n) - 0.3 * matrices.random((n, n), 1), 1e5 ** np.arange(n)
         scaled = d[:, None] * m / d
-        found = np.asarray(systems(scaled, np.eye(n))[0]) / d[:, None] * d
+        found = run(systems, scaled, np.eye(n))[0] / d[:, None] * d
         np.testing.assert_allclose(found, np.linalg.inv(m), rtol=0, atol=1e-14)
 
 
@@ -180,7 +185,9 @@ def test_derivatives_of_systems(n):
             (w @ dm @ w @ z, 2 * w @ dm @ w @ dm @ w @ z),
             (z @ w @ dm @ w, 2 * z @ w @ dm @ w @ dm @ w),
         ]
-        for (value, twice, gradient), (first, second) in zip(derivatives(m), exact, strict=True):
+        for (value, twice, gradient), (first, second) in zip(
+            run(derivatives, m), exact, strict=True
+        ):
             # Roundings of products of matrices as large as these.
             atol = 1e-14 * np.abs(w).max() ** 2 * n**2
             np.testing.assert_allclose(value, -first, rtol=0, atol=atol)
@@ -194,7 +201,7 @@ def test_the_derivative_of_the_transform():
     for is_complex in (False, True):
         u, a = skew(4, 1.5, is_complex), matrices.random((4, 4), 6, np.complex128) / 3
         a = a if is_complex else a.real
-        v, h = np.asarray(dcayinv(jnp.asarray(u), jnp.asarray(a))), 1e-3
+        v, h = run(dcayinv, u, a), 1e-3
         rates = [(cay(u + k * h * v) - cay(u - k * h * v)) / (2 * k * h) for k in (1, 2)]
         # Of fourth order, and rounding over the step.
         np.testing.assert_allclose((4 * rates[0] - rates[1]) / 3, a @ cay(u), rtol=0, atol=2e-11)
@@ -209,7 +216,7 @@ def test_logarithms_of_determinants():
     many = [1j * np.diag(x) for x in (*(2 * np.tan(angles / 2)), np.array([2.0, 2.0, 0.0]))]
     v = np.linalg.qr(matrices.random((3, 3), 4, complex))[0]
     many = np.stack([*many, *(v @ x @ v.conj().T for x in many)])
-    found = np.asarray(jax.jit(jax.vmap(log_determinant))(np.concatenate([few, many])))
+    found = run(jax.vmap(log_determinant), np.concatenate([few, many]))
     for value, u, size in zip(found, few, np.tile(sizes, 2), strict=False):
         with mpmath.workdps(40):
             x, one = mpmath.matrix((u / 2).tolist()), mpmath.eye(3)
@@ -225,17 +232,18 @@ def test_logarithms_of_determinants():
 def test_whole_turns_are_left_out():
     turns, angles = np.arange(-3, 4)[:, None], np.array([-3.14, -1.0, 0.0, 2.0, 3.14])
     given = 0.5 + 1j * (angles + 2 * np.pi * turns)
-    found, slopes = jax.jvp(jax.jit(without_turns), (given,), (np.full_like(given, 1 - 2j),))
+    along = lambda z: jax.jvp(without_turns, (z,), (jnp.full_like(z, 1 - 2j),))  # noqa: E731
+    found, slopes = run(along, given)
     # A rounding of three turns.
     expected = np.broadcast_to(0.5 + 1j * angles, given.shape)
     np.testing.assert_allclose(found, expected, rtol=0, atol=4e-15)
     np.testing.assert_array_equal(slopes, 1 - 2j)
-    assert without_turns(jnp.asarray(1e-20j)) == 1e-20j
+    assert run(without_turns, np.asarray(1e-20j)) == 1e-20j
 
 
 def test_no_turn_by_less_than_one_is_nearly_half_a_turn():
     """But pairs of angles above 2.75 are, and these add up."""
-    is_within = jax.jit(is_within_half_a_turn)
+    is_within = partial(run, is_within_half_a_turn)
     for n in (2, 3, 20, 100):
         for angle in (0.1, 1.0):
             u = np.kron(np.eye(n // 2), [[0, -1], [1, 0]]) * 2 * np.tan(angle / 2)
@@ -272,7 +280,7 @@ def test_tangent_vectors_as_coordinates(shape):
     v = tangent(2, q)
     y = point(v)
     velocity, h = tangent(3, y), 1e-3
-    increment, rate, _ = map(np.asarray, found(v, velocity))
+    increment, rate, _ = run(found, v, velocity)
     np.testing.assert_allclose(q + increment, y, rtol=0, atol=1e-15 * 10)
     np.testing.assert_allclose(y.T @ y, np.eye(p), rtol=0, atol=1e-15 * 10)
     quotient = [(point(v + k * h * rate) - point(v - k * h * rate)) / (2 * k * h) for k in (1, 2)]
@@ -281,8 +289,8 @@ def test_tangent_vectors_as_coordinates(shape):
     g = v - q @ (q.T @ v) / 2
     size = np.sum((g @ q.T - q @ g.T) ** 2)
     bound = np.sqrt((72 + 1.2 * min(n, 2 * p)) / size)
-    assert found((1 - 1e-9) * bound * v, velocity)[2]
-    assert not found((1 + 1e-9) * bound * v, velocity)[2]
+    assert run(found, (1 - 1e-9) * bound * v, velocity)[2]
+    assert not run(found, (1 + 1e-9) * bound * v, velocity)[2]
 
 
 def test_half_a_turn_is_where_the_coordinates_end():
@@ -292,4 +300,4 @@ def test_half_a_turn_is_where_the_coordinates_end():
     u = 2 * (y - np.eye(5)) @ np.linalg.inv(y + np.eye(5))
     np.testing.assert_allclose(cay(u), y, rtol=0, atol=1e-13)
     np.testing.assert_allclose(logm(cay(u)), a, rtol=0, atol=1e-12)
-    assert not is_within_half_a_turn(jnp.asarray(u))
+    assert not run(is_within_half_a_turn, u)

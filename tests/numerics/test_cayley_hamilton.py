@@ -7,6 +7,7 @@ import numpy as np
 import pytest
 import scipy.linalg
 from matrices import DTYPES, POSE, backward_error, exact_expm, random, small, to_numpy
+from xla.interpreter import run
 
 from cfjax import LeftMatrix, expm
 from cfjax._numerics import cayley_hamilton
@@ -52,13 +53,12 @@ def test_a_change_of_units_changes_no_digit():
     for n in (2, 3):
         a = np.stack([small(kind, n, 0.5) for kind in KINDS if kind != "nilpotent"])
         units = 2.0 ** np.array([40, 0, -7])[:n]
-        e = np.asarray(mapped(a))
-        moved = np.asarray(mapped(a * units[:, None] / units))
+        e, moved = run(mapped, a), run(mapped, a * units[:, None] / units)
         np.testing.assert_array_equal(moved, e * units[:, None] / units)
 
 
 def test_the_motion_of_a_pose_far_away():
-    found = expm(POSE)
+    found = run(expm, POSE)
     np.testing.assert_allclose(found, to_numpy(exact_expm(POSE)), rtol=4 * 2.0**-52)
     assert np.array_equal(found[2], [0, 0, 1])
 
@@ -66,7 +66,7 @@ def test_the_motion_of_a_pose_far_away():
 def test_members_have_their_own_scaling():
     norms = [1e-8, 0.5, 3.0, 2e4, 0.0]
     batch = np.stack([small("skew", 3, norm, k) for k, norm in enumerate(norms)])
-    for e, a, norm in zip(np.asarray(mapped(batch)), batch, norms, strict=True):
+    for e, a, norm in zip(run(mapped, batch), batch, norms, strict=True):
         # As in test_accuracy. With the scaling of the largest this would be 2e4 times as much.
         error = np.linalg.norm(e - to_numpy(exact_expm(a)), 2)
         assert error <= 4 * 3 * 2.0**-52 * max(1.0, norm)
@@ -98,7 +98,7 @@ def test_derivatives(n, dtype):
         keep = [k for k, (kind, norm) in enumerate(cases) if not (kind == "meet" and norm > 2)]
         cases, a = [cases[k] for k in keep], a[keep]
     d, w = (random((len(a), n, n), seed, dtype) / n for seed in (8, 9))
-    found = map(np.asarray, derivatives(a, d, w))
+    found = run(derivatives, a, d, w)
     h = mpmath.mpf(10) ** -15
     for case, x, direction, weights, *got in zip(cases, a, d, w, *found, strict=True):
         growth = np.exp(np.linalg.norm((x + x.conj().T) / 2, 2))

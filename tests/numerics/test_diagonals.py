@@ -7,6 +7,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 from matrices import DTYPES, random
+from xla.interpreter import run
 
 from cfjax._numerics.diagonals import Diagonals, adjoint, compact, dense, gram, times, times_adjoint
 
@@ -39,11 +40,10 @@ def test_products_are_those_of_the_dense_matrix(subtests):
     for kind, a in KINDS.items():
         stored = compact(a)
         # Entries that are arguments of a program are not known in it, and their places are.
-        programs = jax.jit(products), jax.jit(partial(products, stored))
         for dtype in (float, complex):
             x = random((N, N), 2, dtype)
             wants = a @ x, x @ a.conj().T, a.conj().T @ a, a @ a.conj().T
-            for found in (programs[0](stored, jnp.asarray(x)), programs[1](jnp.asarray(x))):
+            for found in (run(products, stored, x), run(partial(products, stored), x)):
                 with subtests.test(case=f"{kind} {dtype}"):
                     for got, want in zip(found, wants, strict=True):
                         # Sums of six products of numbers of size 1 to 10.
@@ -67,7 +67,7 @@ def test_the_precision_of_a_product():
 
 def test_a_matrix_of_other_columns():
     a, x = of_diagonals(1, -2), random((N, 3), 1)
-    np.testing.assert_allclose(times(compact(a), jnp.asarray(x)), a @ x, rtol=0, atol=1e-14)
+    np.testing.assert_allclose(run(partial(times, compact(a)), x), a @ x, rtol=0, atol=1e-14)
 
 
 def test_what_is_not_known_or_small_or_has_many_diagonals_stays_dense():
@@ -94,14 +94,15 @@ def test_a_product_has_no_product_of_matrices():
 def test_derivatives_of_products_by_diagonals():
     a, x, d = of_diagonals(1, -2), random((N, N), 1, complex), random((N, N), 2, complex)
     stored: Any = compact(a)
-    found = jax.jvp(lambda x: times_adjoint(times(stored, x), stored), (x,), (d,))[1]
+    both = lambda x: times_adjoint(times(stored, x), stored)  # noqa: E731
+    found = run(lambda x, d: jax.jvp(both, (x,), (d,))[1], x, d)
     np.testing.assert_allclose(found, a @ d @ a.conj().T, rtol=0, atol=1e-13)
 
     def of_entries(entries):
         return times(Diagonals(entries, stored.offsets), jnp.asarray(x))
 
     way = 1j * stored.entries
-    found = jax.jvp(of_entries, (jnp.asarray(stored.entries),), (jnp.asarray(way),))[1]
+    found = run(lambda x, d: jax.jvp(of_entries, (x,), (d,))[1], stored.entries, way)
     np.testing.assert_allclose(found, 1j * a @ x, rtol=0, atol=1e-13)
 
 

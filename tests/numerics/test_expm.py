@@ -14,6 +14,7 @@ import numpy as np
 import pytest
 import scipy.linalg
 from matrices import DTYPES, POSE, THETA, backward_error, coefficients, exact_expm, small, to_numpy
+from xla.interpreter import run
 
 from cfjax import expm
 from cfjax._numerics.expm import (
@@ -44,7 +45,8 @@ def error(got, a):
     return np.linalg.norm(np.asarray(got) - exact, 2) / np.linalg.norm(exact, 2)
 
 
-@pytest.mark.parametrize("dtype", DTYPES)
+@pytest.mark.representatives(2)
+@pytest.mark.parametrize("dtype", [np.float32, np.complex128, np.float64, np.complex64])
 def test_accuracy(dtype, subtests):
     for kind, norm in KINDS:
         a = random(kind, 5, norm, dtype=dtype)
@@ -78,10 +80,10 @@ def test_every_size_and_exactly_at_zero(subtests):
     for dtype, n in (*single, *double, (np.float64, 8)):
         a = random("skew" if n > 1 else "general", n, 1.5, dtype=dtype)
         direction, zero = random("general", n, 1.0, dtype=dtype), np.zeros((n, n), dtype)
-        value, _ = with_tangent(a, direction)
-        at_zero, tangent = with_tangent(zero, direction)
+        value, _ = run(with_tangent, a, direction)
+        at_zero, tangent = run(with_tangent, zero, direction)
         tiny = (1e-30 * direction).astype(dtype)
-        moved, off = np.asarray(with_tangent(tiny, direction)[0]), ~np.eye(n, dtype=bool)
+        moved, off = run(with_tangent, tiny, direction)[0], ~np.eye(n, dtype=bool)
         with subtests.test(case=f"{n} {np.dtype(dtype).name}"):
             assert value.dtype == dtype and value.shape == (n, n)
             # One product's error is n units; 4 products follow the first, most well below one.
@@ -112,7 +114,7 @@ def test_each_member_of_a_batch_has_its_own_scaling_and_what_is_not_finite():
     norms = [1e-8, 0.5, 3.0, 2e4]
     batch = np.stack([random("skew", 5, norm, seed=i) for i, norm in enumerate(norms)] * 2)
     batch[4:7, 0, 4] = [np.nan, np.inf, -np.inf]
-    got = np.asarray(jax.jit(jax.vmap(expm))(batch))
+    got = run(jax.vmap(expm), batch)
     for x, a, norm in zip(got, batch, norms, strict=False):
         # As in test_accuracy. With the scaling of the largest this would be 2e4 times as much.
         assert error(x, a) <= 4 * 5 * 2.3e-16 * max(1.0, norm)
@@ -121,9 +123,9 @@ def test_each_member_of_a_batch_has_its_own_scaling_and_what_is_not_finite():
         a = random("general", n, 3.0)
         for bad in (np.nan, np.inf, -np.inf):
             a[0, n - 1] = bad
-            assert np.isnan(compiled(a)).all()
+            assert np.isnan(run(compiled, a)).all()
     a = jnp.asarray([[0.0, np.inf], [0.0, 0.0]])
-    assert np.isnan(jax.jit(jax.grad(lambda a: jnp.sum(compiled(a))))(a)).all()
+    assert np.isnan(run(jax.grad(lambda a: jnp.sum(compiled(a))), a)).all()
 
 
 def test_overflow_and_too_large_are_never_a_plausible_number(subtests):
@@ -153,11 +155,9 @@ def test_branches_stay_branches_in_a_batch(n):
     def loop(f):
         return lambda a: jax.lax.scan(lambda x, _: (f(x), None), a, None, length=2)[0]
 
-    for f in (expm, jax.grad(lambda a: jnp.sum(expm(a))), loop(jax.checkpoint(expm))):
-        alone = conditions(f, a[0])
-        assert alone > 0
-        assert conditions(jax.vmap(f), a) == alone
-        assert conditions(jax.vmap(jax.vmap(f)), a[None]) == alone
+    assert conditions(jax.vmap(jax.vmap(expm)), a[None]) == conditions(expm, a[0]) > 0
+    for f in (jax.grad(lambda a: jnp.sum(expm(a))), loop(jax.checkpoint(expm))):
+        assert conditions(jax.vmap(f), a) == conditions(f, a[0]) > 0
     # A map over something else leaves the matrix, and so its condition, unbatched.
     assert conditions(jax.vmap(lambda _, x: expm(x), in_axes=(0, None)), a, a[0]) > 0
 
@@ -178,9 +178,9 @@ def test_derivative_is_the_frechet_derivative(dtype):
         # test_accuracy, for each of its two factors exp; SciPy's loses as much. The transpose of
         # L(a, ·) is L(aᵀ, ·), for complex matrices as well.
         bound = 2 * 2 * 4 * 6 * 2.3e-16 * max(1.0, norm)
-        for got, x in zip(both_derivatives(a, direction), (a, a.T), strict=True):
+        for got, x in zip(run(both_derivatives, a, direction), (a, a.T), strict=True):
             exact = scipy.linalg.expm_frechet(x, direction, compute_expm=False)
-            assert np.linalg.norm(np.asarray(got) - exact, 2) <= bound, norm
+            assert np.linalg.norm(got - exact, 2) <= bound, norm
 
 
 def curved(a, b):
@@ -238,29 +238,6 @@ def test_third_derivative():
         np.testing.assert_allclose(third(x), -np.cos(x), rtol=0, atol=4 * 4 * 2 * 2.3e-16 * (1 + x))
 
 
-@pytest.mark.slow
-def test_through_a_scan_with_checkpoints():
-    a = jnp.asarray(random("general", 3, 4.0))
-
-    def loop(wrap, a):
-        step = wrap(lambda x, _: (0.3 * (expm(a) @ x - x), None))
-        return jnp.sum(jax.lax.scan(step, jnp.eye(3), None, length=3)[0])
-
-    def written_out(a):
-        x = jnp.eye(3)
-        for _ in range(3):
-            x = 0.3 * (expm(a) @ x - x)
-        return jnp.sum(x)
-
-    value, slope = jax.jit(jax.value_and_grad(written_out))(a)
-    for wrap in (lambda f: f, jax.checkpoint):
-        got = jax.jit(jax.value_and_grad(lambda a, wrap=wrap: loop(wrap, a)))(a)
-        # The same operations, compiled in another order: some hundred roundings.
-        np.testing.assert_allclose(got[0], value, rtol=1e-13)
-        largest = float(jnp.max(jnp.abs(slope)))
-        np.testing.assert_allclose(got[1], slope, rtol=0, atol=1e-13 * largest)
-
-
 def test_refuses_what_is_not_a_square_matrix_or_of_another_dtype(no_shape_hook, subtests):
     # Unwrapped, since the suite's shape checks would answer first.
     plain: Any = inspect.unwrap(expm)
@@ -278,7 +255,7 @@ def test_expm_of_an_array_of_numpy(no_shape_hook):
     a = np.array([[0.0, -0.5], [0.5, 0.0]])
     expected = [[np.cos(0.5), -np.sin(0.5)], [np.sin(0.5), np.cos(0.5)]]
     np.testing.assert_allclose(expm(a), expected, rtol=0, atol=1e-15)
-    slope = jax.jvp(lambda t: expm(t * a), (0.0,), (1.0,))[1]
+    slope = run(lambda t: jax.jvp(lambda t: expm(t * a), (t,), (1.0,))[1], 0.0)
     np.testing.assert_allclose(slope, a, rtol=0, atol=1e-15)
     with pytest.raises(ValueError, match=r"`a` must be a square matrix, shape \(n, n\), got"):
         expm(np.ones((2, 3)))
@@ -319,7 +296,7 @@ def test_the_rounding_of_the_rest_is_as_small_as_it_is():
     cases = [(kind, norm) for kind in ("skew", "meet", "general") for norm in (1e-6, 1e-3, 0.5)]
     for n, dtype in ((2, np.float32), (3, np.complex128)):
         a = np.stack([small(kind, n, norm, 0, dtype) for kind, norm in cases])
-        weights, found = jax.jit(jax.vmap(expm_parts))(a)
+        weights, found = run(jax.vmap(expm_parts), a)
         assert (np.asarray(weights) == 1).all()
         for x, rest in zip(a, np.asarray(found), strict=True):
             with mpmath.workdps(60):
@@ -329,5 +306,5 @@ def test_the_rounding_of_the_rest_is_as_small_as_it_is():
             # matrices of size 2 is no smaller than the norm squared.
             atol = 8 * np.finfo(dtype).eps * np.linalg.norm(x) ** 2
             np.testing.assert_allclose(rest, exact, rtol=0, atol=atol)
-    weight, rest = expm_parts(jnp.asarray(POSE))
+    weight, rest = run(expm_parts, POSE)
     assert weight == 1 and np.array_equal(rest[2], np.zeros(3))

@@ -6,6 +6,7 @@ import mpmath as mp
 import numpy as np
 import pytest
 import scipy.linalg
+from xla.interpreter import run
 
 from cfjax._numerics.expm_action import _polynomials, phi_1_action
 
@@ -71,7 +72,7 @@ def test_phi_1_action_with_scales_at_a_large_norm():
     def scaled(a, b):
         return phi_1_action(lambda x: a @ x, b, jnp.asarray(20.1), lambda: (a, jnp.asarray(scale)))
 
-    got = scaled(similar, scale[:, None] * b) / scale[:, None]
+    got = run(scaled, similar, scale[:, None] * b) / scale[:, None]
     np.testing.assert_allclose(got, exact(a, b), rtol=0, atol=2e-12)
 
 
@@ -96,7 +97,7 @@ def test_derivatives_of_phi_1_action():
     full = lambda a: np.block([[a, b], [np.zeros((4, 8))]])  # noqa: E731
     for norm in (0.0, 0.3, 2.0, 12.0):
         a = skew(4, norm)
-        found, gradient = both_modes(a, norm * 1.0001)
+        found, gradient = run(both_modes, a, norm * 1.0001)
         expected = scipy.linalg.expm_frechet(full(a), full(d) - full(0 * a))[1][:4, 4:]
         # 100 units, doubled by four squarings for the largest.
         atol = 2e-14 * (1 + norm)
@@ -109,6 +110,6 @@ def test_a_batch_of_phi_1_action_of_all_norms():
     norms = np.array([0.0, 0.01, 1.0, 30.0])
     a = np.stack([skew(4, norm, seed=s) for s, norm in enumerate(norms)])
     b = np.random.default_rng(9).standard_normal((4, 4, 2))
-    got = jax.jit(jax.vmap(action))(a, b, norms * 1.0001)
+    got = run(jax.vmap(action), a, b, norms * 1.0001)
     for x, m, v in zip(got, a, b, strict=True):
         np.testing.assert_allclose(x, exact(m, v), rtol=0, atol=2e-13)

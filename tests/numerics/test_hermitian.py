@@ -5,6 +5,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 from matrices import DTYPES, random
+from xla.interpreter import run
 
 from cfjax._numerics.hermitian import basis, commutators, coordinates, dissipator, matrix
 
@@ -35,14 +36,13 @@ def test_matrices_as_vectors_and_what_acts_on_them(n):
 
     known = [jnp.asarray(dissipator(jump)) for jump in jumps]
 
-    @jax.jit
     def everything(h, x, z, jumps):
         r = coordinates(x)
         a = jnp.tensordot(coordinates(h), commutators(n), 1)
         moved = [matrix(d @ r) for d in (a, *map(dissipator, jumps), *known)]
         return r, matrix(r), coordinates(z), coordinates((z + z.conj().T) / 2), a, moved
 
-    r, y, of_any, of_part, a, (turned, *moved) = everything(h, x, z, jumps)
+    r, y, of_any, of_part, a, (turned, *moved) = run(everything, h, x, z, jumps)
     np.testing.assert_allclose(r, np.einsum("aij,ji->a", basis(n), x).real, rtol=0, atol=8 * EPS)
     assert r[0] == pytest.approx(np.trace(x).real / np.sqrt(n), abs=4 * EPS)
     np.testing.assert_allclose(y, x, rtol=0, atol=8 * EPS)

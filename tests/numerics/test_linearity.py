@@ -108,7 +108,6 @@ DRIFTS: dict[str, Any] = {
     "Rotation, of a parameter": lambda y, a, dw: cfjax.Rotation(dw - a * y),
     "alone": lambda y, a, dw: cfjax.Rotation(-y),
     "Affine": lambda y, a, dw: cfjax.Affine(dw, DECAY),
-    "LinearAffine": lambda y, a, dw: cfjax.LinearAffine(-a * A, dw),
 }
 NOT_LINEAR: dict[str, Any] = {
     "square": lambda y, a, dw: y * dw**2,

@@ -6,6 +6,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from xla.interpreter import run
 
 from cfjax._numerics.loop import loop
 
@@ -37,7 +38,7 @@ def test_powers_and_their_derivatives(mostly, subtests):
 
 def test_a_batch_of_loops():
     a = jnp.asarray([0.5, 1.0, 2.0])
-    found = jax.jit(jax.vmap(lambda a: jax.grad(power)(a, 1.0, jnp.asarray(3, jnp.int32))))(a)
+    found = run(jax.vmap(lambda a: jax.grad(power)(a, 1.0, jnp.asarray(3, jnp.int32))), a)
     np.testing.assert_allclose(found, a**2 / 2, rtol=1e-15)
 
 

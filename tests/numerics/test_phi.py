@@ -10,6 +10,7 @@ import jax.numpy as jnp
 import mpmath
 import numpy as np
 import pytest
+from xla.interpreter import run
 
 import cfjax
 
@@ -88,13 +89,12 @@ def test_forward_and_reverse_mode_agree():
     z = jnp.asarray(np.concatenate([[0.0], -MAGNITUDES, MAGNITUDES[:-1]]))
     slope = jax.grad(phi_1)
 
-    @jax.jit
     @jax.vmap
     def everything(z):
         forward = jax.jvp(phi_1, (z,), (jnp.ones_like(z),))[1]
         return phi_1(z), forward, slope(z), jax.grad(slope)(z), jax.jacfwd(slope)(z)
 
-    value, forward, reverse, twice, mixed = everything(z)
+    value, forward, reverse, twice, mixed = run(everything, z)
     # The same formula in both.
     np.testing.assert_allclose(forward, reverse, rtol=1e-15)
     np.testing.assert_allclose(twice, mixed, rtol=1e-15)
@@ -120,7 +120,7 @@ def test_second_reverse_pass_through_a_checkpointed_loop():
 
 def test_phi_1_of_nan_infinity_and_what_overflows():
     for dtype in (np.float32, np.float64):
-        found = np.asarray(phi_1(jnp.asarray([np.nan, -np.inf, np.inf, 1e4], dtype)))
+        found = run(phi_1, np.asarray([np.nan, -np.inf, np.inf, 1e4], dtype))
         assert np.isnan(found[0])
         assert found[1] == 0
         assert not np.any(np.isfinite(found[2:]))
@@ -146,8 +146,8 @@ def exact_phi(k, z):
         return value
 
 
-@pytest.mark.representatives(2)
-@pytest.mark.parametrize("dtype", [np.float32, np.float64, np.complex64, np.complex128])
+@pytest.mark.representatives(1)
+@pytest.mark.parametrize("dtype", [np.float64, np.float32, np.complex64, np.complex128])
 def test_phi_against_sixty_digits(dtype):
     """On both sides of the switch at 4, and to 1e5 in the left half plane and on its edge."""
     is_complex = np.issubdtype(dtype, np.complexfloating)
@@ -180,14 +180,13 @@ def test_phi_against_sixty_digits(dtype):
 def test_derivatives_of_phi(mode):
     """At zero those of the series, and elsewhere `phi_k' = phi_k - k phi_(k+1)`."""
 
-    @jax.jit
     @jax.vmap
     def everything(z):
         functions = [lambda z, k=k: cfjax.phi(k, z) for k in range(6)]
         return [(f(z), mode(f)(z), mode(mode(f))(z)) for f in functions]
 
     at = (0.0, -30.0, -4.0, -3.9, 2.5)
-    for k, found in enumerate(everything(jnp.asarray(at))):
+    for k, found in enumerate(run(everything, np.asarray(at))):
         wanted = [math.factorial(j) / math.factorial(k + j) for j in range(3)]
         # A few units of rounding: the powers of a series, and two doublings.
         np.testing.assert_allclose([x[0] for x in found], wanted, rtol=0, atol=4e-16)

@@ -7,6 +7,7 @@ import numpy as np
 import pytest
 import scipy.linalg
 from matrices import DTYPES, exact_expm, of_norm, random, to_numpy
+from xla.interpreter import run
 
 import cfjax
 
@@ -66,14 +67,14 @@ def test_alone_and_in_a_batch():
     norms = [0.0, 0.1, 1.0, 2.0, 30.0]
     a = np.stack([of_norm("skew", 3, norm) for norm in norms])
     v = random((5, 3))
-    together = mapped(a, v)
+    together = run(mapped, a, v)
     np.testing.assert_array_equal(together[0], v[0])
     for norm, a1, v1, found in zip(norms, a, v, together, strict=True):
         atol = 20 * 2.0**-52 * (1 + norm)
-        np.testing.assert_allclose(alone(a1, v1), found, rtol=0, atol=atol)
+        np.testing.assert_allclose(run(alone, a1, v1), found, rtol=0, atol=atol)
     # What is not finite stays with its member.
     a[0, 0, 1], a[1, 0, 1] = np.nan, np.inf
-    found = np.asarray(mapped(a, v))
+    found = run(mapped, a, v)
     assert np.isnan(found[:2]).any(axis=1).all()
     np.testing.assert_array_equal(found[2:], together[2:])
 
@@ -82,11 +83,11 @@ def test_a_real_matrix_and_a_complex_vector():
     a, v = of_norm("general", 3, 1.0), random((3,), 1, complex)
     for scale in (1, 5):
         want = exact(scale * a, v)
-        np.testing.assert_allclose(alone(scale * a, v), want, rtol=1e-14 * np.exp(2 * scale))
+        np.testing.assert_allclose(run(alone, scale * a, v), want, rtol=1e-14 * np.exp(2 * scale))
 
 
 def test_against_scipy():
     a, v = of_norm("general", 20, 2.0), random((20,))
     want = scipy.linalg.expm(block(a, v))[:20, 20]
     # Growth e^2 for each, and 20 units for the sums.
-    np.testing.assert_allclose(alone(a, v), want, rtol=0, atol=1e-13 * 8)
+    np.testing.assert_allclose(run(alone, a, v), want, rtol=0, atol=1e-13 * 8)

@@ -5,6 +5,7 @@ import numpy as np
 import scipy.linalg
 from matrices import inverse_derivative_of_exp, motions
 from scipy.spatial.transform import Rotation
+from xla.interpreter import run
 
 from cfjax._numerics import rigid_motion
 
@@ -34,7 +35,7 @@ def as_pose(vector):
 
 
 def test_motions_are_those_of_the_exponential():
-    found = everything(np.multiply.outer(ANGLES, AXIS))
+    found = run(everything, np.multiply.outer(ANGLES, AXIS))
     basis, point = [screw(*np.split(e, 2)) for e in np.eye(6)], np.array([*POINT, 1.0])
     for k, angle in enumerate(ANGLES):
         a, b = screw(angle * AXIS, V), screw(*OTHER)

@@ -3,6 +3,7 @@
 import jax.numpy as jnp
 import numpy as np
 from matrices import random
+from xla.interpreter import run
 
 from cfjax._numerics.span import (
     Corner,
@@ -36,8 +37,8 @@ def test_products_with_the_columns_and_extended_spans(subtests):
     for kind, blocks in BLOCKS.items():
         w, x = whole(blocks), random((N, P), 5)
         z = random((w.shape[1], P), 6)
-        products = inner(blocks, jnp.asarray(x))
-        moved = plus_product(jnp.asarray(x), blocks, jnp.asarray(z))
+        both = lambda x, z, b=blocks: (inner(b, x), plus_product(x, b, z))  # noqa: E731
+        products, moved = run(both, x, z)
         span = made(*blocks).extended(THIRD)
         wider = whole(span.blocks)
         with subtests.test(case=kind):
