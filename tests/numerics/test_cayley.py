@@ -59,11 +59,8 @@ def assert_solved(m, z, factor):
 
 
 def test_systems_against_numpy(subtests):
-    single = [(4, np.float32), (5, np.complex64)]
-    real, other = ([(n, dtype) for n in sizes] for sizes, dtype in (
-        ((1, 3, 5, 17), np.float64), ((2, 4, 17), np.complex128)
-    ))  # fmt: skip
-    for n, dtype in single + real + other:
+    real, other = ((n, np.float64) for n in (1, 3, 5, 17)), ((n, complex) for n in (2, 4, 17))
+    for n, dtype in ((4, np.float32), (5, np.complex64), *real, *other):
         m = (np.eye(n) - 0.4 * matrices.random((n, n), 1)).astype(dtype)
         m = m + (0.2 * matrices.random((n, n), 2, dtype)).astype(dtype)
         with subtests.test(case=f"{n} {np.dtype(dtype).name}"):
