@@ -25,9 +25,9 @@ STEPS = (16, 32, 64, 128)
 TOLERANCE = 0.15
 
 
-def observed_order(problem, solver, steps) -> float:
+def observed_order(problem, solver, steps, **kwargs) -> float:
     field, y0, args, answer = problem
-    found = problems.errors(field, solver, 1.0, y0, args, answer, steps)
+    found = problems.errors(field, solver, 1.0, y0, args, answer, steps, **kwargs)
     assert found.min() > 10 * problems.REFERENCE_ERROR
     assert found.max() < 1
     return problems.slope(steps, found)
@@ -57,6 +57,14 @@ def test_order(matrix_problems, body_problem, flight_problem, problem, name, ste
     given = matrix_problems | {"sphere": body_problem, "product": flight_problem}
     order = observed_order(given[problem], METHODS[name], steps)
     assert abs(order - METHODS[name].order(None)) < TOLERANCE
+
+
+@pytest.mark.slow
+def test_a_mistaken_stage_time_loses_the_order(matrix_problems):
+    """So the problem sees it."""
+    problem, solver = matrix_problems["left"], METHODS["CF4"]
+    order = observed_order(problem, solver, STEPS, ignore_stage_times=True)
+    assert abs(order - 1) < TOLERANCE
 
 
 # Simple cases with a known answer
