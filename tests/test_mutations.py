@@ -114,6 +114,8 @@ def test_the_tests_of_a_file():
         ("sleep 600 & wait", ["the time limit"]),
         ("echo 'tests/a.py::test_b FAILED'; kill -9 $$", ["tests/a.py::test_b", "signal 9"]),
     ],
+    # Of their texts a matrix would read that they fail.
+    ids=["passed", "failed", "not imported", "not collected", "hangs", "killed"],
 )
 def test_what_pytest_says(script, killers, tmp_path, monkeypatch):
     python = tmp_path / "python"

@@ -113,7 +113,7 @@ CASES = [
 ]
 
 
-@pytest.mark.representatives(1)
+@pytest.mark.slow
 @pytest.mark.parametrize(("name", "solver"), CASES)
 def test_every_element_moves_as_it_does_alone(name, solver):
     y0 = points(name)
@@ -179,7 +179,7 @@ def assert_empty_like(found, expected):
     jax.tree.map(lambda a, b: np.testing.assert_array_equal(a, b, strict=True), found, expected)
 
 
-@pytest.mark.representatives(1)
+@pytest.mark.slow
 @pytest.mark.parametrize("name", EMPTY)
 def test_solves_of_an_empty_batch(name):
     """In steps that are given, controlled steps, and each member alone by `jax.vmap`."""

@@ -132,7 +132,7 @@ def along(n):
     return way, random((n, n), 7, complex)
 
 
-@pytest.mark.representatives(1)
+@pytest.mark.slow
 @pytest.mark.parametrize("in_reverse", [False, True])
 def test_the_motion_and_its_derivatives(in_reverse):
     """By Hamiltonian, jumps, rates and state, against the superoperator."""

@@ -54,7 +54,10 @@ def test_a_solver_with_an_estimate_is_adaptive():
 @pytest.mark.filterwarnings("ignore:Complex dtype support in Diffrax")
 @pytest.mark.parametrize(
     "solver, dtype",
-    [(cfjax.CF4(), jnp.complex64), (cfjax.Richardson(cfjax.CF4()), jnp.complex128)],
+    [
+        (cfjax.CF4(), jnp.complex64),
+        pytest.param(cfjax.Richardson(cfjax.CF4()), jnp.complex128, marks=pytest.mark.slow),
+    ],
     ids=["CF4", "Richardson"],
 )
 def test_a_step_without_a_value_is_taken_again_where_the_state_is_complex(solver, dtype):

@@ -141,6 +141,7 @@ def test_a_step_of_complex_matrices_in_numpy():
 # Derivatives
 
 
+@pytest.mark.slow
 def test_derivatives_in_a_batch():
     """Of a general field, and at a field of zero, where they are an integral in closed form."""
     weights = jnp.arange(9.0).reshape(3, 3)

@@ -133,6 +133,7 @@ def batch_of_gradients(solver, field, y0, args):
     return jax.vmap(jax.grad(loss, (0, 1)), (0, None))(jnp.stack([y0, -y0[::-1]]), args)
 
 
+@pytest.mark.slow
 def test_a_gradient_with_rolled_stages_in_a_batch():
     """In NumPy by complex steps, which no rounding limits."""
     args = np.array([0.5, -0.4, 0.9])

@@ -70,7 +70,7 @@ def test_a_few_steps_keep_one_state_each_for_a_gradient():
     assert kept(9) - kept(3) < 6 * 3
 
 
-@pytest.mark.representatives(1)
+@pytest.mark.slow
 @pytest.mark.parametrize("points", [16, 1000])
 def test_a_splitting_is_as_long_as_its_chain_of_flows(points):
     """XLA would compute each flow of the chain again for all that follow."""

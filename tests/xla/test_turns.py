@@ -119,6 +119,7 @@ def test_no_function_of_a_long_gradient_is_longer_than_those_of_xla():
     assert 200 < longest < 2000
 
 
+@pytest.mark.slow
 def test_what_is_unrolled_has_no_terms_that_are_zero():
     """It is the program of stages that were traced one by one, where a weight of one is no
     product.
@@ -247,6 +248,7 @@ def test_a_solve_agrees_however_its_steps_are_compiled(solver):
     assert np.abs(compiled(solve)(few[0]) - expected[0]).max() <= atol[0]
 
 
+@pytest.mark.slow
 def test_output_within_a_step_is_scalarised_in_batches():
     """For one system its flows are a loop."""
     _, y, args = step_of(rigid_body, cfjax.CF3())
