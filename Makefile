@@ -5,7 +5,7 @@ PYTEST := -m pytest --numprocesses auto --dist worksteal
 # Each solver and each field once, what the code relies on in jax, equinox and diffrax, and imports.
 QUICK := tests/test_quick.py tests/xla/test_struct_of_arrays.py tests/test_canary.py tests/test_public.py tests/test_architecture.py
 
-.PHONY: paper lint test test-all test-quick test-lowest test-newest coverage mutations benchmarks benchmark-gpu pages docs clean
+.PHONY: paper lint suite test test-all test-quick test-lowest test-newest coverage mutations benchmarks benchmark-gpu pages docs clean
 
 # Tables and figures of the paper, in figures/.
 paper: .venv/paper
@@ -16,8 +16,11 @@ lint: .venv/dev
 	$(BIN)/ruff format --check .
 	$(BIN)/pyright
 
-# Lint, types, tests.
-test: lint
+# Lint, types, tests: types, which take one core, beside the tests.
+test: .venv/dev
+	@$(MAKE) --no-print-directory --jobs=2 lint suite
+
+suite: .venv/dev
 	$(BIN)/python $(PYTEST)
 
 # The slow ones too, with the emitters of XLA that users' programs are compiled with.
