@@ -1,6 +1,6 @@
 """Coordinates of a step on matrices: time over that of diffrax's Tsit5 in plain space.
 
-`RKMK5` and `RKMK8` with `coordinates="projected"` and `"cayley"` beside `CF4`, `CF54` and diffrax's
+`Projected`, and `RKMK5` and `RKMK8` in Cayley's coordinates, beside `CF4`, `CF54` and diffrax's
 methods in plain space, for equal errors in the largest entry. All in turns, without error control
 in equal steps, and in adaptive steps with `diffrax.PIDController(rtol=0)`. In equal steps the
 number of steps for an error is interpolated between whole numbers, and the time of a step is that
@@ -40,14 +40,14 @@ TIMED, MOST = 60, 1500
 LIE = {
     "CF4": cfjax.CF4(),
     "CF54": cfjax.CF54(),
-    "RKMK5, projected": cfjax.RKMK5(coordinates="projected"),
-    "RKMK8, projected": cfjax.RKMK8(coordinates="projected"),
+    "Projected, Tsit5": cfjax.Projected(diffrax.Tsit5()),
+    "Projected, Dopri8": cfjax.Projected(diffrax.Dopri8()),
     "RKMK5, Cayley": cfjax.RKMK5(coordinates="cayley"),
     "RKMK8, Cayley": cfjax.RKMK8(coordinates="cayley"),
 }
 PLAIN = {"Tsit5": diffrax.Tsit5(), "Dopri8": diffrax.Dopri8()}
 METHODS = tuple(PLAIN | LIE)
-PROJECTED = ("RKMK5, projected", "RKMK8, projected")
+PROJECTED = ("Projected, Tsit5", "Projected, Dopri8")
 
 
 class Problem(NamedTuple):

@@ -1257,8 +1257,8 @@ def diffusion_frames() -> str:
 COORDINATES = {
     "CF4": "`CF4`",
     "CF54": "`CF54`",
-    "RKMK5, projected": "`RKMK5`, projected",
-    "RKMK8, projected": "`RKMK8`, projected",
+    "Projected, Tsit5": "`Projected`, Tsit5",
+    "Projected, Dopri8": "`Projected`, Dopri8",
     "RKMK5, Cayley": "`RKMK5`, Cayley",
     "RKMK8, Cayley": "`RKMK8`, Cayley",
     "Dopri8": "Dopri8, in plain space",
@@ -1548,7 +1548,7 @@ def scenes_others() -> str:
 
 @number
 def scenes_projected() -> str:
-    return _of_scenes("RKMK5, projected", "RKMK8, projected")
+    return _of_scenes("Projected, Tsit5", "Projected, Dopri8")
 
 
 # Programs of the benchmark of variations.

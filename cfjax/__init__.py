@@ -16,6 +16,7 @@ from ._field import bracket as bracket
 from ._field import combine as combine
 from ._field import flow as flow
 from ._field import tangent as tangent
+from ._fields.coordinates import Nearest as Nearest
 from ._fields.elementwise import elementwise as elementwise
 from ._fields.matrix import LeftMatrix as LeftMatrix
 from ._fields.matrix import RightMatrix as RightMatrix
@@ -110,6 +111,7 @@ if TYPE_CHECKING:
     from ._solvers.munthe_kaas import CayleyRK4 as CayleyRK4
     from ._solvers.pieces import ShiftedNoise as ShiftedNoise
     from ._solvers.pieces import WeakOrder2 as WeakOrder2
+    from ._solvers.projected import Projected as Projected
     from ._solvers.richardson import Richardson as Richardson
     from ._solvers.spectral_radius import spectral_radius as spectral_radius
     from ._solvers.splitting import BlanesMoan4 as BlanesMoan4
@@ -175,6 +177,7 @@ _NAMES_LATER = {
     "_solvers.magnus": ("Magnus10", "Magnus2", "Magnus4", "Magnus4Lobatto", "Magnus6", "Magnus8"),
     "_solvers.munthe_kaas": ("RKMK", "RKMK3", "RKMK4", "RKMK5", "RKMK8", "CayleyRK4"),
     "_solvers.pieces": ("ShiftedNoise", "WeakOrder2"),
+    "_solvers.projected": ("Projected",),
     "_solvers.richardson": ("Richardson",),
     "_solvers.spectral_radius": ("spectral_radius",),
     "_solvers.stabilised": ("RKG2", "RKL2", "RKL3"),

@@ -166,11 +166,12 @@ class AbstractFrozenField(eqx.Module):
         return self, point
 
     def projected(self, point: Any) -> "AbstractCoordinates | None":
-        """This field at a point, for `cfjax.RKMK(..., coordinates="projected")`.
+        """This field at a point in plain space, for `cfjax.Projected`.
 
-        A translation in plain space by `tangent(point)`, which knows how to bring the end of a step
-        back to the manifold; or None, the default, if there is none. The point need not be on the
-        manifold.
+        The point need not be on the manifold. A class of your own returns
+        `cfjax.Nearest(self.tangent(point), nearest)`, where `nearest(point)` is the point of the
+        manifold nearest to another point; or what another field returns. None, the default, if
+        there is none.
         """
         del point
         return None
@@ -179,7 +180,7 @@ class AbstractFrozenField(eqx.Module):
         """This field at a point, for `cfjax.RKMK(..., coordinates="cayley")`; or None, the default.
 
         A class that stands for a matrix can return that of its matrix, for example
-        `cfjax.LeftMatrix(a).cayley(point)`, and likewise with `projected`.
+        `cfjax.LeftMatrix(a).cayley(point)`.
         """
         del point
         return None
@@ -530,6 +531,17 @@ def landing(field: PyTree, start: PyTree) -> tuple[PyTree, Bool[Array, ""]]:
 
 
 def _no_coordinates_message(name: str, field: AbstractFrozenField) -> str:
+    if name == "projected":
+        instead = {
+            "Scaling": "steps in plain space change signs. Use cfjax.CF4() or cfjax.RKMK5().",
+            "Lindblad": "in plain space populations become negative. Use cfjax.Kraus4().",
+        }
+        default = (
+            "its method `projected` returns None. Define it in a class of your own; otherwise use "
+            "a commutator-free method, for example cfjax.CF4()."
+        )
+        cls = type(field).__name__
+        return f"cfjax.Projected does not take {cls}: {instead.get(cls, default)}"
     has_closed_form = (
         isinstance(field, AbstractAlgebraElement)
         and type(field).dexpinv is not AbstractAlgebraElement.dexpinv

@@ -35,9 +35,9 @@ _NOT_FINITE = (
 _BLOW_UP = (
     f"{diffrax.RESULTS[diffrax.RESULTS.nonfinite].rstrip('.')}: the solution grows without bound, "
     "or the steps are too long, which more num_steps cure. (A step of a Munthe-Kaas method, such "
-    "as cfjax.RKMK8, must turn by less than 2 pi; with coordinates='projected' and 'cayley' by "
-    "less than pi, and with 'projected' matrices that act from one side must be skew-Hermitian, on "
-    "columns or rows of full rank.)"
+    "as cfjax.RKMK8, must turn by less than 2 pi, or with coordinates='cayley' by less than pi. A "
+    "step of cfjax.Projected must end near the manifold, its invariants must be independent, and "
+    "matrices that act from one side must be skew-Hermitian, on columns or rows of full rank.)"
 )
 
 

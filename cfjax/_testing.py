@@ -52,6 +52,8 @@ def check_field(fields: Sequence[AbstractFrozenField], point: PyTree) -> None:
       along 2, 4, 8 and 16 times the field: rounding must not grow from flow to flow;
     - `framed`, if defined, is linear in the field, has the velocity of the field at the point, and
       is an algebra element that moves the point freely, or shaped like the point;
+    - `projected`, if defined, has the velocity of the field, also off the manifold, and leads to
+      points of the manifold, along velocities of the manifold;
     - for algebra elements, `[a, b]` has the sign and the size that `cfjax.AbstractAlgebraElement`
       says: its tangent is `DX_a X_b - DX_b X_a`, with the tangents of a and b as functions of the
       point. This is compared for `[a, b]`, for `[b, a]` and for the bracket of `[a, b]` with the
@@ -103,6 +105,9 @@ def check_field(fields: Sequence[AbstractFrozenField], point: PyTree) -> None:
     if type(fields[0]).framed is not AbstractFrozenField.framed:
         _check_framed(name, fields, point)
         _compare(name, _of_framed(fields, point), rtol)
+    projected = fields[0].projected(point)
+    if projected is not None and projected.has_rate() in (None, True):
+        _compare(name, _of_projected(fields[0], point), rtol)
     if all(isinstance(field, AbstractAlgebraElement) for field in charted):
         _compare(name, _of_bracket(charted, start), rtol)
 
@@ -417,6 +422,37 @@ def _of_framed(fields: Sequence[Any], point: PyTree) -> _Comparisons:
         velocity = field.tangent(point)
         requirement = "framed must have the velocity of the field at the point"
         comparisons.append((requirement, found, velocity, _scale((point, velocity))))
+    return comparisons
+
+
+@eqx.filter_jit
+def _of_projected(field: Any, point: PyTree) -> _Comparisons:
+    near = jtu.tree_map(lambda x: 1.001 * x, point)
+    projected = field.projected(point)
+
+    def moved(s: Any, point: PyTree) -> Any:
+        increment, _ = type(projected).combine((s,), (projected,)).landing(point)
+        return jtu.tree_map(jnp.add, point, increment)
+
+    dtype = jnp.finfo(jtu.tree_leaves(point)[0].dtype).dtype
+    zero, tenth = jnp.zeros((), dtype), jnp.asarray(0.1, dtype)
+    end, velocity = moved(tenth, point), field.tangent(point)
+    _, found = jax.jvp(lambda s: moved(s, point), (zero,), (jnp.ones_like(zero),))
+    of_near, scale = field.tangent(near), _scale((point, velocity))
+    comparisons: _Comparisons = [
+        (
+            "projected must have the velocity of the field, also off the manifold",
+            field.projected(near).tangent(near),
+            of_near,
+            _scale((point, of_near)),
+        ),
+        ("projected must leave a velocity along the manifold as it is", found, velocity, scale),
+        ("projected must leave a point of the manifold where it is", moved(zero, end), end, scale),
+    ]
+    defect = field.defect(end)
+    if defect is not None:
+        requirement = f"projected must lead to points that have {defect[1]}"
+        comparisons.append((requirement, defect[0], jnp.zeros_like(defect[0]), 1))
     return comparisons
 
 

@@ -24,6 +24,7 @@ Kind = Literal[
     "commutator-free",
     "low-storage",
     "Munthe-Kaas",
+    "projected",
     "Magnus",
     "Kraus",
     "exponential",
@@ -105,6 +106,9 @@ SOLVERS = {
     "CayleyRK4": Row(cfjax.CayleyRK4, "Munthe-Kaas", 4, None, 4, 0, 3, "columns"),
     "RKMK": Row(
         lambda: cfjax.RKMK(diffrax.Bosh3.tableau), "Munthe-Kaas", 3, 2, 3, 1, 2, "brackets"
+    ),
+    "Projected": Row(
+        lambda: cfjax.Projected(diffrax.Bosh3()), "projected", 3, 2, 3, 1, 2, "columns"
     ),
     "Magnus2": Row(cfjax.Magnus2, "Magnus", 2, None, 1, 0, 1, "time only", True),
     "Magnus4": Row(cfjax.Magnus4, "Magnus", 4, 2, 3, 0, 3, "time only", True),

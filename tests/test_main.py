@@ -195,7 +195,7 @@ def test_scenes_solve_with_the_method_that_readme_recommends():
     rows = re.findall(r"^\| `(\w+)\(.*\| (.*?) \|$", readme, re.MULTILINE)
     methods = {name: text for name, text in rows if hasattr(cfjax, name)}
     assert len(methods) > 10
-    projected = 'RKMK8(coordinates="projected")'
+    projected = "Projected(diffrax.Dopri8())"
     seen = set()
 
     def start_and_field(make):
@@ -218,9 +218,8 @@ def test_scenes_solve_with_the_method_that_readme_recommends():
         # Of shapes: some problems take a while to make.
         found = eqx.filter_eval_shape(start_and_field, make)
         chosen = type(module.solver).__name__
-        coordinates = getattr(module.solver, "coordinates", "exponential")
-        if coordinates != "exponential":
-            chosen = f'{chosen}(coordinates="{coordinates}")'
+        if chosen == "Projected":
+            chosen = f"Projected(diffrax.{module.solver.name}())"
         if found is None:
             # The pages on splittings and on noise recommend these.
             assert chosen in ("BlanesMoan4", "Strang", "WeakOrder2"), name

@@ -3,13 +3,16 @@
 `projected` and `cayley` of a frozen field make them.
 """
 
+from collections.abc import Callable
 from typing import Any, ClassVar
 
 import equinox as eqx
 import jax.numpy as jnp
+import jax.tree_util as jtu
 from jax import lax
-from jaxtyping import Array, Bool, Inexact, Real
+from jaxtyping import Array, Bool, Complex, Inexact, PyTree, Real
 
+from .._arrays import describe, struct
 from .._field import AbstractCoordinates
 from .._numerics.cayley import (
     TangentCoordinates,
@@ -17,8 +20,10 @@ from .._numerics.cayley import (
     log_determinant,
     without_turns,
 )
-from .._numerics.polar import polar_correction
+from .._numerics.lengths import length_correction, vector_of_length
+from .._numerics.polar import phase_correction, polar_correction, polar_correction_of_rows
 from .._numerics.squaring import magnitude
+from .._numerics.vectors import entries, pack, placed
 
 
 class AbstractProjected(AbstractCoordinates):
@@ -27,16 +32,89 @@ class AbstractProjected(AbstractCoordinates):
     The end of a step is moved to the manifold, by as little as the step is off it.
     """
 
-    v: eqx.AbstractVar[Inexact[Array, "..."]]
+    v: eqx.AbstractVar[PyTree[Array]]
 
-    def flow(self, point: Array) -> Array:
-        return point + self.v
+    def flow(self, point: Any) -> Any:
+        return jtu.tree_map(jnp.add, point, self.v)
 
-    def increment(self, point: Array) -> Array:
+    def increment(self, point: Any) -> Any:
         return self.v
 
-    def tangent(self, point: Array) -> Array:
+    def tangent(self, point: Any) -> Any:
         return self.v
+
+
+class OfLength(AbstractProjected):
+    """The end of a vector has the length of its start, or length 1."""
+
+    v: Real[Array, "*batch n"]
+    is_unit: bool = eqx.field(static=True)
+
+    def landing(self, start: Array) -> tuple[Array, Bool[Array, ""]]:
+        return vector_of_length(start, self.v, self.is_unit)
+
+
+class Pose(AbstractProjected):
+    """The end of a pose has a unit number or an orthogonal matrix. All else is as in plain space.
+
+    **Arguments:**
+
+    - `v`: the velocity, shaped like the pose.
+    - `dimension`: the size of the rotation in a pose that is a matrix.
+    - `indices`: where the unit number is in a pose that is a vector. A point has none.
+    """
+
+    v: Real[Array, "..."]
+    dimension: int = eqx.field(static=True)
+    indices: tuple[int, ...] = eqx.field(static=True, default=())
+
+    def landing(self, start: Array) -> tuple[Array, Bool[Array, ""]]:
+        if start.ndim == 1:
+            if not self.indices:
+                return self.v, jnp.asarray(True)
+            y, v = entries(start), entries(self.v)
+            number, is_there = length_correction(
+                [y[k] for k in self.indices], [v[k] for k in self.indices], True
+            )
+            rest = [k for k in range(len(v)) if k not in self.indices]
+            return pack(
+                placed([*number, *(v[k] for k in rest)], [*self.indices, *rest]), sums=True
+            ), is_there
+        block = slice(self.dimension)
+        turned, is_there = polar_correction(start[block, block], self.v[block, block], True)
+        return self.v.at[block, block].set(turned), is_there
+
+
+class Nearest(AbstractProjected):
+    """A velocity in plain space, and the point of a manifold that is nearest to another point.
+
+    For `AbstractFrozenField.projected`, which `cfjax.Projected` calls.
+
+    **Arguments:**
+
+    - `v`: the velocity, shaped like the point.
+    - `nearest`: `nearest(point)` returns the point of the manifold nearest to a point that is off
+      it, shaped like the point. It must be one function for all fields of a class, such as a
+      function of a module.
+
+    A step whose end is off by more than half of the size of the end fails.
+    """
+
+    v: PyTree[Array]
+    nearest: Callable[[Any], Any] = eqx.field(static=True)
+
+    def landing(self, start: Any) -> tuple[Any, Bool[Array, ""]]:
+        end = jtu.tree_map(jnp.add, start, self.v)
+        nearest = self.nearest(end)
+        if struct(nearest) != struct(end):
+            raise ValueError(
+                "nearest must return what is shaped like its point, "
+                f"{describe(end)}, got {describe(nearest)}."
+            )
+        increment = jtu.tree_map(jnp.subtract, nearest, start)
+        off = lax.stop_gradient(jtu.tree_map(jnp.subtract, nearest, end))
+        is_there = _square(off) <= _square(lax.stop_gradient(end)) / 4
+        return increment, is_there
 
 
 class Polar(AbstractProjected):
@@ -46,12 +124,14 @@ class Polar(AbstractProjected):
 
     - `v`: the velocity, shaped like the point: a vector or columns; or rows, if `are_rows`.
     - `skew_defect`: 0 if the matrix of the field is skew-Hermitian, otherwise NaN.
+    - `trace`: that of the matrix, if the determinant of points is to follow it; or None.
     - `are_orthonormal`: whether the columns are orthonormal at the end, instead of keeping their
       products.
     """
 
     v: Inexact[Array, "..."]
     skew_defect: Real[Array, ""]
+    trace: Complex[Array, "*batch"] | None = None
     are_rows: bool = eqx.field(static=True, default=False)
     are_orthonormal: bool = eqx.field(static=True, default=False)
 
@@ -60,9 +140,14 @@ class Polar(AbstractProjected):
         return ~jnp.isnan(lax.stop_gradient(self.skew_defect))
 
     def landing(self, start: Array) -> tuple[Array, Bool[Array, ""]]:
-        v, is_there = polar_correction(
-            self._columns(start), self._columns(self.v), self.are_orthonormal
-        )
+        columns = self._columns(start)
+        v = self._columns(self.v)
+        if columns.shape[1] > len(columns):
+            v, is_there = polar_correction_of_rows(columns, v)
+        else:
+            v, is_there = polar_correction(columns, v, self.are_orthonormal)
+        if self.trace is not None:
+            v = phase_correction(columns, v, self.trace)
         v = v.T if self.are_rows else v
         return v.reshape(start.shape), is_there & self.has_rate()
 
@@ -162,3 +247,8 @@ def skew_defect(a: Inexact[Array, "n n"]) -> Real[Array, ""]:
     size, defect = (jnp.max(magnitude(x)) for x in (a, a + a.conj().T))
     zero = jnp.zeros((), size.dtype)
     return jnp.where(defect > 1e3 * jnp.finfo(size.dtype).eps * size, jnp.nan, zero)
+
+
+def _square(tree: PyTree[Array]) -> Real[Array, ""]:
+    squares = [jnp.sum(x.real * x.real + x.imag * x.imag) for x in jtu.tree_leaves(tree)]
+    return jnp.sum(jnp.asarray(squares))

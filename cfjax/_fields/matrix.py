@@ -89,13 +89,10 @@ class AbstractOneSided(AbstractMatrix):
     def projected(self, point: Inexact[Array, "..."]) -> Any:
         if self._num_axes:
             return elementwise(self, self._num_axes).projected(point)
-        if point.size > self.a.shape[0] ** 2:
-            raise ValueError(
-                f'coordinates="projected" with {type(self).__name__} needs a point of full rank, '
-                f"which a of shape {self.a.shape} multiplies at most {len(self.a)} vectors of, got "
-                f"shape {point.shape}. Use a commutator-free method, for example cfjax.CF4()."
-            )
-        return Polar(self.tangent(point), skew_defect(self.a), are_rows=self.axis == -1)
+        velocity, trace = self.tangent(point), None
+        if jnp.iscomplexobj(velocity) and point.shape == self.a.shape:
+            trace = jnp.trace(self.a).astype(velocity.dtype)
+        return Polar(velocity, skew_defect(self.a), trace, are_rows=self.axis == -1)
 
     def cayley(self, point: Inexact[Array, "..."]) -> Any:
         trace = None

@@ -10,7 +10,8 @@ from jaxtyping import Array, Bool, Float, Real
 from .._field import AbstractAlgebraElement
 from .._numerics.matmul import matmul
 from .._numerics.quaternion import Frame
-from .elementwise import check_other, check_point, check_real, each, each_of_its_own
+from .coordinates import Pose
+from .elementwise import check_other, check_point, check_real, each, each_of_its_own, elementwise
 
 
 class AbstractMotion(AbstractAlgebraElement):
@@ -44,6 +45,14 @@ class AbstractMotion(AbstractAlgebraElement):
 
     def tangent(self, point: Float[Array, "..."]) -> Float[Array, "..."]:
         return self._each(self.numerics.tangent, point)
+
+    def projected(self, point: Float[Array, "..."]) -> Any:
+        axes = self._num_axes
+        indices = ()
+        if point.shape[axes:] == self._pose_shapes[1]:
+            indices = self._indices[: self.number_size]
+        velocity = Pose(self.tangent(point), self.dimension, indices)
+        return elementwise(velocity, axes) if axes else velocity
 
     def bracket(self, other: Any) -> Any:
         return self._with(self.numerics.bracket, other)

@@ -12,7 +12,8 @@ from .._arrays import describe
 from .._field import AbstractAlgebraElement
 from .._numerics.quaternion import Frame, Layout, check_choice, increment, times
 from .._numerics.rotate import cross_product, dexpinv, has_dexpinv
-from .elementwise import check_point, each, each_of_its_own
+from .coordinates import OfLength
+from .elementwise import check_point, each, each_of_its_own, elementwise
 from .rotation import check_angular_velocity
 
 
@@ -67,6 +68,10 @@ class QuaternionRotation(AbstractAlgebraElement):
 
     def framed(self, point: Float[Array, "*batch 4"]) -> "QuaternionRotation":
         return each_of_its_own(self, self._num_axes, point)
+
+    def projected(self, point: Float[Array, "*batch 4"]) -> Any:
+        velocity = OfLength(self.tangent(point), is_unit=True)
+        return elementwise(velocity, self._num_axes) if self._num_axes else velocity
 
     def bracket(self, other: Any) -> "QuaternionRotation":
         return self._with(cross_product, other)

@@ -9,7 +9,8 @@ from jaxtyping import Array, Bool, Float
 
 from .._field import AbstractAlgebraElement
 from .._numerics.rotate import cross_product, dexpinv, has_dexpinv, increment, mean, rotate
-from .elementwise import check_other, check_point, check_real, each, each_of_its_own
+from .coordinates import OfLength, Polar
+from .elementwise import check_other, check_point, check_real, each, each_of_its_own, elementwise
 
 
 class Rotation(AbstractAlgebraElement):
@@ -57,6 +58,12 @@ class Rotation(AbstractAlgebraElement):
         if point.shape[self._num_axes :] != (3, 3):
             return self.tangent(point)
         return each_of_its_own(self, self._num_axes, point)
+
+    def projected(self, point: Float[Array, "..."]) -> Any:
+        if self._num_axes:
+            return elementwise(self, self._num_axes).projected(point)
+        v = self.tangent(point)
+        return OfLength(v, is_unit=False) if v.ndim == 1 else Polar(v, jnp.zeros((), v.dtype))
 
     def bracket(self, other: Any) -> "Rotation":
         return self._with(cross_product, other)

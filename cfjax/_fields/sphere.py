@@ -10,7 +10,7 @@ from jaxtyping import Array, Float
 
 from .._field import AbstractFrozenField
 from .._numerics.vectors import smooth
-from .coordinates import Tangent
+from .coordinates import OfLength, Tangent
 from .elementwise import check_real, elementwise
 from .low_rank import SpanSkew, check_like
 from .rotation import Rotation
@@ -63,6 +63,10 @@ class SphereRotation(AbstractFrozenField):
     def defect(self, point: Float[Array, "*batch n"]) -> tuple[Array, str]:
         length = jnp.sqrt(jnp.sum(point * point, axis=-1))
         return jnp.max(jnp.abs(length - 1), initial=0), "length 1"
+
+    def projected(self, point: Float[Array, "*batch n"]) -> Any:
+        velocity = OfLength(self.tangent(point), is_unit=True)
+        return elementwise(velocity, point.ndim - 1) if point.ndim > 1 else velocity
 
     def cayley(self, point: Float[Array, "*batch n"]) -> Any:
         velocity = Tangent(self.tangent(point))

@@ -24,6 +24,7 @@ from rich.table import Table
 from .._batch.progress import on_terminal, progress_bar
 from .._integrate import integrate
 from .._signals import busy
+from .._solvers.projected import Projected
 from .style import about_times, new_figure
 from .work_precision import WorkPrecision, compiled, take_turns
 
@@ -131,8 +132,8 @@ def scene(
         update(advance=1)
 
     method = type(module.solver).__name__
-    coordinates = getattr(module.solver, "coordinates", "exponential")
-    method = method if coordinates == "exponential" else f"{method} ({coordinates})"
+    if isinstance(module.solver, Projected):
+        method = f"{method} ({module.solver.name})"
     title = f"{num_steps} equal steps of {method}, t = {float(arrays[0]):g} to {float(arrays[1]):g}"
     table = Table(box=box.SIMPLE_HEAD, padding=(0, 1), title=title, title_justify="left")
     table.add_column("", no_wrap=True)

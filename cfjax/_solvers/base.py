@@ -69,7 +69,7 @@ class AbstractLieSolver(AbstractSolver):
         """
         state, fault = self.start(terms, t0, t1, y0, args)
         zero = fault.error(jnp.zeros((), jnp.result_type(t0)))
-        return State(state.compensation, state.first, zero)
+        return State(state.compensation, state.first, zero, kept=state.kept)
 
     def start(self, terms, t0, t1, y0, args) -> tuple["State", Fault]:
         # Steps of this state carry no checks: a loop reports what is wrong with the start itself,
@@ -233,11 +233,13 @@ class State(eqx.Module):
     - `first`: the value of the field at the start of the next step, if the last step ended with it.
     - `zero`: carries the checks of the start. Every step uses it, as otherwise diffrax would drop
       it.
+    - `kept`: values at the start of the solve that stay what they are, or None.
     """
 
     compensation: PyTree
     first: PyTree
     zero: Real[Array, ""] | None
+    kept: PyTree = eqx.field(default=None, kw_only=True)
 
 
 # By how much a start is off, in the message. The error itself may be in a compiled program.

@@ -4,18 +4,31 @@ from typing import ClassVar
 
 import jax.numpy as jnp
 import jax.tree_util as jtu
-from jax import lax
-from jaxtyping import PyTree
+from jaxtyping import Array, Bool, PyTree, Real
 
 from .._field import has_rate, in_coordinates, landing, rate
-from .compiled import materialised_in_rows
+from .._numerics.vectors import smooth
+from .compiled import materialised_in_rows, materialised_together
 from .step import Chart
 
 _NOT_SKEW = (
-    'coordinates="projected" needs skew-Hermitian matrices a in LeftMatrix and RightMatrix, as for '
+    "cfjax.Projected needs skew-Hermitian matrices a in LeftMatrix and RightMatrix, as for "
     "orthogonal and unitary matrices, and a is not skew-Hermitian at the start. Use a "
     "commutator-free method, for example cfjax.CF4()."
 )
+
+
+def zero_or_nan(is_defined: Bool[Array, ""], field: PyTree) -> Real[Array, ""]:
+    """Zero, or NaN if not, in the precision of a field: a number for `plus_zero`.
+
+    The derivative of a sum with it is that of the other summand, and so is finite.
+    """
+    dtype = jnp.finfo(jtu.tree_leaves(field)[0].dtype).dtype
+    return jnp.where(is_defined, jnp.zeros((), dtype), jnp.nan)
+
+
+def plus_zero(tree: PyTree, zero: Real[Array, ""]) -> PyTree:
+    return jtu.tree_map(lambda x: x + zero.astype(x.dtype), tree)
 
 
 def landed(field: PyTree, start: PyTree) -> PyTree:
@@ -24,6 +37,16 @@ def landed(field: PyTree, start: PyTree) -> PyTree:
     """
     increment, is_there = landing(field, start)
     return jtu.tree_map(lambda y, v: jnp.where(is_there, y + v, jnp.nan), start, increment)
+
+
+@smooth
+def _landing_or_nan(field: PyTree, start: PyTree) -> tuple[PyTree, Bool[Array, ""]]:
+    """The same as `landing`, with NaN where there is no such point.
+
+    A number and not a predicate: a comparison would keep the divisions of the whole step.
+    """
+    increment, is_there = landing(field, start)
+    return plus_zero(increment, zero_or_nan(is_there, field)), is_there
 
 
 class AbstractCoordinateChart(Chart):
@@ -50,7 +73,7 @@ class AbstractCoordinateChart(Chart):
         return has_rate(u)
 
     def flow_of_step(self, field):
-        increment, is_there = landing(field, self.origin)
+        increment, is_there = _landing_or_nan(field, self.origin)
         # A part that is no sum has its state there.
         end = jtu.tree_map(jnp.add, self.start, increment)
         return materialised_in_rows(end), is_there
@@ -63,10 +86,9 @@ class ProjectedChart(AbstractCoordinateChart):
 
     name = "projected"
 
-    @classmethod
-    def case_of_start(cls, field, y0):
-        has_step = has_rate(in_coordinates(cls.name, lax.stop_gradient(field()), y0))
-        return None if has_step is None else (~has_step, _NOT_SKEW)
+    def flow_of_step(self, field):
+        # Otherwise each entry of the end would compute the whole step anew.
+        return super().flow_of_step(materialised_together(field))
 
 
 class CayleyChart(AbstractCoordinateChart):
@@ -79,6 +101,5 @@ class CayleyChart(AbstractCoordinateChart):
 
 CHARTS: dict[str, type[Chart]] = {
     "exponential": Chart,
-    "projected": ProjectedChart,
     "cayley": CayleyChart,
 }

@@ -27,10 +27,9 @@ from .._methods.continuous_extension import RungeKuttaExtension, runge_kutta_ext
 from .._methods.order_conditions import runge_kutta_order
 from .._methods.tableau import ContinuousExtension, Row
 from .._numerics.vectors import smooth
-from .._term import product
 from .base import check_choice, combine_nonzero, without_trailing_zeros
 from .compiled import materialised_together, scalarised
-from .coordinates import CHARTS
+from .coordinates import CHARTS, CayleyChart, plus_zero, zero_or_nan
 from .dense import Path
 from .stages import rolled_elements
 from .step import AbstractChartSolver, Chart, Step
@@ -79,6 +78,10 @@ class AbstractMuntheKaas(AbstractChartSolver, diffrax.AbstractStratonovichSolver
         """With the further elements that the estimate takes; v leads to the end."""
         return elements
 
+    def end_of(self, chart: Chart, v: PyTree) -> tuple[PyTree, Bool[Array, ""] | None]:
+        """Where v leads, and whether there is such a point, None if so."""
+        return chart.flow_of_step(v)
+
     def logarithm(self, field: Callable[[Any, PyTree], PyTree], y0: PyTree) -> PyTree:
         """The element v, where `field(c, y)` is `h f(t + c h, y)`."""
         chart = Chart.at_start(field, lambda field: field, Sums(y0), field(0.0, y0))
@@ -87,9 +90,10 @@ class AbstractMuntheKaas(AbstractChartSolver, diffrax.AbstractStratonovichSolver
     def step_in(self, chart):
         elements = self.elements(chart)
         v = combine_nonzero(self.b, elements.fields)
-        end, is_there = chart.flow_of_step(v)
-        elements = elements.add_zero(_zero_where(is_there, v))
+        end, is_there = self.end_of(chart, v)
         y1 = elements.or_nan(chart.end(end))
+        # Where there is no such point, the end is NaN already, but not the estimate.
+        elements = elements.add_zero(_zero_where(is_there, v))
         error = None
         # All that follows is for error control and output within the step. The compiler leaves it
         # out where the caller asks for neither.
@@ -127,8 +131,7 @@ class _Elements(NamedTuple):
 
     def or_nan(self, tree: PyTree) -> PyTree:
         """The same arrays, or NaN where something had no value."""
-        zero = self.zero
-        return tree if zero is None else jtu.tree_map(lambda x: x + zero.astype(x.dtype), tree)
+        return tree if self.zero is None else plus_zero(tree, self.zero)
 
 
 # A number and not a predicate: a comparison would keep the divisions of the whole step.
@@ -140,10 +143,7 @@ def _zero_or_nan(chart: Chart, u: PyTree) -> Real[Array, ""] | None:
 
 def _zero_where(is_defined: Bool[Array, ""] | None, u: PyTree) -> Real[Array, ""] | None:
     """Zero, or NaN if not, in the precision of the field u; None if nothing is known."""
-    if is_defined is None:
-        return None
-    dtype = jnp.finfo(jtu.tree_leaves(u)[0].dtype).dtype
-    return jnp.where(is_defined, jnp.zeros((), dtype), jnp.nan)
+    return None if is_defined is None else zero_or_nan(is_defined, u)
 
 
 def _first_element(chart: Chart) -> PyTree:
@@ -227,12 +227,9 @@ class RKMK4(AbstractMuntheKaas):
         return _Elements([k1, k2, k3, k4, bracket(k1, k4)])
 
 
-class AbstractRKMK(AbstractMuntheKaas):
-    """The Munthe-Kaas method of a tableau, in some coordinates of a step."""
+class AbstractRungeKutta(AbstractMuntheKaas):
+    """The Runge-Kutta method of a tableau, in some coordinates of a step."""
 
-    coordinates: Literal["exponential", "projected", "cayley"] = eqx.field(
-        static=True, default="exponential", kw_only=True
-    )
     # Tuples: unlike diffrax's tableau they compare by value, as a static field must. Last are
     # stages without weight that only serve the estimate.
     a: tuple[tuple[float, ...], ...] = eqx.field(static=True)
@@ -246,40 +243,16 @@ class AbstractRKMK(AbstractMuntheKaas):
         self,
         tableau: diffrax.ButcherTableau,
         *,
-        coordinates: Literal["exponential", "projected", "cayley"] = "exponential",
         estimate: Literal["algebra", "group"] | None = "algebra",
         unroll: bool | None = None,
     ):
-        if not isinstance(tableau, diffrax.ButcherTableau):
-            solver_tableau = getattr(tableau, "tableau", None)
-            is_solver = isinstance(solver_tableau, diffrax.ButcherTableau)
-            name = tableau.__name__ if isinstance(tableau, type) else type(tableau).__name__
-            advice = f" Write diffrax.{name}.tableau." if is_solver else ""
-            raise TypeError(f"tableau must be a diffrax.ButcherTableau, got {tableau!r}.{advice}")
-        if tableau.implicit:
-            raise ValueError("tableau must be explicit, got one of an implicit method.")
         self.b = without_trailing_zeros(tableau.b_sol.tolist())
         self.b_error = without_trailing_zeros(tableau.b_error.tolist()) or None
         n = max(len(self.b), len(self.b_error or ()))
         self.a = ((), *(tuple(row.tolist()) for row in tableau.a_lower[: n - 1]))
         self.c = (0.0, *tableau.c.tolist()[: n - 1])
-        self.coordinates = coordinates
         self.estimate = estimate
         self.unroll = unroll
-
-    def __check_init__(self):
-        check_choice("coordinates", self.coordinates, *CHARTS)
-
-    @property
-    def chart_type(self) -> type[Chart]:
-        return CHARTS[self.coordinates]
-
-    def start(self, terms, t0, t1, y0, args):
-        state, fault = super().start(terms, t0, t1, y0, args)
-        case = self.chart_type.case_of_start(
-            lambda: product(terms, terms.vf(t0, y0, args), terms.contr(t0, t1)), y0
-        )
-        return state, fault if case is None else fault.with_case(*case)
 
     def order(self, terms) -> int:
         return _order(*self._end)
@@ -346,6 +319,10 @@ class AbstractRKMK(AbstractMuntheKaas):
     def _extension(self) -> RungeKuttaExtension:
         return runge_kutta_extension(self.a[: len(self.b)], self.b, self.order(None))
 
+    def unrolls(self, chart: Chart) -> bool | None:
+        """Whether the stages of this step are unrolled. None: what is faster."""
+        return self.unroll
+
     @property
     def _degree(self) -> int:
         return self.order(None) - 2
@@ -356,7 +333,7 @@ class AbstractRKMK(AbstractMuntheKaas):
         """These fields, and a stage for each row and time."""
         rate = functools.partial(chart.rate, degree=self._degree)
         zero_of = functools.partial(_zero_or_nan, chart)
-        rolled = rolled_elements(self.unroll, chart, fields, rows, times, rate, zero_of)
+        rolled = rolled_elements(self.unrolls(chart), chart, fields, rows, times, rate, zero_of)
         if rolled is not None:
             return _Elements(*rolled)
         elements = _Elements(fields)
@@ -372,7 +349,7 @@ class AbstractRKMK(AbstractMuntheKaas):
         return elements
 
 
-class RKMK(AbstractRKMK, diffrax.AbstractAdaptiveSolver):
+class RKMK(AbstractRungeKutta, diffrax.AbstractAdaptiveSolver):
     """The Munthe-Kaas method of any explicit Runge-Kutta method, with its order and its estimate.
 
     Each stage but the first takes the inverse derivative of the exponential, `dexpinv` of the
@@ -388,32 +365,11 @@ class RKMK(AbstractRKMK, diffrax.AbstractAdaptiveSolver):
     field at the end of the step, which is the first field of the next step. Dense output has order
     q - 1 and uses the stages alone; for `diffrax.Dopri8` it takes 4 evaluations more.
 
-    With `coordinates="projected"` a step takes no exponentials and no commutators. Within a step it
-    moves along straight lines: the stages are those of the tableau in plain space, off the manifold
-    by their own error, and only the end of the step, or the output within it, is brought back to
-    the manifold. The order, the order of output and the cost of the estimate are as above. It takes
-    these fields, with leading axes or without, and arrays and None beside them:
-
-    - `LeftMatrix` and `RightMatrix` with a skew-Hermitian `a`, on columns or rows of full rank. The
-      end keeps their products, so matrices stay orthogonal or unitary. The determinant of a complex
-      matrix is only as accurate as the solution. A step takes four or five products with the point
-      more than in plain space, and an inverse where the columns are not orthonormal. The estimate
-      is that of plain space.
-    - `LowRankSkew` and `BorderedSkew`. The end has orthonormal columns, and the estimate is that of
-      plain space.
-    - `Conjugation` and `Congruence` without `q`, with any `a`. Beside the point a step computes an
-      element of the algebra in Cayley's coordinates, which moves the start to the end, and whose
-      estimate is that of the step. This takes three products of matrices a stage, and two solves a
-      step.
-
-    The function of the term is called off the manifold, and must return elements of the same
-    algebra there.
-
-    With `coordinates="cayley"` a step takes no exponentials and no commutators either, but all its
-    stages are on the manifold: Cayley's transform `cay(u) = (I - u/2)^-1 (I + u/2)` stands in place
-    of the exponential, and the inverse of its derivative is `(I - u/2) a (I + u/2)`. The order, the
-    order of output and the cost of the estimate are as above. It takes these fields, with leading
-    axes or without, and arrays and None beside them:
+    With `coordinates="cayley"` a step takes no exponentials and no commutators: Cayley's transform
+    `cay(u) = (I - u/2)^-1 (I + u/2)` stands in place of the exponential, and the inverse of its
+    derivative is `(I - u/2) a (I + u/2)`. The order, the order of output and the cost of the
+    estimate are as above. It takes these fields, with leading axes or without, and arrays and None
+    beside them:
 
     - `LeftMatrix`, `RightMatrix`, `Conjugation` and `Congruence` without `q`, with any `a`. Every
       form `y^H J y` that the group of the field keeps is kept to rounding, for example of
@@ -434,7 +390,7 @@ class RKMK(AbstractRKMK, diffrax.AbstractAdaptiveSolver):
     **Arguments:**
 
     - `tableau`: a `diffrax.ButcherTableau`, for example `diffrax.Dopri5.tableau`.
-    - `coordinates`: `"exponential"`, `"projected"` or `"cayley"`.
+    - `coordinates`: `"exponential"` or `"cayley"`.
     - `estimate`: the estimate of the error, if the tableau has an embedded method, which gives
       another element of the algebra. `"algebra"`, the default, is the velocity of the difference of
       both elements at the end of the step, and takes no flow. `"group"` is the difference between
@@ -444,27 +400,44 @@ class RKMK(AbstractRKMK, diffrax.AbstractAdaptiveSolver):
 
     **Raises** `TypeError` if the tableau is something else, `ValueError` if the method is implicit,
     or for other `coordinates`, `estimate` or `unroll`; `TypeError` for a field without such
-    coordinates. With `coordinates="projected"`: `ValueError` for more columns than a column has
-    entries, and a runtime error for an `a` that is not skew-Hermitian at the start, by more than
-    1000 units of rounding of its largest entry. Such an `a` later on makes a step fail, and so do
-    an end so far off that five corrections do not lead to rounding, and with both coordinates an
-    element of the algebra that turns by nearly pi. Then `cfjax.integrate` raises an error, and an
-    adaptive step is taken again, shorter.
+    coordinates. With `coordinates="cayley"` an element of the algebra that turns by nearly pi makes
+    a step fail. Then `cfjax.integrate` raises an error, and an adaptive step is taken again,
+    shorter.
 
     Source: Munthe-Kaas, High order Runge-Kutta methods on manifolds, Appl. Numer. Math. 29 (1999),
     doi:10.1016/S0168-9274(98)00030-0; for Cayley's transform, Iserles, Munthe-Kaas, Nørsett &
     Zanna, Lie-group methods, Acta Numerica 9 (2000), Section 6, doi:10.1017/S0962492900002154.
     """
 
+    coordinates: Literal["exponential", "cayley"] = eqx.field(
+        static=True, default="exponential", kw_only=True
+    )
+
     def __init__(
         self,
         tableau: diffrax.ButcherTableau,
         *,
-        coordinates: Literal["exponential", "projected", "cayley"] = "exponential",
+        coordinates: Literal["exponential", "cayley"] = "exponential",
         estimate: Literal["algebra", "group"] | None = "algebra",
         unroll: bool | None = None,
     ):
-        super().__init__(tableau, coordinates=coordinates, estimate=estimate, unroll=unroll)
+        if not isinstance(tableau, diffrax.ButcherTableau):
+            solver_tableau = getattr(tableau, "tableau", None)
+            is_solver = isinstance(solver_tableau, diffrax.ButcherTableau)
+            name = tableau.__name__ if isinstance(tableau, type) else type(tableau).__name__
+            advice = f" Write diffrax.{name}.tableau." if is_solver else ""
+            raise TypeError(f"tableau must be a diffrax.ButcherTableau, got {tableau!r}.{advice}")
+        if tableau.implicit:
+            raise ValueError("tableau must be explicit, got one of an implicit method.")
+        super().__init__(tableau, estimate=estimate, unroll=unroll)
+        self.coordinates = coordinates
+
+    def __check_init__(self):
+        check_choice("coordinates", self.coordinates, *CHARTS)
+
+    @property
+    def chart_type(self) -> type[Chart]:
+        return CHARTS[self.coordinates]
 
 
 class RKMK5(RKMK):
@@ -484,7 +457,7 @@ class RKMK5(RKMK):
     def __init__(
         self,
         *,
-        coordinates: Literal["exponential", "projected", "cayley"] = "exponential",
+        coordinates: Literal["exponential", "cayley"] = "exponential",
         estimate: Literal["algebra", "group"] | None = "algebra",
         unroll: bool | None = None,
     ):
@@ -510,7 +483,7 @@ class RKMK8(RKMK):
     def __init__(
         self,
         *,
-        coordinates: Literal["exponential", "projected", "cayley"] = "exponential",
+        coordinates: Literal["exponential", "cayley"] = "exponential",
         estimate: Literal["algebra", "group"] | None = "algebra",
         unroll: bool | None = None,
     ):
@@ -519,7 +492,7 @@ class RKMK8(RKMK):
         )
 
 
-class CayleyRK4(AbstractRKMK):
+class CayleyRK4(AbstractRungeKutta):
     """The classical Runge-Kutta method in the coordinates of Cayley's transform.
 
     Order 4, 4 evaluations. Dense output of order 3. This is `RKMK` of the classical tableau with
@@ -534,7 +507,11 @@ class CayleyRK4(AbstractRKMK):
     """
 
     def __init__(self, *, unroll: bool | None = None):
-        super().__init__(_CLASSICAL, coordinates="cayley", estimate=None, unroll=unroll)
+        super().__init__(_CLASSICAL, estimate=None, unroll=unroll)
+
+    @property
+    def chart_type(self) -> type[Chart]:
+        return CayleyChart
 
 
 _CLASSICAL = diffrax.ButcherTableau(

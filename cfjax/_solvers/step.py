@@ -81,13 +81,6 @@ class Chart(NamedTuple):
         return cls(value, product, sums, first_value, first_field, start)
 
     @classmethod
-    def case_of_start(
-        cls, field: Callable[[], PyTree], y0: PyTree
-    ) -> tuple[Bool[Array, ""], str] | None:
-        """Whether the first field has no step in this chart, and what to do; None if it has one."""
-        return None
-
-    @classmethod
     def charted(
         cls, sums: Sums, field: PyTree, point: PyTree, earlier: Sequence[PyTree] = ()
     ) -> tuple[PyTree, PyTree]:
@@ -258,7 +251,7 @@ def finish_step(
 
     (end, last, error), path = scalarised(outputs, y0, is_pair=True)
     y1, compensation = Sums(y0, solver_state.compensation).fast_two_sum(end)
-    state = State(compensation, last, solver_state.zero)
+    state = State(compensation, last, solver_state.zero, kept=solver_state.kept)
     return y1, finite_if_complex(error), dict(path=path), state, result_of(y1)
 
 

@@ -52,18 +52,19 @@ class Scene(Protocol):
 
 
 # Methods of a chart, with stages in plain space.
-PROJECTED = cfjax.RKMK5(coordinates="projected"), cfjax.RKMK8(coordinates="projected")
+PROJECTED = cfjax.Projected(diffrax.Tsit5()), cfjax.Projected(diffrax.Dopri8())
 
 
 def by_name(*solvers: diffrax.AbstractSolver, term: Any = None) -> dict[str, Any]:
-    """Methods of a chart, each by the name of its class, with coordinates of its steps that are not
-    exponential. They solve `term`, if it is given.
+    """Methods of a chart, each by the name of its class, with what it projects, or coordinates of
+    its steps that are not exponential. They solve `term`, if it is given.
     """
 
     def name(solver: diffrax.AbstractSolver) -> str:
-        coordinates = getattr(solver, "coordinates", "exponential")
-        suffix = "" if coordinates == "exponential" else f", {coordinates}"
-        return type(solver).__name__ + suffix
+        detail = getattr(solver, "coordinates", "exponential")
+        if isinstance(solver, cfjax.Projected):
+            detail = solver.name
+        return type(solver).__name__ + ("" if detail == "exponential" else f", {detail}")
 
     methods = {name(solver): solver for solver in solvers}
     return methods if term is None else {name: (term, s) for name, s in methods.items()}

@@ -22,7 +22,7 @@ from . import _figures as figures
 from ._scene import PROJECTED, by_dop853, by_name, in_plain_space, solve
 
 t0, t1 = 0.0, 1.0
-solver = cfjax.RKMK8(coordinates="projected")
+solver = cfjax.Projected(diffrax.Dopri8())
 
 # The first two rows of Y(1) and the sum of its entries for n = 100, p = 4, from an independent
 # program, rounded to 13 decimals.
@@ -153,7 +153,7 @@ def picture(n: int = 40) -> figures.Figure:
     climb.plot(times, height, color=figures.BLUE)
     climb.axhline(top, color="0.6", linestyle=":", linewidth=1)
     climb.set(title="tr($C\\,Y^T D\\,Y$) / 2, and its maximum", xlabel="t")
-    for name, y in {"RKMK8, projected": ys, "Tsit5 in plain space": others}.items():
+    for name, y in {"Projected, Dopri8": ys, "Tsit5 in plain space": others}.items():
         off = np.abs(np.swapaxes(y, 1, 2) @ y - np.eye(y.shape[2])).max(axis=(1, 2))
         drift.semilogy(times, np.maximum(off, 1e-17), label=name)
     drift.set(title=f"Off orthonormal, steps of {end / steps:g}", xlabel="t")

@@ -27,7 +27,7 @@ from . import _figures as figures
 from ._scene import PROJECTED, by_name, in_plain_space, solve
 
 t0, t1 = 0.0, 10.0
-solver = cfjax.RKMK8(coordinates="projected")
+solver = cfjax.Projected(diffrax.Dopri8())
 
 # The particles of `y0()`: they run into each other.
 positions = np.array([-10.0, -5.0, -1.0, 4.0, 9.0])
@@ -134,7 +134,7 @@ def picture() -> figures.Figure:
         diagonal.plot(times, ys[:, k, k], color=colour)
     for value in values:
         diagonal.axhline(value, color="0.6", linestyle=":", linewidth=1, zorder=0)
-    for name, y in {"RKMK8, projected": ys, "Tsit5": others}.items():
+    for name, y in {"Projected, Dopri8": ys, "Tsit5": others}.items():
         off = np.abs(np.linalg.eigvalsh((y + np.swapaxes(y, 1, 2)) / 2) - values).max(-1)
         drift.semilogy(times, np.maximum(off, 1e-16), label=f"{name}, {n} steps")
     lattice.set(title="Positions", xlabel="q", ylabel="t")

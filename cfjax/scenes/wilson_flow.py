@@ -27,7 +27,7 @@ from . import _figures as figures
 from ._scene import PROJECTED, by_dop853, by_name, in_plain_space, solve
 
 t0, t1 = 0.0, 0.5
-solver = cfjax.RKMK8(coordinates="projected")
+solver = cfjax.Projected(diffrax.Dopri8())
 
 Links = Complex[Array | np.ndarray, "d *sides 3 3"]
 

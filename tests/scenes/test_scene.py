@@ -92,11 +92,11 @@ def single(x):
 
 
 def test_methods_have_the_names_of_their_classes():
-    methods = by_name(cfjax.CF4(), cfjax.RKMK5(), cfjax.RKMK5(coordinates="projected"))
+    methods = by_name(cfjax.CF4(), cfjax.RKMK5(), cfjax.Projected(diffrax.Tsit5()))
     assert {name: type(solver) for name, solver in methods.items()} == {
         "CF4": cfjax.CF4,
         "RKMK5": cfjax.RKMK5,
-        "RKMK5, projected": cfjax.RKMK5,
+        "Projected, Tsit5": cfjax.Projected,
     }
     ((name, (term, solver)),) = in_plain_space(rigid_body.velocity, diffrax.Tsit5()).items()
     assert (name, type(term), type(solver)) == ("Tsit5", diffrax.ODETerm, diffrax.Tsit5)

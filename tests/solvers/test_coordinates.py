@@ -14,20 +14,26 @@ from matrix_problems import PROBLEMS
 import cfjax
 from cfjax.scenes import zeitlin
 
-NAMES = ["projected", "cayley"]
+SOLVERS = {
+    "projected": cfjax.Projected,
+    "cayley": lambda method, **options: cfjax.RKMK(method.tableau, coordinates="cayley", **options),
+}
+NAMES = list(SOLVERS)
 
 
 def test_coordinates_are_part_of_the_method(no_shape_hook):
-    message = "coordinates must be 'exponential', 'projected' or 'cayley', got"
-    for name in ("caley", "Projected", None):
+    message = "coordinates must be 'exponential' or 'cayley', got"
+    for name in ("caley", "projected", None):
         with pytest.raises(ValueError, match=message):
             cfjax.RKMK8(coordinates=name)
-    for name in NAMES:
-        solver = cfjax.RKMK5(coordinates=name)
-        assert cfjax.RKMK5() == cfjax.RKMK5(coordinates="exponential") != solver
-        assert solver == cfjax.RKMK5(coordinates=name)
-        for row in ("a", "b", "b_error", "c"):
-            assert getattr(solver, row) == getattr(cfjax.RKMK5(), row)
+    solver = cfjax.RKMK5(coordinates="cayley")
+    assert cfjax.RKMK5() == cfjax.RKMK5(coordinates="exponential") != solver
+    assert solver == cfjax.RKMK5(coordinates="cayley")
+    projected = cfjax.Projected(diffrax.Tsit5())
+    assert projected == cfjax.Projected(diffrax.Tsit5()) != cfjax.Projected(diffrax.Bosh3())
+    for row in ("a", "b", "b_error", "c"):
+        for other in (solver, projected):
+            assert getattr(other, row) == getattr(cfjax.RKMK5(), row)
 
 
 CLOSED = r'coordinates="exponential", the default'
@@ -64,12 +70,43 @@ REFUSED = {
 def test_fields_without_these_coordinates_are_refused(subtests):
     for name, (field, y0, advice) in REFUSED.items():
         term = cfjax.LieTerm(lambda t, y, args, field=field: field(y))
-        for coordinates in NAMES:
-            solver = cfjax.RKMK5(coordinates=coordinates)
-            message = f'^{name.split()[0]} has no coordinates for coordinates="{coordinates}"'
-            with subtests.test(case=(name, coordinates)):
-                with pytest.raises(TypeError, match=f"{message}.*{advice}"):
-                    cfjax.integrate(term, solver, 0.0, 1.0, y0, num_steps=2)
+        message = f'^{name.split()[0]} has no coordinates for coordinates="cayley".*{advice}'
+        with subtests.test(case=name), pytest.raises(TypeError, match=message):
+            cfjax.integrate(term, cfjax.RKMK5(coordinates="cayley"), 0.0, 1.0, y0, num_steps=2)
+
+
+NOT_PROJECTED = {
+    name: (REFUSED[name][0], REFUSED[name][1], "`projected` returns None.*cfjax.CF4")
+    for name in ("Congruence", "Affine", "Elementwise")
+} | {
+    "Scaling": (lambda y: cfjax.Scaling(-y), jnp.ones(3), r"signs.*cfjax\.RKMK5"),
+    "Lindblad": (lambda y: cfjax.Lindblad(y, [y]), jnp.eye(2, dtype=complex), r"cfjax\.Kraus4"),
+}
+
+
+def test_what_projected_refuses(subtests, no_shape_hook):
+    for name, (field, y0, advice) in NOT_PROJECTED.items():
+        term = cfjax.LieTerm(lambda t, y, args, field=field: field(y))
+        message = f"^cfjax.Projected does not take {name}.*{advice}"
+        with subtests.test(case=name), pytest.raises(TypeError, match=message):
+            cfjax.integrate(term, cfjax.Projected(diffrax.Heun()), 0.0, 1.0, y0, num_steps=2)
+    for method, error, message in [
+        (diffrax.Tsit5, TypeError, r"an instance, Tsit5\(\), got the class"),
+        (diffrax.Kvaerno5(), ValueError, "must be explicit, got the implicit one Kvaerno5"),
+        (diffrax.KenCarp4(), TypeError, "explicit Runge-Kutta solver of diffrax, such as"),
+        (diffrax.SPaRK(), TypeError, "explicit Runge-Kutta solver of diffrax, such as"),
+        (diffrax.Euler(), TypeError, "explicit Runge-Kutta solver of diffrax, such as"),
+        (cfjax.CF4(), TypeError, "explicit Runge-Kutta solver of diffrax, such as"),
+        ("Tsit5", TypeError, "explicit Runge-Kutta solver of diffrax, such as"),
+    ]:
+        with subtests.test(method=method), pytest.raises(error, match=message):
+            cfjax.Projected(method)
+    with pytest.raises(TypeError, match="invariants must be a function or None, got 3"):
+        cfjax.Projected(diffrax.Heun(), invariants=3)
+    path = diffrax.LinearInterpolation(jnp.arange(2.0), jnp.arange(2.0)[:, None])
+    term = cfjax.LieControlTerm(lambda t, y, args, dx: cfjax.Rotation(dx[0] * y), path)
+    with pytest.raises(TypeError, match=r"driven by a path.*cfjax\.WeakOrder2"):
+        cfjax.integrate(term, cfjax.Projected(diffrax.Heun()), 0.0, 1.0, jnp.ones(3), num_steps=2)
 
 
 class Turn(cfjax.AbstractFrozenField):
@@ -110,7 +147,7 @@ def test_the_field_at_the_end_of_a_step_is_the_first_of_the_next():
         return solver.step(term, *times, y0, args, state, made_jump=False)[0]
 
     for coordinates in NAMES:
-        solver = cfjax.RKMK(diffrax.Bosh3.tableau, coordinates=coordinates, unroll=True)
+        solver = SOLVERS[coordinates](diffrax.Bosh3(), unroll=True)
         jax.eval_shape(lambda: step(solver))  # noqa: B023
         assert len(count) == 3
 
@@ -140,7 +177,7 @@ def test_products_with_arrays_parts_at_rest_and_a_field_of_a_users_own(coordinat
         "turn": np.eye(2)[0],
     }
     y0, args = problems.arrays((y0, frame.args))
-    term, solver = cfjax.LieTerm(field), cfjax.RKMK8(coordinates=coordinates, unroll=False)
+    term, solver = cfjax.LieTerm(field), SOLVERS[coordinates](diffrax.Dopri8(), unroll=False)
     ys: Any = cfjax.integrate(term, solver, 0.0, 2.0, y0, args, num_steps=20).ys
     times, weights = np.polynomial.legendre.leggauss(20)
     path = sum(w * frame.exact(1 + t)[:, 0] for t, w in zip(times, weights, strict=True))
@@ -173,7 +210,7 @@ def test_rossby_haurwitz_waves(coordinates):
         # With a skew-Hermitian matrix both are the same. One of them has a leading axis.
         return cfjax.Conjugation((a + s * unit)[None]), cfjax.Congruence(b + s * (1j * unit))
 
-    term, solver = cfjax.LieTerm(field), cfjax.RKMK8(coordinates=coordinates, unroll=False)
+    term, solver = cfjax.LieTerm(field), SOLVERS[coordinates](diffrax.Dopri8(), unroll=False)
 
     def solve(size):
         args = jnp.asarray(size, complex), jnp.asarray(zeitlin.inverse_laplacian(n))

@@ -470,8 +470,15 @@ def test_a_bias_in_the_state_adds_its_share():
 
 
 @pytest.mark.representatives(1)
-@pytest.mark.parametrize("coordinates", ["projected", "cayley"])
-def test_coordinates_of_a_step(coordinates):
+@pytest.mark.parametrize(
+    "solver",
+    [
+        cfjax.Projected(diffrax.Bosh3()),
+        cfjax.RKMK(diffrax.Bosh3.tableau, coordinates="cayley"),
+    ],
+    ids=["projected", "cayley"],
+)
+def test_coordinates_of_a_step(solver):
     """`y' = k b y + y c`, whose flow is linear in the start, with each kind of coordinates."""
     b, c = hat([0.3, -0.5, 0.8]), np.array([[0.0, 0.7], [-0.7, 0.0]])
     basis = np.stack([hat(x) for x in np.eye(3)])
@@ -500,7 +507,6 @@ def test_coordinates_of_a_step(coordinates):
     covariance = np.zeros((9, 9))
     covariance[slices["r"], slices["r"]] = P0
     start = problems.arrays(Variation(y0, np.eye(9), covariance, np.zeros((9, 1))))
-    solver = cfjax.RKMK(diffrax.Bosh3.tableau, coordinates=coordinates)
     # From steps of two sizes, by one program, to order 4.
     coarse, fine = (
         problems.in_pieces(term, solver, 0.0, t, start, k, num_steps=1000, pieces=n) for n in (1, 2)

@@ -1,0 +1,50 @@
+"""The nearest vector of given length."""
+
+from typing import Any
+
+import jax.numpy as jnp
+from jax import lax
+from jaxtyping import Array, Bool, Real
+
+from .vectors import Vector, entries, pack, smooth
+
+
+@smooth
+def length_correction(y: Vector, v: Vector, is_unit: bool) -> tuple[Vector, Bool[Array, ""]]:
+    """v so corrected that `y + v` has the length of y, and whether there is such a vector.
+
+    There is none where `y + v` is off by more than half of its own length. With `is_unit` the
+    length is 1, which that of y must be but for a small error. Vectors are given by their entries.
+    The correction is as small as what it corrects, and so is its rounding.
+    """
+    square = _sum([a * a for a in y])
+    e = _sum([(a + a + b) * b for a, b in zip(y, v, strict=True)])
+    if is_unit:
+        e = e + (square - 1)
+    else:
+        # A vector of length zero does not move.
+        e = e / jnp.where(square == 0, 1, square)
+    ratio = lax.stop_gradient(1 + e)
+    is_there = (ratio >= 4 / 9) & (ratio <= 4)
+    e = jnp.where(is_there, e, 0)
+    root = jnp.sqrt(1 + e)
+    factor = -e / (root * (1 + root))
+    return [b + factor * (a + b) for a, b in zip(y, v, strict=True)], is_there
+
+
+def vector_of_length(
+    y: Real[Array, " n"], v: Real[Array, " n"], is_unit: bool
+) -> tuple[Real[Array, " n"], Bool[Array, ""]]:
+    """The same for arrays."""
+    if len(y) <= 4:
+        corrected, is_there = length_correction(entries(y), entries(v), is_unit)
+        return pack(corrected, sums=True), is_there
+    (corrected,), is_there = length_correction([y], [v], is_unit)
+    return corrected, is_there
+
+
+def _sum(terms: Vector) -> Any:
+    total = terms[0]
+    for term in terms[1:]:
+        total = total + term
+    return jnp.sum(total) if jnp.ndim(total) else total
