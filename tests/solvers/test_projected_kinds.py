@@ -8,6 +8,7 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
+import optimistix as optx
 import problems
 import pytest
 import scipy.linalg
@@ -368,3 +369,50 @@ def test_in_a_linear_space_it_is_the_method_itself():
         for name in ("num_steps", "num_accepted_steps"):
             assert plain.stats[name] == projected.stats[name]
         problems.assert_close(plain.ys, projected.ys, 1e-13)
+
+
+@pytest.mark.slow
+def test_output_events_and_adjoints_of_controlled_steps():
+    """Between steps, at an event, and a gradient through both is that in forward mode."""
+    names = ["vector", "pose", "pose matrix", "own"]
+
+    def some(t, y, coupling):
+        return {name: one(name, t, y[name], coupling[name]) for name in names}
+
+    start = problems.arrays({name: Y0[name] for name in names})
+    coupling = problems.arrays({name: COUPLING[name] for name in names})
+
+    def solve(coupling, adjoint):
+        return diffrax.diffeqsolve(
+            cfjax.LieTerm(some),
+            cfjax.Projected(diffrax.Tsit5()),
+            *(0.0, 2.0, 0.1),
+            start,
+            coupling,
+            saveat=diffrax.SaveAt(ts=jnp.asarray([0.3, 0.7, 1.1]), t1=True),
+            stepsize_controller=diffrax.PIDController(rtol=1e-9, atol=1e-9),
+            event=diffrax.Event(lambda t, y, args, **kwargs: t - 1.3, optx.Newton(1e-12, 1e-12)),
+            adjoint=adjoint,
+            max_steps=64,
+        )
+
+    solution = jax.jit(lambda c: solve(c, diffrax.RecursiveCheckpointAdjoint()))(coupling)
+    np.testing.assert_allclose(solution.ts[-1], 1.3, rtol=0, atol=1e-11)
+    for k, t in enumerate([0.3, 0.7, 1.1, 1.3]):
+        for name in names:
+            found = np.asarray(solution.ys[name][k])
+            # Output within a step has order 4, a tenth of a radian from its ends.
+            np.testing.assert_allclose(found, exact(t)[name], rtol=0, atol=1e-6)
+            off = np.abs(gram(name, found) - gram(name, Y0[name])).max()
+            assert off < 1e-14
+
+    def loss(coupling, adjoint):
+        ys = solve(coupling, adjoint).ys
+        return sum(jnp.sum(jnp.sin(ys[name])) for name in names)
+
+    direction = problems.random_like(coupling, 3)
+    pulled = jax.jit(jax.grad(lambda c: loss(c, diffrax.RecursiveCheckpointAdjoint())))(coupling)
+    forward = lambda c: loss(c, diffrax.ForwardMode())  # noqa: E731
+    pushed = jax.jit(lambda c, d: jax.jvp(forward, (c,), (d,))[1])(coupling, direction)
+    # Sums of some hundred steps of rounding.
+    np.testing.assert_allclose(problems.inner(pulled, direction), pushed, rtol=1e-10)

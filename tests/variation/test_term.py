@@ -765,3 +765,30 @@ def test_errors_at_run_time(subtests):
         message = rf"^[^\n]*{text}[^\n]*$"
         with subtests.test(case=text), pytest.raises(eqx.EquinoxRuntimeError, match=message):
             fun()
+
+
+@pytest.mark.slow
+def test_projected_attitudes_have_the_variations_of_other_methods():
+    """Of order 8, so the difference is rounding of a hundred steps, and errors as small."""
+
+    def field(t, y, k):
+        w = jnp.stack([jnp.cos(t), k * y["q"][1], 0.5 - y["p"][0]])
+        return {
+            "q": cfjax.QuaternionRotation(w, frame="body", layout="wxyz"),
+            "p": cfjax.RigidMotion(omega=w[::-1], v=w, frame="fixed", layout="xyz_wxyz"),
+        }
+
+    q = np.array([1.0, -3.0, 5.0, 1.0]) / 6
+    y0 = {"q": q, "p": np.r_[0.3, 0.2, 0.1, q]}
+    term = VariationTerm(LieTerm(field), parameters=lambda k: k)
+    n = sum(s.stop - s.start for s in term.slices(0.0, y0, 0.7).values())
+    start = problems.arrays(
+        Variation(y0, np.eye(n), np.diag(np.arange(1.0, n + 1)), np.zeros((n, 1)))
+    )
+    ends = [
+        cfjax.integrate(term, solver, 0.0, 2.0, start, 0.7, num_steps=100).ys
+        for solver in (cfjax.RKMK8(), cfjax.Projected(diffrax.Dopri8()))
+    ]
+    a, b = (problems.flat(jax.tree.map(lambda x: np.asarray(x[-1]), end)) for end in ends)
+    assert np.abs(a).max() > 1
+    np.testing.assert_allclose(a, b, rtol=0, atol=1e-11)
