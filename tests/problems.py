@@ -236,6 +236,29 @@ class Growth(cfjax.AbstractFrozenField):
 QUICK: Any = {"xla_backend_optimization_level": 0, "xla_llvm_disable_expensive_passes": True}
 
 
+class Circle(cfjax.AbstractFrozenField):
+    """Turns of the circle through a point about the origin."""
+
+    angle: jax.Array
+
+    def flow(self, point):
+        c, s = jnp.cos(self.angle), jnp.sin(self.angle)
+        return jnp.stack([c * point[0] - s * point[1], s * point[0] + c * point[1]])
+
+    def tangent(self, point):
+        return self.angle * jnp.stack([-point[1], point[0]])
+
+    def defect(self, point):
+        return jnp.abs(point @ point - 1), "length 1"
+
+    def projected(self, point):
+        return cfjax.Nearest(self.tangent(point), to_the_circle)
+
+
+def to_the_circle(point):
+    return point / jnp.sqrt(point @ point)
+
+
 def central_difference(fun: Callable[[Any], Any], x: Any, direction: Any, step: float) -> Any:
     """Order 4: an error of about step^4 (fifth derivative) / 30 and 1.5 rounding / step."""
     f = [

@@ -6,7 +6,9 @@ import diffrax
 import jax
 import jax.numpy as jnp
 import numpy as np
+import problems
 import pytest
+from problems import to_the_circle
 
 import cfjax
 from cfjax import AbstractAlgebraElement, AbstractFrozenField
@@ -101,44 +103,25 @@ def test_mistakes_in_framed_are_named(subtests):
             cfjax.check_field(fields, POINT)
 
 
-class Circle(AbstractFrozenField):
-    """Turns of the circle through a point about the origin."""
-
-    angle: jax.Array
-
-    def flow(self, point):
-        c, s = jnp.cos(self.angle), jnp.sin(self.angle)
-        return jnp.stack([c * point[0] - s * point[1], s * point[0] + c * point[1]])
-
-    def tangent(self, point):
-        return self.angle * jnp.stack([-point[1], point[0]])
-
-    def defect(self, point):
-        return jnp.abs(point @ point - 1), "length 1"
-
-    def projected(self, point):
-        return cfjax.Nearest(self.tangent(point), to_the_circle)
-
-
-def to_the_circle(point):
-    return point / jnp.sqrt(point @ point)
-
-
 def test_mistakes_in_projected_are_named(subtests):
     point = POINT / np.linalg.norm(POINT)
-    fields = [Circle(random(F64)), Circle(random(F64))]
+    fields = [problems.Circle(random(F64)), problems.Circle(random(F64))]
     cfjax.check_field(fields, point)
     for nearest, factor, text in [
         (to_the_circle, 2, "have the velocity of the field"),
         (lambda x: x * jnp.asarray([1.0, 2.0]), 1, "leave a velocity along the manifold as it is"),
-        (lambda x: to_the_circle(x) + 1e-3, 1, "leave a point of the manifold where it is"),
+        (
+            lambda x: to_the_circle(x) + 1e-3,
+            1,
+            "leave a point of the manifold where it is",
+        ),
         (lambda x: x, 1, "lead to points that have length 1"),
     ]:
 
         def projected(self, point, nearest=nearest, factor=factor):
             return cfjax.Nearest(factor * self.tangent(point), nearest)
 
-        planted = type("Planted", (Circle,), {"projected": projected})
+        planted = type("Planted", (problems.Circle,), {"projected": projected})
         with subtests.test(text=text):
             with pytest.raises(ValueError, match=f"Planted.projected must {text}"):
                 cfjax.check_field([planted(f.angle) for f in fields], point)

@@ -1,6 +1,7 @@
 """The nearest vector of given length."""
 
-from typing import Any
+import functools
+import operator
 
 import jax.numpy as jnp
 from jax import lax
@@ -43,8 +44,5 @@ def vector_of_length(
     return corrected, is_there
 
 
-def _sum(terms: Vector) -> Any:
-    total = terms[0]
-    for term in terms[1:]:
-        total = total + term
-    return jnp.sum(total) if jnp.ndim(total) else total
+def _sum(terms: Vector) -> Array:
+    return jnp.sum(functools.reduce(operator.add, terms))

@@ -35,8 +35,8 @@ def landed(field: PyTree, start: PyTree) -> PyTree:
     """Where a field in these coordinates leads from the start of a step, on the manifold; or NaN
     where there is no such point.
     """
-    increment, is_there = landing(field, start)
-    return jtu.tree_map(lambda y, v: jnp.where(is_there, y + v, jnp.nan), start, increment)
+    increment, _ = _landing_or_nan(field, start)
+    return jtu.tree_map(jnp.add, start, increment)
 
 
 @smooth

@@ -160,9 +160,8 @@ def _tableau(method: Any) -> diffrax.ButcherTableau:
         raise TypeError(
             f"method must be an instance, {method.__name__}(), got the class {method.__name__}."
         )
-    tableau = method.tableau if isinstance(method, diffrax.AbstractERK) else method
-    if isinstance(method, diffrax.AbstractDIRK):
-        tableau = method.tableau
+    is_solver = isinstance(method, diffrax.AbstractERK | diffrax.AbstractDIRK)
+    tableau: Any = method.tableau if is_solver else method
     if not isinstance(tableau, diffrax.ButcherTableau):
         raise TypeError(
             "method must be an explicit Runge-Kutta solver of diffrax, such as diffrax.Dopri8(), "
@@ -193,26 +192,23 @@ def _correction(
     they are then.
     """
     start, unravel = ravel_pytree(y)
-    eps = float(jnp.finfo(start.dtype).eps)
-    end, is_independent, size = start, jnp.asarray(True), jnp.zeros_like(kept)
-    for _ in range(_TURNS):
-        point = unravel(end)
 
-        def moved(w: Array, point: PyTree = point) -> Array:
-            increment, _ = landing(_along(field, unravel(w)), point)
-            return ravel_pytree(increment)[0]
+    def turn(end: Array, _: None) -> tuple[Array, Any]:
+        def moved(w: Array) -> Array:
+            """Where a velocity in plain space leads on the manifold."""
+            increment, _ = landing(_along(field, unravel(w)), unravel(end))
+            return end + ravel_pytree(increment)[0]
 
-        # Where a velocity in plain space leads on the manifold, and its derivative at zero.
-        now, pullback = jax.vjp(lambda w: values(unravel(end + moved(w))), jnp.zeros_like(end))  # noqa: B023
+        now, pullback = jax.vjp(lambda w: values(unravel(moved(w))), jnp.zeros_like(end))
         (rows,) = jax.vmap(pullback)(jnp.eye(len(kept), dtype=kept.dtype))
-        gram = (rows @ rows.conj().T).real
+        factors, is_independent = _solved((rows @ rows.conj().T).real, kept - now)
         size = jnp.abs(kept) + jnp.abs(rows) @ jnp.abs(end)
-        factors, found = _solved(gram, kept - now)
-        is_independent = is_independent & found
-        end = end + moved(rows.conj().T @ factors.astype(rows.dtype))
-    off = lax.stop_gradient(jnp.abs(values(unravel(end)) - kept))
-    is_kept = jnp.all(off <= _UNITS * eps * lax.stop_gradient(size))
-    return unravel(end - start), is_independent & is_kept
+        return moved(rows.conj().T @ factors.astype(rows.dtype)), (is_independent, size)
+
+    end, (are_independent, sizes) = lax.scan(turn, start, length=_TURNS)
+    off, size = lax.stop_gradient((jnp.abs(values(unravel(end)) - kept), sizes[-1]))
+    is_kept = jnp.all(off <= _UNITS * float(jnp.finfo(start.dtype).eps) * size)
+    return unravel(end - start), jnp.all(are_independent) & is_kept
 
 
 def _solved(gram: Real[Array, "m m"], x: Real[Array, " m"]) -> tuple[Array, Bool[Array, ""]]:
