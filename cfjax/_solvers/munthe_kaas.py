@@ -312,16 +312,12 @@ class AbstractRungeKutta(AbstractMuntheKaas):
             elements = self._stages(fields[:n], rows, times, chart)
             return elements.or_nan(elements.fields[n:])
 
-        fields = [*fields[:n], *scalarised(extra_fields, start, in_batches=True)]
+        fields = [*fields[:n], *scalarised(extra_fields, start, only_values=True)]
         return Path.of(path.continuous_extension, start, fields, path.apply_flow)
 
     @property
     def _extension(self) -> RungeKuttaExtension:
         return runge_kutta_extension(self.a[: len(self.b)], self.b, self.order(None))
-
-    def unrolls(self, chart: Chart) -> bool | None:
-        """Whether the stages of this step are unrolled. None: what is faster."""
-        return self.unroll
 
     @property
     def _degree(self) -> int:
@@ -333,7 +329,7 @@ class AbstractRungeKutta(AbstractMuntheKaas):
         """These fields, and a stage for each row and time."""
         rate = functools.partial(chart.rate, degree=self._degree)
         zero_of = functools.partial(_zero_or_nan, chart)
-        rolled = rolled_elements(self.unrolls(chart), chart, fields, rows, times, rate, zero_of)
+        rolled = rolled_elements(self.unroll, chart, fields, rows, times, rate, zero_of)
         if rolled is not None:
             return _Elements(*rolled)
         elements = _Elements(fields)

@@ -20,7 +20,6 @@ from .._fields.elementwise import ElementwiseCoordinates, elementwise
 from .._term import product
 from .coordinates import ProjectedChart, plus_zero, zero_or_nan
 from .munthe_kaas import AbstractRungeKutta
-from .stacked import size_of
 
 _NOT_SKEW = (
     "cfjax.Projected needs skew-Hermitian matrices a in LeftMatrix and RightMatrix, as for "
@@ -29,9 +28,6 @@ _NOT_SKEW = (
 )
 # Turns of Newton's method: they lead from a thousandth to rounding, and so do their derivatives.
 _TURNS = 3
-# Stages of so many numbers are little arithmetic, and a loop takes longer, to compile too. Fewer
-# with an estimate, for which XLA computes some of them again.
-_SMALL, _SMALL_WITH_ESTIMATE = 208, 64
 # Units of rounding of the values, by the sizes of what they consist of.
 _UNITS = 16
 
@@ -136,11 +132,6 @@ class Projected(AbstractRungeKutta, diffrax.AbstractAdaptiveSolver):
         if self.invariants is not None:
             solver = self._with(target=(t1, args, solver_state.kept))
         return AbstractRungeKutta.step(solver, terms, t0, t1, y0, args, solver_state, made_jump)
-
-    def unrolls(self, chart):
-        most = _SMALL if self.estimate is None else _SMALL_WITH_ESTIMATE
-        is_small = len(self.b) * size_of(chart.start) <= most
-        return True if self.unroll is None and is_small else self.unroll
 
     def end_of(self, chart, v):
         end, is_there = super().end_of(chart, v)

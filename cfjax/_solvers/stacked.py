@@ -71,7 +71,7 @@ def rolled_flows(
     # A weak type would be lost on the way.
     start = jtu.tree_map(lambda x: jnp.asarray(x, jnp.result_type(x)), point)
     # For one system a loop of flows is as fast, and its derivatives compile faster.
-    return scalarised(end_point, start, in_batches=True)
+    return scalarised(end_point, start, only_values=True)
 
 
 class Weights(NamedTuple):

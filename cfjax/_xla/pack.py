@@ -74,11 +74,10 @@ def _pack_impl(*entries, axis, sums=False):
     # Spread over a mesh as the entries are.
     spread = sharding(lax.expand_dims(entries[0], [axis]))
     parts = [lax.broadcast_in_dim(entry, shape, axes, out_sharding=spread) for entry in entries]
-    # By the bits of the place: XLA keeps each comparison of places as an array, outside of a loop,
-    # and a loop that reads too many is not one function.
-    place, bit = lax.broadcasted_iota(np.int32, shape, axis, out_sharding=spread), 1
+    # Which is which is known: XLA would keep comparisons of places as arrays, outside of a loop.
+    places, bit = np.arange(len(entries)), 1
     while len(parts) > 1:
-        is_odd = place & bit != 0
+        is_odd = lax.broadcast_in_dim(places & bit != 0, shape, [axis], out_sharding=spread)
         pairs = [lax.select(is_odd, b, a) for a, b in zip(parts[::2], parts[1::2], strict=False)]
         parts, bit = pairs + parts[2 * len(pairs) :], 2 * bit
     return parts[0]

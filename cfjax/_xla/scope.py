@@ -18,13 +18,13 @@ _on = jax.make_user_context({"0": False, "1": True}.get(os.environ.get("CFJAX_RE
 def rewriting(on: bool | None) -> contextlib.AbstractContextManager:
     """Switches the rewriting of small systems for XLA on or off within a `with` block.
 
-    Rewriting makes steps several times faster on CPU and GPU, and takes time to compile. The values
-    agree to rounding.
+    Rewriting makes steps of many systems several times faster on CPU and GPU, and takes time to
+    compile. The values agree to rounding.
 
-    - None, the default: rewrites short steps, such as those of `CF4`, everywhere, and long ones,
-      such as those of `CF54` and `RKMK8`, in batches and in `cfjax.integrate`. For one system in
-      `diffrax.diffeqsolve` these would take longer to compile than 10 000 steps save.
-    - True: rewrites long steps everywhere, for solves of very many steps.
+    - None, the default: rewrites batches, and short vectors along leading axes. Before jax 0.12
+      also short programs of one system.
+    - True: rewrites one system too. It rarely gains, and takes longer to compile, by far in
+      derivatives and Jacobians.
     - False: XLA gets every program as it was traced, for debugging and for programs that run a few
       times.
 
@@ -49,7 +49,7 @@ def is_on() -> bool:
 
 
 def is_everywhere() -> bool:
-    """Whether also what rarely pays is scalarised."""
+    """Whether one system is scalarised as many are."""
     return _on.value is True
 
 

@@ -11,6 +11,7 @@ others are, and the program is up to twice as long.
 """
 
 import functools
+import math
 from collections.abc import Callable, Sequence
 from typing import Any, NamedTuple
 
@@ -21,7 +22,6 @@ from jax import lax
 from jax.core import ShapedArray
 from jax.extend.core import ClosedJaxpr, Jaxpr, JaxprEqn, Primitive, jaxpr_as_fun
 from jax.interpreters import ad, batching, mlir
-from jax.interpreters import partial_eval as pe
 from jaxtyping import PyTree
 
 from .in_two import in_two
@@ -37,22 +37,23 @@ from .jaxprs import (
     structs,
 )
 from .limits import (
-    CUT_IN_BATCHES,
-    CUT_ONE,
+    CUT_VALUES,
     FEW_DIRECTIONS,
-    FLAT_DERIVATIVES,
+    FLAT_DIRECTIONS,
     FLAT_MANY,
+    FLAT_ONE,
     FLAT_SECOND,
-    FLAT_VALUES,
     FLAT_WHOLE,
     MAX_ENTRIES,
     MAX_RESULTS_IN_BATCHES,
+    UNCUT,
     UNCUT_VALUES,
 )
 from .materialise import not_materialised, together
-from .program import Declined, join, length, num_turns, on_numbers, read, split
+from .program import Declined, Reading, join, length, num_turns, on_numbers, read, split
 from .scope import is_everywhere, is_rewritten, unread
 from .turns import by_turns
+from .understood import MOVES
 
 step_p = Primitive("cfjax_step")
 step_p.multiple_results = True
@@ -122,48 +123,38 @@ class Kind(NamedTuple):
     first: int
     # Whether the state has short vectors along leading axes.
     rows: bool
-    # How long values and derivatives of one system may be, to be scalarised as a whole.
-    max_values: int
-    max_derivatives: int
+    # Whether one system is treated as many are.
+    is_everywhere: bool
+    # Whether values are left as they are if they are differentiated.
+    only_values: bool = False
     # The axes of each `vmap` around it, the innermost first.
     levels: tuple[tuple[int | None, ...], ...] = ()
     # How many of the last operands it is linear in, if it is a derivative.
     linear: int = 0
+    # Whether it is a derivative of a derivative.
+    is_second: bool = False
     # Whether its results are materialised together, as what needs several of them would compute it
     # anew for each.
     is_once: bool = False
     # What a derivative is derived from.
     of: Of | None = None
-    # Whether these are values beside their derivative, in one loop.
-    is_beside: bool = False
+
+    def is_of_directions(self, level: int) -> bool:
+        """Whether a batch is one of directions of a derivative, at a point that they share."""
+        axes = self.levels[level]
+        return bool(self.linear) and all(x is None for x in axes[: len(axes) - self.linear])
 
     @property
-    def is_batch(self) -> bool:
-        """Whether it is of many systems."""
-        return self.rows or bool(self.levels)
+    def is_many(self) -> bool:
+        """Whether it is of many systems, or treated as if it were."""
+        levels = range(len(self.levels))
+        return self.rows or self.is_everywhere or not all(map(self.is_of_directions, levels))
 
     def limit(self) -> int:
         """How long a program may be, to be scalarised as a whole."""
-        if self.is_batch and (self.is_first or not self.linear):
-            return FLAT_MANY
-        if self.is_forward:
-            # Longer ones gain nothing, and take several times as long to compile.
-            return min(self.max_derivatives, FLAT_DERIVATIVES)
-        if self.is_beside:
-            # XLA may compile such a loop as many functions, and compute a long program in them
-            # exponentially often: `RKMK8` on one body took 4 ms a step.
-            return min(self.max_values, CUT_IN_BATCHES)
-        return self.max_derivatives if self.linear else self.max_values
-
-    @property
-    def is_forward(self) -> bool:
-        """Whether it is a derivative of values, in forward mode."""
-        return self.of is not None and self.of.of is None and self.of.derive is _tangents
-
-    @property
-    def is_first(self) -> bool:
-        """Whether it is no derivative of a derivative."""
-        return self.max_derivatives > FLAT_SECOND
+        if self.linear and self.only_values:
+            return 0
+        return FLAT_SECOND if self.is_second else FLAT_MANY
 
     def is_cut(self, jaxpr: Jaxpr, num_operations: float) -> bool:
         """Whether a program that is scalarised as a whole is cut at the turns of its loop.
@@ -173,52 +164,38 @@ class Kind(NamedTuple):
         """
         if self.linear:
             return num_operations > FLAT_WHOLE
-        least = CUT_IN_BATCHES if self.levels else CUT_ONE
-        is_long = num_operations > least and num_operations * num_turns(jaxpr) > UNCUT_VALUES
+        is_long = num_operations > CUT_VALUES and num_operations * num_turns(jaxpr) > UNCUT_VALUES
         return is_long and not self.rows
 
 
-# For a step of many, which may take longer to compile, and for any other.
-OF_MANY = FLAT_MANY, FLAT_MANY
-OF_FEW = FLAT_VALUES, FLAT_DERIVATIVES
-
-
 def scalarised(
-    fun: Callable[[PyTree], PyTree], y: PyTree, is_pair: bool = False, in_batches: bool = False
+    fun: Callable[[PyTree], PyTree], y: PyTree, is_pair: bool = False, only_values: bool = False
 ) -> PyTree:
-    """`fun(y)`, computed on single numbers where `y` is a small state of short vectors.
+    """`fun(y)`, computed on single numbers for many systems with a small state of short vectors.
 
     The result agrees with that of `fun` to rounding. `fun` may close over traced values. Operations
     that have no rule get the array whole. Where `y` is another state or the program cannot be
-    scalarised, and within another one that is scalarised, this is `fun(y)`. With `is_pair` the
-    function returns a pair, of which mostly the first part alone is used. With `in_batches` values
-    of one system and derivatives are left as they are. Reverse mode keeps `y` and what the function
+    scalarised, within another one that is scalarised, and for one system, this is `fun(y)`. With
+    `is_pair` the function returns a pair, of which mostly the first part alone is used. With
+    `only_values` derivatives are left as they are. Reverse mode keeps `y` and what the function
     closes over, and computes the step again.
     """
     reading = None if is_rewritten() else read(fun, y)
     if reading is None:
         return fun(y)
     leaves, structure = jtu.tree_flatten(reading.shape)
+    first = len(jtu.tree_leaves(reading.shape[0])) if is_pair else len(leaves)
     outs = bound(
-        reading.program,
-        reading.parameters,
-        list(map(jnp.asarray, jtu.tree_leaves(y))),
-        len(jtu.tree_leaves(reading.shape[0])) if is_pair else len(leaves),
-        reading.rows,
-        (0, 0) if in_batches else OF_MANY if is_everywhere() else OF_FEW,
+        reading, list(map(jnp.asarray, jtu.tree_leaves(y))), first, only_values=only_values
     )
     return jtu.tree_unflatten(structure, outs)
 
 
 def bound(
-    program: ClosedJaxpr,
-    parameters: Sequence[Any],
-    state: Sequence[Any],
-    first: int,
-    rows: bool,
-    max_lengths: tuple[int, int],
+    reading: Reading, state: Sequence[Any], first: int, only_values: bool = False
 ) -> list[Any]:
     """The results of a step as one operation. `Kind` says what the other arguments are."""
+    program, parameters = reading.program, reading.parameters
     operands, outs = [*parameters, *state], program.out_avals
     fixed = (*[True] * len(parameters), *[False] * len(state))
     # Integers that depend on integers alone, as the number of a step, are on their own: a transpose
@@ -227,7 +204,7 @@ def bound(
     exact = [k for k, x in enumerate(outs) if not (is_inexact(x) or are_reached[k])]
     others = _others(outs, exact)
     code, _ = narrowed(program, others, range(len(operands)))
-    kind = Kind(fixed, sum(k < first for k in others), rows, *max_lengths)
+    kind = Kind(fixed, sum(k < first for k in others), reading.rows, is_everywhere(), only_values)
     new = step_p.bind(*operands, program=code, kind=kind)
     counting, places = narrowed(program, exact)
     counts = map(jnp.asarray, jaxpr_as_fun(counting)(*(operands[k] for k in places)))
@@ -251,10 +228,9 @@ def _sizes(operands: Sequence[Any], levels: Sequence[Any]) -> list[int]:
 
 
 def _jvp(primals, tangents, *, program, kind):
-    if kind.linear:
-        # Several derivatives in one loop take long to compile.
-        kind = kind._replace(max_derivatives=min(kind.max_derivatives, FLAT_SECOND))
-    outs = step_p.bind(*primals, program=program, kind=kind._replace(is_beside=not kind.linear))
+    # Several derivatives in one loop take long to compile.
+    kind = kind._replace(is_second=bool(kind.linear))
+    outs = step_p.bind(*primals, program=program, kind=kind)
     ways: list[Any] = [ad.Zero(jax.typeof(x).to_tangent_aval()) for x in outs]
     pairs = enumerate(zip(primals, tangents, strict=True))
     moving = tuple(k for k, (x, way) in pairs if type(way) is not ad.Zero and is_inexact(x))
@@ -276,14 +252,8 @@ def _jvp(primals, tangents, *, program, kind):
     return outs, replaced(ways, results, new)
 
 
-def _partly_known(trace, *operands, program, kind):
-    """Reverse mode computes values in a loop of their own, before their derivatives."""
-    params = {"program": program, "kind": kind._replace(is_beside=False)}
-    return trace.default_process_primitive(step_p, operands, params)
-
-
 def _derivative(kind: Kind, of: Of, operands: Sequence[Any]) -> list[Any]:
-    kind = kind._replace(is_once=True, of=of, is_beside=False)
+    kind = kind._replace(is_once=True, of=of)
     return step_p.bind(*operands, program=of.derived(), kind=kind)
 
 
@@ -347,13 +317,12 @@ def _one_of(xs):
 @step_p.def_impl
 def _run(*operands, program, kind):
     num_operations, few = length(program.jaxpr), _few_directions(operands, kind)
+    if not kind.is_many and (kind.levels or num_operations > FLAT_ONE):
+        return _whole(operands, not_materialised(program), kind)
     if few is not None:
-        if kind.is_forward and len(kind.levels) == 1 and not kind.rows:
-            # The Jacobian of one system. On numbers it gains nothing.
-            return _whole(operands, not_materialised(program), kind)
         level, size = few
-        is_flat = num_operations <= min(kind.limit(), FLAT_DERIVATIVES)
-        if is_flat or (kind.is_first and size <= FEW_DIRECTIONS):
+        is_flat = num_operations <= min(kind.limit(), FLAT_DIRECTIONS)
+        if is_flat or (not kind.is_second and size <= FEW_DIRECTIONS):
             return _one_by_one(operands, program, kind, level)
     if few is not None or num_operations > kind.limit():
         return _as_traced(operands, program, kind)
@@ -361,20 +330,21 @@ def _run(*operands, program, kind):
     if is_cut and num_turns(program.jaxpr) == 1:
         # There is nothing to cut it at.
         return _as_traced(operands, program, kind)
-    if kind.linear and kind.levels and not is_cut and kind.max_derivatives == FLAT_MANY:
+    if kind.linear and kind.levels and not (is_cut or kind.is_second):
         # What is kept of many steps lies entry beside entry, and XLA would read it where it lies,
         # one member at a time: `CF4` on 1000 bodies took 6.5 ms for 50 steps, and takes 3.0 ms.
         operands = together(operands)
-    outs = _flat(operands, program, kind, is_cut)
+    # How long a loop over stages really is shows when it is unrolled.
+    is_tried = is_cut and not kind.linear
+    outs = _flat(operands, program, kind, most=UNCUT) if is_tried else None
+    outs = _flat(operands, program, kind, is_cut=is_cut) if outs is None else outs
     return _as_traced(operands, program, kind) if outs is None else outs
 
 
 def _few_directions(operands: Sequence[Any], kind: Kind) -> tuple[int, int] | None:
     """Which level is a batch over few directions of a derivative, and over how many."""
     for k, size in enumerate(reversed(_sizes(operands, kind.levels))):
-        moves = [axis is not None for axis in kind.levels[k]]
-        is_of_directions = kind.linear and not any(moves[: len(moves) - kind.linear])
-        if is_of_directions and size <= MAX_ENTRIES["step"]:
+        if kind.is_of_directions(k) and size <= MAX_ENTRIES["step"]:
             return k, size
     return None
 
@@ -399,13 +369,10 @@ def _one_by_one(operands, program, kind, k):
     """One member of a batch after the other, as of the few directions of a Jacobian.
 
     In a program for all of them single numbers meet arrays, and XLA would compute the former anew
-    for every use. The Jacobian of one system is no reason to compile longer where many steps are to
-    follow: that of `CF54` on a spacecraft would take 8 s.
+    for every use.
     """
     levels = kind.levels
     kind = kind._replace(levels=(*levels[:k], *levels[k + 1 :]))
-    if not kind.is_batch:
-        kind = kind._replace(max_derivatives=min(kind.max_derivatives, FLAT_DERIVATIVES))
     moving = [n for n, axis in enumerate(levels[k]) if axis is not None]
     # What is outside of this batch comes first.
     axes = [sum(level[n] is not None for level in levels[k + 1 :]) for n in moving]
@@ -417,9 +384,15 @@ def _one_by_one(operands, program, kind, k):
 
 
 def _flat(
-    operands: Sequence[Any], program: ClosedJaxpr, kind: Kind, is_cut: bool
+    operands: Sequence[Any],
+    program: ClosedJaxpr,
+    kind: Kind,
+    is_cut: bool = False,
+    most: float = math.inf,
 ) -> list[Any] | None:
-    """The results, computed on single numbers; None if the program declines."""
+    """The results, computed on single numbers; None if the program declines, or if it has more than
+    `most` operations on single numbers.
+    """
     levels, rows = kind.levels, kind.rows
     fun = _of_numbers(program, kind.fixed, kind.of, rows, is_cut)
 
@@ -435,6 +408,8 @@ def _flat(
         return None
     except Exception as error:
         return unread(error)
+    if sum(eqn.primitive.name not in MOVES for eqn in code.jaxpr.eqns) > most:
+        return None
     leaves = jtu.tree_leaves(entries)
     if levels and kind.first < len(out):
         new = in_two(code, len(jtu.tree_leaves(out[: kind.first])), leaves)
@@ -460,8 +435,9 @@ def whole(eqn: JaxprEqn) -> ClosedJaxpr:
 
 def _as_traced(operands, program, kind) -> list[Any]:
     def run(operands: Sequence[Any], turn: ClosedJaxpr, fixed: Sequence[bool]) -> list[Any]:
-        lengths = kind.max_values, kind.max_derivatives
-        of_turn = Kind(tuple(fixed), len(turn.out_avals), kind.rows, *lengths, is_once=True)
+        of_turn = Kind(
+            tuple(fixed), len(turn.out_avals), kind.rows, kind.is_everywhere, is_once=True
+        )
         return step_p.bind(*operands, program=turn, kind=of_turn)
 
     return _whole(operands, by_turns(not_materialised(program), kind.fixed, run), kind)
@@ -481,7 +457,6 @@ def _in_batches(fun: Callable[..., Any], levels: Sequence[Any]) -> Callable[...,
 
 ad.primitive_jvps[step_p] = _jvp
 ad.primitive_transposes[step_p] = _transpose
-pe.custom_partial_eval_rules[step_p] = _partly_known
 batching.primitive_batchers[step_p] = _batch
 mlir.register_lowering(step_p, mlir.lower_fun(_run, multiple_results=True))
 # Where newer versions of JAX put types of their own within, they take them out first.

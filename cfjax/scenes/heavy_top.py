@@ -28,7 +28,7 @@ from jaxtyping import Array, Float
 import cfjax
 
 from . import _figures as figures
-from ._scene import by_dop853, by_name, in_plain_space, solve
+from ._scene import PROJECTED, by_dop853, by_name, in_plain_space, solve
 
 t0, t1 = 0.0, 2.0
 # Over long times a splitting, see the page on them.
@@ -184,6 +184,7 @@ def chart(**options: Any) -> cfjax.WorkPrecision:
         methods=by_name(
             cfjax.CF3(), cfjax.CF4(), cfjax.RKMK4(), cfjax.CF43(), cfjax.CF54(), cfjax.RKMK8()
         )
+        | by_name(*PROJECTED)
         | in_plain_space(velocity, diffrax.Tsit5(), diffrax.Dopri8()),
         reference=reference(t1),
         error=error,

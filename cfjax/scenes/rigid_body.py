@@ -20,7 +20,7 @@ import cfjax
 
 from .._numerics.matmul import matmul
 from . import _figures as figures
-from ._scene import by_name, in_plain_space
+from ._scene import PROJECTED, by_name, in_plain_space
 
 t0, t1 = 0.0, 100.0
 solver = cfjax.RKMK8()
@@ -98,6 +98,7 @@ def chart(**options: Any) -> cfjax.WorkPrecision:
     return cfjax.work_precision(
         **problem(),
         methods=by_name(cfjax.CF3(), cfjax.RKMK3(), cfjax.CF4(), cfjax.RKMK4(), cfjax.CF43())
+        | by_name(*PROJECTED)
         | in_plain_space(velocity, diffrax.Dopri5(), diffrax.Tsit5()),
         reference=reference(t1),
         num_steps=[500 * 2**k for k in range(7)],

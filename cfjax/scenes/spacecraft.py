@@ -22,7 +22,7 @@ import cfjax
 
 from . import _figures as figures
 from . import rigid_body
-from ._scene import by_name, in_plain_space, solve
+from ._scene import PROJECTED, by_name, in_plain_space, solve
 
 t0, t1 = 0.0, 40.0
 solver = cfjax.RKMK8()
@@ -143,6 +143,7 @@ def chart(**options: Any) -> cfjax.WorkPrecision:
         methods=by_name(
             cfjax.CF3(), cfjax.CF4(), cfjax.RKMK4(), cfjax.CF43(), cfjax.CF54(), cfjax.RKMK8()
         )
+        | by_name(*PROJECTED)
         | in_plain_space(velocity, diffrax.Tsit5(), diffrax.Dopri8()),
         reference=reference(t1),
         error=error,

@@ -28,7 +28,7 @@ from jaxtyping import Array, Float
 import cfjax
 
 from . import _figures as figures
-from ._scene import by_dop853, by_name, in_plain_space
+from ._scene import PROJECTED, by_dop853, by_name, in_plain_space
 
 t0, t1 = 0.0, 40.0
 # To `t1`. The splitting of the picture pays over longer times.
@@ -147,6 +147,7 @@ def chart(**options: Any) -> cfjax.WorkPrecision:
     return cfjax.work_precision(
         **problem(),
         methods=by_name(cfjax.CF4(), cfjax.RKMK8())
+        | by_name(*PROJECTED)
         | by_name(cfjax.Strang(), cfjax.BlanesMoan4(), cfjax.BlanesMoan6(), term=terms)
         | in_plain_space(velocity, diffrax.Tsit5()),
         reference=reference(t1),

@@ -149,6 +149,6 @@ def test_a_linear_solve_in_a_program_that_is_left_as_it_was_traced(rewritten):
     def fun(y):
         return jnp.linalg.solve(jnp.outer(y, y) + 9 * jnp.eye(3), y)
 
-    both = jax.jit(lambda y: (scalarised(fun, y, in_batches=True), fun(y)))
+    both = jax.jit(lambda y: (scalarised(fun, y, only_values=True), fun(y)))
     # The same operations.
     np.testing.assert_allclose(*both(jnp.arange(3.0)), rtol=1e-15)
