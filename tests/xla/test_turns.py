@@ -13,7 +13,6 @@ from xla import random_programs
 from xla.interpreter import run
 
 import cfjax
-from cfjax._xla import limits
 from cfjax.scenes import heavy_top, rigid_body, spacecraft, spin_waves
 
 pytestmark = pytest.mark.usefixtures("rewritten_by_default")
@@ -61,7 +60,7 @@ def test_which_steps_are_unrolled():
     solvers = cfjax.CF4(), cfjax.RKMK8()
     short, long = (step_of(rigid_body, solver, num_results=3) for solver in solvers)
     assert "scan" in str(jax.make_jaxpr(short[0])(*short[1:]))
-    assert (num_loops(*short) == 0) == (limits.FLAT_ONE > 0)
+    assert (num_loops(*short) == 0) == (random_programs.lowering.FLAT_ONE > 0)
     assert num_loops(*long) > 0
     assert num_loops(*batch_of(*short)) == num_loops(*batch_of(*long)) == 0
     # Directions are no batch.
