@@ -43,7 +43,7 @@ test-newest:
 	.venv-newest/bin/python $(PYTEST)
 
 # Measures everything anew, one after the other, for the pages. ARGS=--quick is rough, and quicker.
-BENCHMARKS := rigid_body tolerances attitude million_steps gradients fits fields leading_axes compile sweep first_call second_process getting_started chain expm unitary heat stiff stabilised coordinates batch charts stability energy noise noise_lattice quantum lindblad operators variations peers scenes
+BENCHMARKS := rigid_body tolerances attitude million_steps gradients fits fields leading_axes compile first_call second_process getting_started chain expm unitary heat stiff stabilised coordinates batch charts stability energy noise noise_lattice quantum lindblad operators variations peers scenes
 benchmarks: .venv/dev
 	@$(BIN)/python benchmarks/results.py
 	for name in $(BENCHMARKS); do $(BIN)/python benchmarks/$$name.py $(ARGS) || exit 1; done
