@@ -70,10 +70,9 @@ def test_a_step_is_computed_once_and_its_error_goes_through_memory(rewritten, so
 @pytest.mark.slow
 def test_a_long_step_is_cut(rewritten):
     """One function of its end and its error would be 4800 operations, and take 20 ms."""
-    sizes = sorted(size for size, _ in _functions(spacecraft, cfjax.CF54()))
-    # Its end, and its error with the end known.
-    assert sizes[-2] > 1000
-    assert sizes[-1] < 4000
+    longest = max(size for size, _ in _functions(spacecraft, cfjax.CF54()))
+    # A few turns of its loop over stages, or its end, and its error with the end known.
+    assert 500 < longest < 4000
 
 
 def _functions(scene, solver):
