@@ -110,11 +110,7 @@ def test_mistakes_in_projected_are_named(subtests):
     for nearest, factor, text in [
         (to_the_circle, 2, "have the velocity of the field"),
         (lambda x: x * jnp.asarray([1.0, 2.0]), 1, "leave a velocity along the manifold as it is"),
-        (
-            lambda x: to_the_circle(x) + 1e-3,
-            1,
-            "leave a point of the manifold where it is",
-        ),
+        (lambda x: to_the_circle(x) + 1e-3, 1, "leave a point of the manifold where it is"),
         (lambda x: x, 1, "lead to points that have length 1"),
     ]:
 

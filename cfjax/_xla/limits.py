@@ -75,7 +75,6 @@ LARGE = 2048
 # (scenes)
 LARGE_TERM = 512
 
-# More stages of a method, or more equal steps, are many. A method of many stages is mostly not
-# scalarised as a whole, and unrolled its time to compile grows as the square of their number. The
-# derivative of few steps takes longer to compile than it will ever save. (compile)
+# More stages of a method are many. It is mostly not scalarised as a whole, and unrolled its time to
+# compile grows as the square of their number. (compile)
 MANY = 9

@@ -23,8 +23,8 @@ def rewriting(on: bool | None) -> contextlib.AbstractContextManager:
 
     - None, the default: rewrites batches, and short vectors along leading axes. Before jax 0.12
       also short programs of one system.
-    - True: rewrites one system too. Gradients of long solves then take half to all of the time, and
-      compile in 1 to 7 times the time; values and Jacobians rarely gain.
+    - True: rewrites one system too. Gradients of long solves may then take half the time, and up to
+      7 times as long to compile. Values and Jacobians rarely gain.
     - False: XLA gets every program as it was traced, for debugging and for programs that run a few
       times.
 

@@ -46,10 +46,7 @@ def size(fun, y):
 
 @pytest.mark.slow
 def test_a_step_that_is_kept_is_as_one_in_the_loop():
-    """The gradient of all that a fit compares with data, at every step or every twentieth.
-
-    Both are many steps in a row: few of a long method are compiled otherwise.
-    """
+    """The gradient of all that a fit compares with data, at every step or every twentieth."""
     sizes = [
         size(jax.grad(equal(body, cfjax.CF4(), 100, save_every=n), argnums=(0, 1)), BODY)
         for n in (1, 20)

@@ -64,9 +64,7 @@ def test_which_steps_are_unrolled():
     assert num_loops(*long) > 0
     assert num_loops(*batch_of(*short)) == num_loops(*batch_of(*long)) == 0
     # Directions are no batch.
-    gradient = jax.grad(size(long[0]))
-    jacobian = lines_of(jax.jacfwd(gradient), *long[1:])
-    assert len(jacobian) < 3 * len(lines_of(gradient, *long[1:]))
+    assert num_loops(jax.jacfwd(short[0]), *short[1:]) > 0
     with cfjax.rewriting(True):
         assert num_loops(*short) == 0
     with cfjax.rewriting(False):
