@@ -198,13 +198,14 @@ def equal_steps(
         n, intervals = jnp.zeros_like(num_steps), num_steps.astype(t0.dtype)
     is_short = _is_short(t0, t1, intervals)
 
+    h = (t1 - t0) / intervals
     # Not as a number that is known: next to zero the compiler rounds the times within a step once
     # less than those at its ends, and the lengths of steps would not add up to the interval.
     t0 = lax.optimization_barrier(t0)
 
     def time(n):
         # From the step's number, so that rounding does not add up, and t1 is met exactly.
-        return jnp.where(n == num_steps, t1, t0 + n.astype(t0.dtype) * ((t1 - t0) / intervals))
+        return jnp.where(n == num_steps, t1, t0 + n.astype(t0.dtype) * h)
 
     def step(carry, direction=1):
         n, y, solver_state, result = carry
@@ -235,7 +236,7 @@ def equal_steps(
     # Not the times: if these are constants, CF54 on a heavy top takes less than half the time.
     start = needing(zero, y0)
     carry = (n, start, solver_state, diffrax.RESULTS.successful)
-    solver = solver.for_equal_steps(term, (t1 - t0) / intervals, t0, y0, args)
+    solver = solver.for_equal_steps(term, h, t0, y0, args)
 
     def advance(carry, length):
         if step_back:

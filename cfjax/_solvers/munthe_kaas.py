@@ -31,6 +31,7 @@ from .base import check_choice, combine_nonzero, without_trailing_zeros
 from .compiled import materialised_together, scalarised
 from .coordinates import CHARTS, CayleyChart, plus_zero, zero_or_nan
 from .dense import Path
+from .stacked import Stacked, Weights
 from .stages import rolled_elements
 from .step import AbstractChartSolver, Chart, Step
 from .sums import Sums
@@ -85,11 +86,11 @@ class AbstractMuntheKaas(AbstractChartSolver, diffrax.AbstractStratonovichSolver
     def logarithm(self, field: Callable[[Any, PyTree], PyTree], y0: PyTree) -> PyTree:
         """The element v, where `field(c, y)` is `h f(t + c h, y)`."""
         chart = Chart.at_start(field, lambda field: field, Sums(y0), field(0.0, y0))
-        return combine_nonzero(self.b, self.elements(chart).fields)
+        return self.elements(chart).combination(self.b)
 
     def step_in(self, chart):
         elements = self.elements(chart)
-        v = combine_nonzero(self.b, elements.fields)
+        v = elements.combination(self.b)
         end, is_there = self.end_of(chart, v)
         y1 = elements.or_nan(chart.end(end))
         # Where there is no such point, the end is NaN already, but not the estimate.
@@ -99,7 +100,7 @@ class AbstractMuntheKaas(AbstractChartSolver, diffrax.AbstractStratonovichSolver
         # out where the caller asks for neither.
         if self.estimate is not None and self.b_error is not None:
             elements = self.for_estimate(elements, v, end, chart)
-            difference = combine_nonzero(self.b_error, elements.fields)
+            difference = elements.combination(self.b_error)
             if self.estimate == "algebra":
                 error = tangent(difference, chart.state(end))
             else:
@@ -118,12 +119,23 @@ class _Elements(NamedTuple):
 
     The elements then mean nothing, but they are finite: the derivative of a rejected step must be
     zero, and that of NaN is NaN. The zero is None if nothing is known. `last` is the value of the
-    field at the end of the step, if it has been evaluated.
+    field at the end of the step, if it has been evaluated. `stacked` has the first elements, if a
+    loop computed them.
     """
 
     fields: list[PyTree]
     zero: Real[Array, ""] | None = None
+    stacked: Stacked | None = None
     last: PyTree = None
+
+    def combination(self, row: Sequence[float]) -> PyTree:
+        """Without the elements of weight zero. The row may have fewer entries."""
+        if self.stacked is None:
+            return combine_nonzero(row, self.fields)
+        # A sum over an axis, which XLA computes once; one of slices it computes for each use.
+        n = self.stacked.size
+        first = self.stacked.combination(Weights.of([row[:n]], len(row[:n])).row(0))
+        return combine_nonzero((1.0, *row[n:]), (first, *self.fields[n:]))
 
     def add_zero(self, zero: Real[Array, ""] | None) -> "_Elements":
         zeros = [x for x in (self.zero, zero) if x is not None]
@@ -290,7 +302,7 @@ class AbstractRungeKutta(AbstractMuntheKaas):
         for c, row in zip(self.c[n:], self.a[n:], strict=True):
             u, point = v, end
             if row != self.b:
-                u = combine_nonzero(row, elements.fields)
+                u = elements.combination(row)
                 point = chart.flow(u, chart.start)
             value = chart.value_at(c, point)
             field = chart.frozen(value, point, elements.fields)
@@ -338,7 +350,7 @@ class AbstractRungeKutta(AbstractMuntheKaas):
                 stage = chart.field(c, chart.start, elements.fields)
             else:
                 # Rows may be shorter than the list of fields.
-                u = combine_nonzero(row, elements.fields)
+                u = elements.combination(row)
                 stage = rate(u, _field_at(chart, c, u, elements.fields))
                 elements = elements.add_zero(_zero_or_nan(chart, u))
             elements = elements._replace(fields=[*elements.fields, stage])

@@ -89,6 +89,9 @@ class Weights(NamedTuple):
         padded = np.array([[*map(float, row), *[0.0] * (n - len(row))] for row in rows])
         return cls(padded, padded != 0)
 
+    def row(self, k: int) -> "Weights":
+        return Weights(self.weights[k], self.nonzero[k])
+
 
 class Stacked(eqx.Module):
     """Fields with the default `combine`, stacked along a new first axis of their arrays.
@@ -104,6 +107,10 @@ class Stacked(eqx.Module):
         for k, field in enumerate(fields[1:], 1):
             stacked = stacked.put(k, field)
         return stacked
+
+    @property
+    def size(self) -> int:
+        return len(jtu.tree_leaves(self.stacked)[0])
 
     def combination(self, row: Weights) -> PyTree:
         """The combination of the first fields, as many as the row has entries."""

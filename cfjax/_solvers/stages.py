@@ -153,9 +153,9 @@ def rolled_elements(
     times: Sequence[float],
     element: Callable[[PyTree, PyTree], PyTree],
     zero_of: Callable[[PyTree], Real[Array, ""] | None],
-) -> tuple[list[PyTree], Real[Array, ""] | None] | None:
-    """The `stages` k, and for each row and time c a further stage `element(u, f)`; and the sum of
-    `zero_of(u)` over all u, or None.
+) -> tuple[list[PyTree], Real[Array, ""] | None, Stacked | None] | None:
+    """The `stages` k, and for each row and time c a further stage `element(u, f)`; the sum of
+    `zero_of(u)` over all u, or None; and all stages stacked, or None.
 
     Here `u = sum_j row[j] k[j]`, and f is the field at time c and the point where u leads from the
     start. None where the field allows no loop, where `unroll` asks for none, and where it does not
@@ -167,8 +167,8 @@ def rolled_elements(
 
     if can_roll(unroll, first, first) and is_uniform(chart):
         fields = Stacked.of(stages, n)
-        values, total = _rolled_elements(chart, fields, len(stages), rows, times, element, zero_of)
-        return [*stages, *values[len(stages) :]], total
+        fields, total = _rolled_elements(chart, fields, len(stages), rows, times, element, zero_of)
+        return [*stages, *map(fields.at, range(len(stages), n))], total, fields
     if not _can_roll_in_room(unroll, chart, stages, n):
         return None
     # The time of a bracket grows with the cube of the room: the first ones get a smaller room.
@@ -176,8 +176,9 @@ def rolled_elements(
     for chunk in (slice(half), slice(half, None)) if half else (slice(None),):
         m = len(stages) + len(rows[chunk])
         fields = _InRoom.of(stages, chart.start, m, m)
-        stages, _ = _rolled_elements(chart, fields, len(stages), rows[chunk], times[chunk], element)
-    return list(stages), None
+        fields, _ = _rolled_elements(chart, fields, len(stages), rows[chunk], times[chunk], element)
+        stages = [fields.at(k) for k in range(m)]
+    return list(stages), None, None
 
 
 def _rolled_elements(
@@ -188,7 +189,7 @@ def _rolled_elements(
     times: Sequence[float],
     element: Callable[[PyTree, PyTree], PyTree],
     zero_of: Callable[[PyTree], Real[Array, ""] | None] = lambda u: None,
-) -> tuple[list[PyTree], Real[Array, ""] | None]:
+) -> tuple[Any, Real[Array, ""] | None]:
     n = num_stages + len(rows)
 
     def body(carry: Any, x: Any) -> Any:
@@ -206,7 +207,7 @@ def _rolled_elements(
     # Computed, as it must vary along the axes of a mesh as the fields do.
     zero = combine((0.0,), (fields.at(0),))
     (fields, total), _ = over_stages(body, (fields, zero_of(zero)), xs)
-    return [fields.at(k) for k in range(n)], total
+    return fields, total
 
 
 class _InRoom(eqx.Module):
