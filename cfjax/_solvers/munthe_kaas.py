@@ -128,14 +128,14 @@ class _Elements(NamedTuple):
     stacked: Stacked | None = None
     last: PyTree = None
 
-    def combination(self, row: Sequence[float]) -> PyTree:
+    def combination(self, row: Row) -> PyTree:
         """Without the elements of weight zero. The row may have fewer entries."""
         if self.stacked is None:
             return combine_nonzero(row, self.fields)
         # A sum over an axis, which XLA computes once; one of slices it computes for each use.
         n = self.stacked.size
         first = self.stacked.combination(Weights.of([row[:n]], len(row[:n])).row(0))
-        return combine_nonzero((1.0, *row[n:]), (first, *self.fields[n:]))
+        return combine_nonzero((1, *row[n:]), (first, *self.fields[n:]))
 
     def add_zero(self, zero: Real[Array, ""] | None) -> "_Elements":
         zeros = [x for x in (self.zero, zero) if x is not None]

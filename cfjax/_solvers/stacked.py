@@ -181,8 +181,8 @@ def _sum(row: Weights, fields: Array) -> Array:
     shape = len(fields), *[1] * (fields.ndim - 1)
     terms = row.weights.astype(fields.dtype).reshape(shape) * fields
     # If the loop is unrolled, terms of weight zero drop out.
-    terms = jnp.where(row.nonzero.reshape(shape), terms, jnp.zeros((), terms.dtype))
-    return jnp.sum(terms, axis=0)
+    used = lambda: jnp.where(row.nonzero.reshape(shape), terms, jnp.zeros((), terms.dtype))  # noqa: E731
+    return jnp.sum(where_scalarised(used, lambda: terms), axis=0)
 
 
 def _product(weights: Array, fields: Array) -> Array:
