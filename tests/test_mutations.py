@@ -93,7 +93,7 @@ def test_the_tests_of_a_file():
     for file, tests in {
         "_solvers/stages.py": "tests/solvers/test_stages.py",
         "_fields/elementwise.py": "tests/fields",
-        "_xla/turns.py": "tests/xla/test_turns.py",
+        "_xla/over_stages.py": "tests/xla/test_over_stages.py",
         "_control_term.py": "tests/noise/test_control_term.py",
         "__main__.py": "tests/test_main.py",
     }.items():

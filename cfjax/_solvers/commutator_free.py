@@ -17,7 +17,7 @@ from .._methods.continuous_extension import continuous_extension
 from .._methods.tableau import Product, Row, Tableau
 from .._numerics.vectors import smooth
 from .base import AbstractTableauSolver, check_choice, combine_nonzero, without_trailing_zeros
-from .compiled import materialised_if_long, materialised_together
+from .compiled import materialised_together
 from .dense import Path
 from .stages import Stages, rolled
 from .step import AbstractChartSolver, Chart, Step
@@ -52,10 +52,6 @@ class AbstractCommutatorFree(AbstractTableauSolver, AbstractChartSolver):
         beta, embedded = trimmed(tableau.beta), self._embedded
         chart, fields, points = self.stages(chart)
         end = points[beta]
-        if self.first_same_as_last:
-            # The state, the last field and the error use it.
-            end = materialised_if_long(end)
-        points = {**points, beta: end}
         # All that follows is for error control and output within the step. The compiler leaves it
         # out where the caller asks for neither.
         extension, last = continuous_extension(tableau), None

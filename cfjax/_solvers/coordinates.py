@@ -18,6 +18,7 @@ _NOT_SKEW = (
 )
 
 
+@smooth
 def zero_or_nan(is_defined: Bool[Array, ""], field: PyTree) -> Real[Array, ""]:
     """Zero, or NaN if not, in the precision of a field: a number for `plus_zero`.
 

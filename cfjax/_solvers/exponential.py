@@ -19,7 +19,6 @@ from .._methods import exponential as _exponential
 from .._methods.exponential import Columns, Combination, ExponentialTableau
 from .._term import product
 from .base import AbstractTableauSolver, check_choice
-from .compiled import materialised_if_long
 from .dense import AbstractPath
 from .dependence import dependents
 from .step import AbstractChartSolver, Step
@@ -124,7 +123,6 @@ class AbstractExponential(AbstractTableauSolver, AbstractChartSolver):
             return Step(chart.end(end), path)
         last = None
         if tableau.uses_last:
-            end = materialised_if_long(end)
             last = chart.value_at(1.0, end)
             field = chart.frozen(last, end, fields)
             changes = {**changes, tableau.num_stages + 1: change(field, end)}

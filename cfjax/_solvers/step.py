@@ -249,7 +249,7 @@ def finish_step(
         step = step_from(y0)
         return (step.end, step.last, step.error), step.path
 
-    (end, last, error), path = scalarised(outputs, y0, is_pair=True)
+    (end, last, error), path = scalarised(outputs, y0)
     y1, compensation = Sums(y0, solver_state.compensation).fast_two_sum(end)
     state = State(compensation, last, solver_state.zero, kept=solver_state.kept)
     return y1, finite_if_complex(error), dict(path=path), state, result_of(y1)

@@ -4,7 +4,7 @@
 - `over_stages`, `chosen`: a loop over the stages of a method, and a choice within it, which are
   part of what is scalarised; `where_scalarised`, `computed_again`: what is computed otherwise
   there; `kept_on_arrays`: what is not scalarised.
-- `materialised_if_long`, `materialised_together`, `materialised_in_rows`, `computed_once`: values
+- `materialised_together`, `materialised_in_rows`, `computed_once`: values
   that several results need, computed once.
 - `pack`, `unpack`: `jnp.stack` and `jnp.unstack` in a form that XLA fuses.
 - `smooth`: a mark of functions that compare numbers and yet are smooth up to rounding.
@@ -20,7 +20,6 @@ from .loop import repeat as repeat
 from .materialise import call as call
 from .materialise import computed_once as computed_once
 from .materialise import materialised as materialised
-from .materialise import materialised_if_long as materialised_if_long
 from .materialise import materialised_in_rows as materialised_in_rows
 from .materialise import materialised_together as materialised_together
 from .over_stages import chosen as chosen

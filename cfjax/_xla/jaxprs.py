@@ -88,15 +88,6 @@ def live(eqns: Sequence[JaxprEqn], outvars: Iterable[Any]) -> list[JaxprEqn]:
     return reverse[::-1]
 
 
-def part_of(jaxpr: Jaxpr, eqns: Sequence[JaxprEqn], needed: Iterable[Any]) -> Jaxpr:
-    """Some equations as a program that returns what is needed of them, and takes what it needs."""
-    defined = {v for eqn in eqns for v in eqn.outvars}
-    outvars = list(dict.fromkeys(v for v in needed if v in defined))
-    eqns = live(eqns, outvars)
-    operands = dict.fromkeys(v for e in eqns for v in variables(e.invars) if v not in defined)
-    return altered(jaxpr, constvars=[], invars=list(operands), eqns=eqns, outvars=outvars)
-
-
 def narrowed(
     program: ClosedJaxpr, results: Sequence[int], operands: Sequence[int] | None = None
 ) -> tuple[ClosedJaxpr, Sequence[int]]:
@@ -113,20 +104,13 @@ def narrowed(
     return ClosedJaxpr(code, program.consts), operands
 
 
-def dependent(
-    jaxpr: Jaxpr, sources: Iterable[Any], among: Callable[[Any], bool] = lambda _: True
-) -> set[Any]:
-    """The sources and all that may depend on them, of the values that are `among` some."""
-    values = set(sources)
-    for eqn in jaxpr.eqns:
-        if not values.isdisjoint(variables(eqn.invars)):
-            values.update(filter(among, eqn.outvars))
-    return values
-
-
 def reached(jaxpr: Jaxpr, operands: Iterable[bool]) -> list[bool]:
     """Which results may depend on some of the operands."""
-    return are_among(jaxpr.outvars, dependent(jaxpr, itertools.compress(jaxpr.invars, operands)))
+    values = set(itertools.compress(jaxpr.invars, operands))
+    for eqn in jaxpr.eqns:
+        if not values.isdisjoint(variables(eqn.invars)):
+            values.update(eqn.outvars)
+    return are_among(jaxpr.outvars, values)
 
 
 # To make others of: JAX wants to know of each program where it was traced.

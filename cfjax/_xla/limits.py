@@ -35,37 +35,17 @@ MAX_RESULTS = 15
 # on five times or more. (batch)
 MAX_RESULTS_IN_BATCHES = 13
 
-# About as many operations XLA puts into one function. What is longer is cut, and materialised in
-# between: a step takes 20 ms where it is not. (attitude)
-FUNCTION = 2000
-# Values of many that are scalarised as a whole are cut in a loop over many stages if they are
-# longer. XLA computes what a turn needs of all turns before it in each of its functions, up to
-# thousands of times over, depending on what else is known of a program. What is known of it before
-# are its operations times the turns of its loop: values with more than this are cut, as a cut that
-# is not needed costs up to a factor of three (gradients, batch).
-CUT_VALUES = 5 * FUNCTION // 2
-UNCUT_VALUES = 32 * FUNCTION
-# But for those that turn out to have at most so many: in a loop over stages all weights are
-# counted, and many are zero. (batch)
-UNCUT = 3 * FUNCTION // 2
-# The most operations of one system. From jax 0.12 on XLA compiles its loop as one function, and on
-# single numbers it gains nothing. (gradients, compile)
-FLAT_ONE = 0 if jax.__version_info__ >= (0, 12) else 2 * FUNCTION
-# The most operations in batches, which short vectors along leading axes are too. A gradient of this
-# length takes some 12 s to compile (gradients, batch, chain).
-FLAT_MANY = 9 * FUNCTION
-# The most operations of a derivative that is differentiated again, and of that derivative. (fits,
-# gradients)
-FLAT_SECOND = 2 * FUNCTION
-# Whatever is longer is cut where a method says, and a derivative at the turns of a loop:
-# what two functions need, XLA computes in both, and in long programs exponentially often. Some
-# derivatives of 4800 operations never end, and others of 6000 do not need the cut, which makes them
-# two to four times as long. Nothing that is known before tells them apart. (attitude, leading_axes)
-FLAT_WHOLE = 2 * FUNCTION
-# Few directions of a Jacobian of many systems are computed one after the other if each has at most
-# so many operations; up to four of them if it is longer, too. More of them take less time together.
-# (compile)
-FLAT_DIRECTIONS, FEW_DIRECTIONS = 3 * FUNCTION, 4
+# About as many operations XLA puts into one function.
+_FUNCTION = 2000
+# From jax 0.12 on XLA compiles a loop of one system as one function, and on single numbers it gains
+# nothing. Before, what two functions need it computes in both, in long programs exponentially
+# often.
+_IS_NEW = jax.__version_info__ >= (0, 12)
+# The most operations of one system. (gradients, compile)
+FLAT_ONE = 0 if _IS_NEW else 2 * _FUNCTION
+# The most operations of many systems: of a batch, or of short vectors along leading axes.
+# (gradients, batch, chain)
+FLAT_MANY = (20 if _IS_NEW else 2) * _FUNCTION
 # The numbers of a large point. If a loop over stages is differentiated, it keeps the points of all
 # stages for each of its turns, which is too much memory for larger ones; and unrolled, XLA keeps
 # several fields to add them up at once, which is too much for those of twice as many. (scenes)

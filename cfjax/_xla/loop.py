@@ -49,7 +49,7 @@ def repeat(
     reading = reading._replace(program=code)
 
     def once(parts: Sequence[Array]) -> list[Array]:
-        return bound(reading, parts, len(parts))
+        return bound(reading, parts)
 
     def whole(parts: Sequence[Array]) -> PyTree:
         return jtu.tree_unflatten(structure, _joined(parts, arrays))

@@ -25,24 +25,13 @@ def materialised(
     *,
     in_batches: bool = False,
     alone: bool = True,
-    is_cut: bool = False,
 ) -> list[Array]:
     """The same arrays, materialised: sent through memory.
 
     Otherwise XLA may compute them anew for every use. In a batch, where memory is what
-    takes time, only if asked for, on CPU; outside of batches only if `alone`; and if `is_cut`, only
-    in a program that is long.
+    takes time, only if asked for, on CPU; outside of batches only if `alone`.
     """
-    return materialised_p.bind(*entries, in_batches=in_batches, alone=alone, is_cut=is_cut)
-
-
-def materialised_if_long(tree: PyTree) -> PyTree:
-    """The same, materialised where a step is too long for one of XLA's functions.
-
-    That has some 2000 operations. What needs several entries of the function before calls it for
-    each, and so on to the start: values never as measured took 20 ms a step.
-    """
-    return _once(tree, in_batches=True, is_cut=True)
+    return materialised_p.bind(*entries, in_batches=in_batches, alone=alone)
 
 
 def materialised_together(tree: PyTree) -> PyTree:
@@ -132,7 +121,7 @@ materialised_p.multiple_results = True
 
 
 @materialised_p.def_impl
-def _materialised_impl(*entries, in_batches, alone, is_cut, has_calls=False):
+def _materialised_impl(*entries, in_batches, alone, has_calls=False):
     outs = list(entries)
     groups: dict[Any, list[int]] = {}
     for k, x in enumerate(entries):

@@ -28,23 +28,17 @@ from .jaxprs import (
     altered,
     are_among,
     evaluate,
-    flattened,
     is_inexact,
-    replaced,
     structs,
-    without_constants,
     without_dead_code,
 )
 from .limits import (
     FLAT_MANY,
-    FLAT_WHOLE,
-    FUNCTION,
     MAX_ENTRIES,
     MAX_LENGTH,
-    MAX_RESULTS_IN_BATCHES,
     MAX_SIZE,
 )
-from .materialise import materialised, materialised_p, together
+from .materialise import materialised, materialised_p
 from .over_stages import Loop, is_scalarised_p
 from .rules import on_entries
 from .scope import is_numeric, is_on, is_rows, is_short, unread, within
@@ -61,7 +55,6 @@ from .struct_of_arrays import (
     static_value,
     struct_of_arrays,
 )
-from .turns import in_parts, is_table, of_tables
 from .understood import MOVES, REDUCTIONS, is_in_place, is_readable
 
 
@@ -121,10 +114,7 @@ def read(
         code = without_dead_code(jaxpr.jaxpr)
         if jaxpr.effects or not is_readable(code):
             return None
-        # All of it, or each turn of a loop over stages.
-        scans = (eqn for eqn in code.eqns if eqn.primitive.name == "scan")
-        loops = [eqn.params["jaxpr"].jaxpr for eqn in scans]
-        if min(map(length, (code, *loops))) > FLAT_MANY:
+        if length(code) > FLAT_MANY:
             return None
     except Exception as error:
         return unread(error)
@@ -146,18 +136,14 @@ def on_numbers(
     operands: Sequence[Any],
     rows: bool,
     is_last: bool = True,
-    is_cut: bool = False,
 ) -> list[Any]:
     """The results of a program, apart. So are its operands.
 
     `fixed` says which of them are the same in every step, and `is_last` whether nothing is
-    differentiated any more. With `is_cut` each turn of a loop is a piece that reverse mode computes
-    again, or several turns together where nothing is differentiated.
+    differentiated any more.
     """
     jaxpr = program.jaxpr
-    is_long = length(jaxpr) > FLAT_WHOLE
-    cut = None if not is_cut else "groups" if is_last else "turns"
-    form = _Form(rows, is_long, cut, has_reciprocals(jaxpr, fixed), is_last, {}, {})
+    form = _Form(rows, has_reciprocals(jaxpr, fixed), is_last, {})
     outs, _ = _evaluate(program, operands, fixed, form)
     likes = jax.eval_shape(functools.partial(split, rows=rows), structs(program.out_avals))
     # What is known before the program runs may come out as NumPy's.
@@ -217,14 +203,6 @@ def _length_of(eqn: JaxprEqn) -> float:
     return sum(terms * n for n in map(_entries, shapes))
 
 
-def num_turns(jaxpr: Jaxpr) -> int:
-    """The number of turns of the longest loop over stages, or 1."""
-    calls = [eqn for eqn in jaxpr.eqns if eqn.primitive.name in OPENED_LAST]
-    inner = [eqn.params[CALLS[eqn.primitive.name]].jaxpr for eqn in calls]
-    loops = [eqn.params["length"] for eqn in jaxpr.eqns if eqn.primitive.name == "scan"]
-    return max([1, *loops, *map(num_turns, inner)])
-
-
 def _entries(shape: tuple[int, ...]) -> int:
     """About how many numbers or whole arrays an array is scalarised into, if it is."""
     if is_small_shape(shape):
@@ -236,14 +214,9 @@ class _Form(NamedTuple):
     """How a program is scalarised."""
 
     rows: bool  # It has arrays with leading axes.
-    is_long: bool  # Too long for one function of XLA's.
-    # "turns": each turn of a loop is a piece that reverse mode computes again. "groups": what
-    # several turns carry is materialised.
-    cut: str | None
     has_reciprocals: bool  # In the place of divisions by what is fixed.
     is_last: bool  # Nothing is differentiated any more.
     literals: dict[Any, Any]  # Each is made once.
-    in_memory: dict[int, Any]  # What is materialised already, by its identity.
 
 
 def _evaluate(
@@ -316,88 +289,13 @@ def _unrolled(
     flags = [*fixed[:n], *[False] * len(carry), *fixed[m:]]
     ys: dict[int, list[Any]] = {}
     outs_fixed: list[bool] = []
-    run = _in_parts if form.cut == "turns" else _evaluate
-    group, size = 0, length(loop.body.jaxpr)
     for k in loop.turns:
         turn = [_entry(x, k) for x in operands[m:]]
-        outs, outs_fixed = run(loop.body, [*operands[:n], *carry, *turn], flags, form)
+        outs, outs_fixed = _evaluate(loop.body, [*operands[:n], *carry, *turn], flags, form)
         carry, ys[k] = outs[: m - n], outs[m - n :]
-        if form.cut == "groups":
-            group += 1
-            traced = {id(x) for x in jtu.tree_leaves(carry) if isinstance(x, Tracer)}
-            num_new = len(traced - {*form.in_memory})
-            # With one turn more.
-            is_full = (group + 1) * size > FUNCTION
-            if is_full or (group + 1) * num_new > group * MAX_RESULTS_IN_BATCHES:
-                carry, group = _entries_materialised(carry, form.in_memory), 0
-                form.in_memory.update((id(x), x) for x in jtu.tree_leaves(carry))
     stacks = map(_stacked, zip(*(ys[k] for k in sorted(ys)), strict=True))
     # It is the same in every turn.
     return [*carry, *stacks], [*[False] * len(carry), *outs_fixed[m - n :]]
-
-
-def _in_parts(
-    program: ClosedJaxpr, operands: Sequence[Any], fixed: Sequence[bool], form: _Form
-) -> tuple[list[Any], list[bool]]:
-    """A turn, of which reverse mode keeps what goes in and comes out, and computes the rest again.
-
-    These are materialised, so that what XLA computes at once is about one turn.
-    """
-    program = flattened(program, OPENED)
-    jaxpr, consts = without_constants(program).jaxpr, list(map(_constant, program.consts))
-    operands, fixed = [*consts, *operands], [*[True] * len(consts), *fixed]
-    are_tables = is_table
-    if form.rows:
-        # The points along the other axes are not those of stages.
-        pairs = zip(jaxpr.invars, operands, strict=True)
-        are_tables = of_tables(jaxpr, [v for v, x in pairs if _is_apart(x) and x.is_table])
-
-    def on_vectors(part: Jaxpr, operands: Sequence[Any], fixed: Sequence[bool]) -> Any:
-        operands = _entries_materialised(operands, {})
-        return _again(part, operands, fixed, form, list(map(are_tables, part.outvars)))
-
-    def on_tables(part: Jaxpr, operands: Sequence[Any], fixed: Sequence[bool]) -> Any:
-        return _evaluate(ClosedJaxpr(part, []), operands, fixed, form)
-
-    return in_parts(jaxpr, operands, fixed, on_vectors, on_tables, are_tables)
-
-
-def _entries_materialised(values: Sequence[Any], in_memory: dict[int, Any]) -> list[Any]:
-    """The same, with all numbers and entries materialised together that are not `in_memory`."""
-    apart = [k for k, x in enumerate(values) if not is_whole(x)]
-    leaves, structure = jtu.tree_flatten([values[k] for k in apart])
-    traced = {id(x): x for x in leaves if isinstance(x, Tracer) and id(x) not in in_memory}
-    new = dict(zip(traced, together(list(traced.values())), strict=True))
-    return replaced(values, apart, structure.unflatten([new.get(id(x), x) for x in leaves]))
-
-
-def _again(
-    jaxpr: Jaxpr,
-    operands: Sequence[Any],
-    fixed: Sequence[bool],
-    form: _Form,
-    are_tables: Sequence[bool],
-) -> tuple[list[Any], list[bool]]:
-    """The results of a program, which reverse mode computes again."""
-    leaves, structure = jtu.tree_flatten(list(operands))
-    traced = [k for k, x in enumerate(leaves) if isinstance(x, Tracer)]
-    static: Any = None
-
-    def run(residuals: list[Any]) -> list[Any]:
-        nonlocal static
-        operands = structure.unflatten(replaced(leaves, traced, residuals))
-        inner = form._replace(literals={}, in_memory={})
-        outs, outs_fixed = _evaluate(ClosedJaxpr(jaxpr, []), operands, fixed, inner)
-        single = [k for k, x in enumerate(outs_fixed) if not (x or are_tables[k])]
-        new = _entries_materialised([outs[k] for k in single], inner.in_memory)
-        entries, shape = jtu.tree_flatten(replaced(outs, single, new))
-        places = [k for k, x in enumerate(entries) if isinstance(x, Tracer)]
-        static = replaced(entries, places, [None] * len(places)), places, shape, outs_fixed
-        return [entries[k] for k in places]
-
-    new = jax.checkpoint(run)([leaves[k] for k in traced])
-    entries, places, shape, outs_fixed = static
-    return shape.unflatten(replaced(entries, places, new)), outs_fixed
 
 
 def _entry(x: Any, k: int) -> Any:
@@ -448,12 +346,8 @@ _PARAMETERS_OF_A_PRODUCT = jax.make_jaxpr(lax.mul)(1.0, 1.0).jaxpr.eqns[0].param
 def _results(eqn: JaxprEqn, values: list[Any], fixed: Sequence[bool], form: _Form) -> Sequence[Any]:
     """The results of one operation: scalarised, if there is a rule for it."""
     if eqn.primitive is materialised_p:
-        if eqn.params["is_cut"] and not form.is_long:
-            return values
         leaves, structure = jtu.tree_flatten(values)
-        new = materialised(leaves, **eqn.params)
-        form.in_memory.update((id(x), x) for x in new)
-        return structure.unflatten(new)
+        return structure.unflatten(materialised(leaves, **eqn.params))
     outs = on_entries(eqn, values, fixed, form.rows)
     if outs is None and is_in_place(eqn):
         raise Declined

@@ -11,7 +11,6 @@ others are, and the program is up to twice as long.
 """
 
 import functools
-import math
 from collections.abc import Callable, Sequence
 from typing import Any, NamedTuple
 
@@ -20,11 +19,10 @@ import jax.numpy as jnp
 import jax.tree_util as jtu
 from jax import lax
 from jax.core import ShapedArray
-from jax.extend.core import ClosedJaxpr, Jaxpr, JaxprEqn, Primitive, jaxpr_as_fun
+from jax.extend.core import ClosedJaxpr, JaxprEqn, Primitive, jaxpr_as_fun
 from jax.interpreters import ad, batching, mlir
 from jaxtyping import PyTree
 
-from .in_two import in_two
 from .jaxprs import (
     CALLS,
     called,
@@ -37,23 +35,14 @@ from .jaxprs import (
     structs,
 )
 from .limits import (
-    CUT_VALUES,
-    FEW_DIRECTIONS,
-    FLAT_DIRECTIONS,
     FLAT_MANY,
     FLAT_ONE,
-    FLAT_SECOND,
-    FLAT_WHOLE,
     MAX_ENTRIES,
     MAX_RESULTS_IN_BATCHES,
-    UNCUT,
-    UNCUT_VALUES,
 )
 from .materialise import not_materialised, together
-from .program import Declined, Reading, join, length, num_turns, on_numbers, read, split
+from .program import Declined, Reading, join, length, on_numbers, read, split
 from .scope import is_everywhere, is_rewritten, unread
-from .turns import by_turns
-from .understood import MOVES
 
 step_p = Primitive("cfjax_step")
 step_p.multiple_results = True
@@ -119,8 +108,6 @@ class Kind(NamedTuple):
 
     # Which operands the step closes over.
     fixed: tuple[bool, ...]
-    # How many of the results are mostly used alone.
-    first: int
     # Whether the state has short vectors along leading axes.
     rows: bool
     # Whether one system is treated as many are.
@@ -131,8 +118,6 @@ class Kind(NamedTuple):
     levels: tuple[tuple[int | None, ...], ...] = ()
     # How many of the last operands it is linear in, if it is a derivative.
     linear: int = 0
-    # Whether it is a derivative of a derivative.
-    is_second: bool = False
     # Whether its results are materialised together, as what needs several of them would compute it
     # anew for each.
     is_once: bool = False
@@ -151,49 +136,30 @@ class Kind(NamedTuple):
         return self.rows or self.is_everywhere or not all(map(self.is_of_directions, levels))
 
     def limit(self) -> int:
-        """How long a program may be, to be scalarised as a whole."""
+        """How long a program may be, to be scalarised."""
         if self.linear and self.only_values:
             return 0
-        return FLAT_SECOND if self.is_second else FLAT_MANY
-
-    def is_cut(self, jaxpr: Jaxpr, num_operations: float) -> bool:
-        """Whether a program that is scalarised as a whole is cut at the turns of its loop.
-
-        What is not cut may explode: 1000 bodies with `RKMK8` took half a second a step where their
-        inertia is known, and 0.15 ms where it is an argument.
-        """
-        if self.linear:
-            return num_operations > FLAT_WHOLE
-        is_long = num_operations > CUT_VALUES and num_operations * num_turns(jaxpr) > UNCUT_VALUES
-        return is_long and not self.rows
+        return FLAT_MANY if self.is_many else FLAT_ONE
 
 
-def scalarised(
-    fun: Callable[[PyTree], PyTree], y: PyTree, is_pair: bool = False, only_values: bool = False
-) -> PyTree:
+def scalarised(fun: Callable[[PyTree], PyTree], y: PyTree, only_values: bool = False) -> PyTree:
     """`fun(y)`, computed on single numbers for many systems with a small state of short vectors.
 
     The result agrees with that of `fun` to rounding. `fun` may close over traced values. Operations
     that have no rule get the array whole. Where `y` is another state or the program cannot be
     scalarised, within another one that is scalarised, and for one system, this is `fun(y)`. With
-    `is_pair` the function returns a pair, of which mostly the first part alone is used. With
     `only_values` derivatives are left as they are. Reverse mode keeps `y` and what the function
     closes over, and computes the step again.
     """
     reading = None if is_rewritten() else read(fun, y)
     if reading is None:
         return fun(y)
-    leaves, structure = jtu.tree_flatten(reading.shape)
-    first = len(jtu.tree_leaves(reading.shape[0])) if is_pair else len(leaves)
-    outs = bound(
-        reading, list(map(jnp.asarray, jtu.tree_leaves(y))), first, only_values=only_values
-    )
+    structure = jtu.tree_structure(reading.shape)
+    outs = bound(reading, list(map(jnp.asarray, jtu.tree_leaves(y))), only_values)
     return jtu.tree_unflatten(structure, outs)
 
 
-def bound(
-    reading: Reading, state: Sequence[Any], first: int, only_values: bool = False
-) -> list[Any]:
+def bound(reading: Reading, state: Sequence[Any], only_values: bool = False) -> list[Any]:
     """The results of a step as one operation. `Kind` says what the other arguments are."""
     program, parameters = reading.program, reading.parameters
     operands, outs = [*parameters, *state], program.out_avals
@@ -204,7 +170,7 @@ def bound(
     exact = [k for k, x in enumerate(outs) if not (is_inexact(x) or are_reached[k])]
     others = _others(outs, exact)
     code, _ = narrowed(program, others, range(len(operands)))
-    kind = Kind(fixed, sum(k < first for k in others), reading.rows, is_everywhere(), only_values)
+    kind = Kind(fixed, reading.rows, is_everywhere(), only_values)
     new = step_p.bind(*operands, program=code, kind=kind)
     counting, places = narrowed(program, exact)
     counts = map(jnp.asarray, jaxpr_as_fun(counting)(*(operands[k] for k in places)))
@@ -228,8 +194,6 @@ def _sizes(operands: Sequence[Any], levels: Sequence[Any]) -> list[int]:
 
 
 def _jvp(primals, tangents, *, program, kind):
-    # Several derivatives in one loop take long to compile.
-    kind = kind._replace(is_second=bool(kind.linear))
     outs = step_p.bind(*primals, program=program, kind=kind)
     ways: list[Any] = [ad.Zero(jax.typeof(x).to_tangent_aval()) for x in outs]
     pairs = enumerate(zip(primals, tangents, strict=True))
@@ -243,7 +207,6 @@ def _jvp(primals, tangents, *, program, kind):
         kind._replace(
             levels=tuple((*axes, *(axes[k] for k in moving)) for axes in kind.levels),
             fixed=(*kind.fixed, *[False] * len(moving)),
-            first=len(results),
             linear=len(moving),
         ),
         of,
@@ -280,7 +243,6 @@ def _transpose(cotangents, *operands, program, kind):
         kind._replace(
             levels=tuple((*(axes[k] for k in residuals), *[0] * len(coming)) for axes in levels),
             fixed=(*(kind.fixed[k] for k in residuals), *[False] * len(coming)),
-            first=len(linear),
             linear=len(coming),
         ),
         of,
@@ -316,37 +278,17 @@ def _one_of(xs):
 
 @step_p.def_impl
 def _run(*operands, program, kind):
-    num_operations, few = length(program.jaxpr), _few_directions(operands, kind)
-    if not kind.is_many and (kind.levels or num_operations > FLAT_ONE):
-        return _whole(operands, not_materialised(program), kind)
-    if few is not None:
-        level, size = few
-        is_flat = num_operations <= min(kind.limit(), FLAT_DIRECTIONS)
-        if is_flat or (not kind.is_second and size <= FEW_DIRECTIONS):
-            return _one_by_one(operands, program, kind, level)
-    if few is not None or num_operations > kind.limit():
+    if length(program.jaxpr) > kind.limit() or (kind.levels and not kind.is_many):
         return _as_traced(operands, program, kind)
-    is_cut = kind.is_cut(program.jaxpr, num_operations)
-    if is_cut and num_turns(program.jaxpr) == 1:
-        # There is nothing to cut it at.
-        return _as_traced(operands, program, kind)
-    if kind.linear and kind.levels and not (is_cut or kind.is_second):
+    for k, size in enumerate(reversed(_sizes(operands, kind.levels))):
+        if kind.is_of_directions(k) and size <= MAX_ENTRIES["step"]:
+            return _one_by_one(operands, program, kind, k)
+    if kind.linear and kind.levels:
         # What is kept of many steps lies entry beside entry, and XLA would read it where it lies,
         # one member at a time: `CF4` on 1000 bodies took 6.5 ms for 50 steps, and takes 3.0 ms.
         operands = together(operands)
-    # How long a loop over stages really is shows when it is unrolled.
-    is_tried = is_cut and not kind.linear
-    outs = _flat(operands, program, kind, most=UNCUT) if is_tried else None
-    outs = _flat(operands, program, kind, is_cut=is_cut) if outs is None else outs
+    outs = _flat(operands, program, kind)
     return _as_traced(operands, program, kind) if outs is None else outs
-
-
-def _few_directions(operands: Sequence[Any], kind: Kind) -> tuple[int, int] | None:
-    """Which level is a batch over few directions of a derivative, and over how many."""
-    for k, size in enumerate(reversed(_sizes(operands, kind.levels))):
-        if kind.is_of_directions(k) and size <= MAX_ENTRIES["step"]:
-            return k, size
-    return None
 
 
 def _of_numbers(
@@ -354,13 +296,12 @@ def _of_numbers(
     fixed: Sequence[bool],
     of: Of | None,
     rows: bool,
-    is_cut: bool,
     is_last: bool = True,
 ) -> Callable[..., list[Any]]:
     """The program of operands that are apart. A derivative is that of the numbers."""
     if of is None:
-        return lambda *xs: on_numbers(program, fixed, xs, rows, is_last, is_cut)
-    fun = _of_numbers(of.program, of.fixed, of.of, rows, is_cut, False)
+        return lambda *xs: on_numbers(program, fixed, xs, rows, is_last)
+    fun = _of_numbers(of.program, of.fixed, of.of, rows, False)
     shapes = jax.eval_shape(functools.partial(split, rows=rows), structs(of.program.in_avals))
     return of.applied(fun, shapes)
 
@@ -383,18 +324,10 @@ def _one_by_one(operands, program, kind, k):
     return [jnp.moveaxis(x, 0, len(levels) - 1 - k) for x in outs]
 
 
-def _flat(
-    operands: Sequence[Any],
-    program: ClosedJaxpr,
-    kind: Kind,
-    is_cut: bool = False,
-    most: float = math.inf,
-) -> list[Any] | None:
-    """The results, computed on single numbers; None if the program declines, or if it has more than
-    `most` operations on single numbers.
-    """
+def _flat(operands: Sequence[Any], program: ClosedJaxpr, kind: Kind) -> list[Any] | None:
+    """The results, computed on single numbers; None if the program declines."""
     levels, rows = kind.levels, kind.rows
-    fun = _of_numbers(program, kind.fixed, kind.of, rows, is_cut)
+    fun = _of_numbers(program, kind.fixed, kind.of, rows)
 
     def apart(k: int) -> Any:
         axes = [(axes[k],) for axes in levels if axes[k] is not None]
@@ -408,13 +341,8 @@ def _flat(
         return None
     except Exception as error:
         return unread(error)
-    if sum(eqn.primitive.name not in MOVES for eqn in code.jaxpr.eqns) > most:
-        return None
     leaves = jtu.tree_leaves(entries)
-    if levels and kind.first < len(out):
-        new = in_two(code, len(jtu.tree_leaves(out[: kind.first])), leaves)
-    else:
-        new = called(code, leaves)
+    new = called(code, leaves)
     if kind.is_once:
         # But for what is known, as the derivative by what has no part in it.
         are_reached = reached(code.jaxpr, [True] * len(leaves))
@@ -434,17 +362,7 @@ def whole(eqn: JaxprEqn) -> ClosedJaxpr:
 
 
 def _as_traced(operands, program, kind) -> list[Any]:
-    def run(operands: Sequence[Any], turn: ClosedJaxpr, fixed: Sequence[bool]) -> list[Any]:
-        of_turn = Kind(
-            tuple(fixed), len(turn.out_avals), kind.rows, kind.is_everywhere, is_once=True
-        )
-        return step_p.bind(*operands, program=turn, kind=of_turn)
-
-    return _whole(operands, by_turns(not_materialised(program), kind.fixed, run), kind)
-
-
-def _whole(operands, program, kind) -> list[Any]:
-    fun = _in_batches(jaxpr_as_fun(program), kind.levels)
+    fun = _in_batches(jaxpr_as_fun(not_materialised(program)), kind.levels)
     # A literal comes out as NumPy's.
     return list(map(jnp.asarray, fun(*operands)))
 

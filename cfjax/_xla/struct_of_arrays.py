@@ -62,11 +62,6 @@ class StructOfArrays:
         """The lengths of these axes, without repetitions."""
         return tuple(self.shape[k] for k in self.long)
 
-    @property
-    def is_table(self) -> bool:
-        """Whether it has short vectors along leading axes of several stages."""
-        return bool(self.long) and self.is_short[0] and self.shape[0] > 1
-
     def at(
         self, places: np.ndarray, shape: Sequence[int], is_short: Sequence[bool] | None = None
     ) -> "StructOfArrays":

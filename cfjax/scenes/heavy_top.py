@@ -32,7 +32,7 @@ from ._scene import PROJECTED, by_dop853, by_name, in_plain_space, solve
 
 t0, t1 = 0.0, 2.0
 # Over long times a splitting, see the page on them.
-solver = cfjax.RKMK8()
+solver = cfjax.Projected(diffrax.Dopri8())
 
 # `pose`, shape `(*times, 7)`, and `m`, shape `(*times, 3)`.
 State = dict[str, Float[Array | np.ndarray, "..."]]

@@ -23,7 +23,7 @@ from . import _figures as figures
 from ._scene import PROJECTED, by_name, in_plain_space
 
 t0, t1 = 0.0, 100.0
-solver = cfjax.RKMK8()
+solver = cfjax.Projected(diffrax.Dopri8())
 y0 = np.array([8 / 9, 4 / 9, 1 / 9])
 inertia = np.array([7 / 8, 5 / 8, 1 / 4])
 

@@ -25,7 +25,7 @@ from . import rigid_body
 from ._scene import PROJECTED, by_name, in_plain_space, solve
 
 t0, t1 = 0.0, 40.0
-solver = cfjax.RKMK8()
+solver = cfjax.Projected(diffrax.Dopri8())
 inertia = np.array([3.0, 2.0, 1.0])
 
 # `q`, shape `(*times, 4)`, and `m`, shape `(*times, 3)`.

@@ -32,7 +32,7 @@ from ._scene import PROJECTED, by_dop853, by_name, in_plain_space
 
 t0, t1 = 0.0, 40.0
 # To `t1`. The splitting of the picture pays over longer times.
-solver = cfjax.RKMK8()
+solver = cfjax.Projected(diffrax.Dopri8())
 
 # `up` and `m`, shapes `(3,)`.
 State = dict[str, Float[Array | np.ndarray, "3"]]

@@ -7,12 +7,9 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from xla import random_programs
-from xla.interpreter import run
 
 import cfjax
 from cfjax._xla import scalarised
-from cfjax._xla.limits import MAX_RESULTS_IN_BATCHES
 from cfjax._xla.materialise import materialised
 from cfjax._xla.pack import pack, unpack
 from cfjax.scenes import rigid_body, spacecraft
@@ -108,38 +105,6 @@ def test_other_dtypes_stay():
     x = [jnp.asarray(True), jnp.asarray(3), jnp.asarray(0.5), jnp.asarray(2j, np.complex64)]
     for got, want in zip(jax.jit(lambda x: materialised(x))(x), x, strict=True):
         assert got.dtype == want.dtype and got == want
-
-
-@pytest.mark.parametrize("has_rest", [False, True])
-def test_what_is_seldom_used_of_a_batch_is_computed_in_parts(rewritten, monkeypatch, has_rest):
-    """XLA would compute each of many results from the start, here 12 points from one another."""
-    # They are longer than this, and four of them are not.
-    monkeypatch.setitem(random_programs.lowering.in_two.__globals__, "FUNCTION", 100)
-
-    def points(x):
-        found = []
-        for _ in range(12):
-            x = jnp.sin(x[::-1] + 0.1) - 0.3 * jnp.roll(x, 1)
-            found.append(x)
-        return x, found
-
-    def fun(x):
-        end, rest = scalarised(points, x, is_pair=True)
-        return (end, rest) if has_rest else end
-
-    batch = jnp.outer(jnp.linspace(0.2, 1.4, 50), jnp.array([1.0, -0.6, 0.3]))
-    compiled = jax.jit(jax.vmap(fun)).lower(batch).compile()
-    expected = run(jax.vmap(points), batch)
-    expected = expected if has_rest else expected[0]
-    for a, b in zip(jax.tree.leaves(compiled(batch)), jax.tree.leaves(expected), strict=True):
-        # 12 times a few roundings of entries of size 1, none of which grows by more than a factor
-        # of 1.3 from point to point.
-        np.testing.assert_allclose(a, b, rtol=0, atol=1e-13)
-    program = str(compiled.as_text())
-    # The end itself, and a copy in parts of four points, three of which may compute one again.
-    assert program.count(" sine(") <= 36 + has_rest * (36 + 9)
-    packed = [int(n) for n in re.findall(r"f64\[50,(\d+)\]", program)]
-    assert max(packed) <= MAX_RESULTS_IN_BATCHES
 
 
 def test_a_linear_solve_in_a_program_that_is_left_as_it_was_traced(rewritten):
