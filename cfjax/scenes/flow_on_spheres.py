@@ -21,6 +21,7 @@ arXiv:2006.10605.
 
 from typing import Any, NamedTuple
 
+import diffrax
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -29,10 +30,10 @@ from jaxtyping import Array, Float, Key
 import cfjax
 
 from . import _figures as figures
-from ._scene import by_name
+from ._scene import PROJECTED, by_name
 
 t0, t1 = 0.0, 1.0
-solver = cfjax.RKMK8()
+solver = cfjax.Projected(diffrax.Dopri8())
 pole = np.array([0.0, 0.0, 1.0])
 
 # `vector`, shape `(*times, 3)`, and `rotation`, shape `(*times, 3, 3)`.
@@ -112,7 +113,7 @@ def chart(**options: Any) -> cfjax.WorkPrecision:
     """State and log-density at t = 1, 5 to 160 equal steps."""
     return cfjax.work_precision(
         **problem(),
-        methods=by_name(cfjax.CF4(), cfjax.CF54(), cfjax.RKMK5(), cfjax.RKMK8()),
+        methods=by_name(cfjax.CF4(), cfjax.CF54(), cfjax.RKMK5(), cfjax.RKMK8(), *PROJECTED),
         reference=reference(t1),
         num_steps=[5 * 2**k for k in range(6)],
         error=error,

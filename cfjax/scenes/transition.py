@@ -20,6 +20,7 @@ Source: Hughes, Spacecraft Attitude Dynamics, Wiley 1986, Chapters 8 and 9.
 
 from typing import Any, NamedTuple
 
+import diffrax
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
@@ -27,11 +28,11 @@ from jaxtyping import Array, Float
 import cfjax
 
 from . import _figures as figures
-from ._scene import by_dop853, by_name, solve
+from ._scene import PROJECTED, by_dop853, by_name, solve
 
 # Two orbits.
 t0, t1 = 0.0, 4 * np.pi
-solver = cfjax.RKMK8()
+solver = cfjax.Projected(diffrax.Dopri8())
 
 # `q`, shape `(*times, 4)`, and `w`, shape `(*times, 3)`.
 State = dict[str, Float[Array | np.ndarray, "..."]]
@@ -146,7 +147,7 @@ def chart(**options: Any) -> cfjax.WorkPrecision:
     """State and transition matrix after two orbits, 40 to 1280 equal steps."""
     return cfjax.work_precision(
         **problem(),
-        methods=by_name(cfjax.CF4(), cfjax.CF54(), cfjax.RKMK5(), cfjax.RKMK8()),
+        methods=by_name(cfjax.CF4(), cfjax.CF54(), cfjax.RKMK5(), cfjax.RKMK8(), *PROJECTED),
         reference=reference(t1),
         num_steps=[40 * 2**k for k in range(6)],
         error=error,

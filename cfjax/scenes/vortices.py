@@ -28,11 +28,11 @@ from jaxtyping import Array, Float
 import cfjax
 
 from . import _figures as figures
-from ._scene import by_dop853, by_name, in_plain_space, solve
+from ._scene import PROJECTED, by_dop853, by_name, in_plain_space, solve
 
 t0, t1 = 0.0, 20.0
 # To `t1`. The splitting into rounds pays over longer times.
-solver = cfjax.RKMK8()
+solver = cfjax.Projected(diffrax.Dopri8())
 
 Vortices = Float[Array | np.ndarray, "N 3"]
 Strengths = Float[Array | np.ndarray, " N"]
@@ -138,7 +138,7 @@ def chart(**options: Any) -> cfjax.WorkPrecision:
     """A street of vortices to t = 20, 20 to 1280 equal steps; Tsit5 in plain space."""
     return cfjax.work_precision(
         **problem(),
-        methods=by_name(cfjax.CF4(), cfjax.RKMK8())
+        methods=by_name(cfjax.CF4(), cfjax.RKMK8(), *PROJECTED)
         | by_name(cfjax.Strang(), cfjax.BlanesMoan4(), cfjax.BlanesMoan6(), term=rounds())
         | in_plain_space(velocity, diffrax.Tsit5()),
         reference=reference(t1, y0(), strengths()),
