@@ -187,7 +187,13 @@ def test_a_scene(blank, monkeypatch, tmp_path, capsys):
 
 
 # What README's table says of fields, where a scene has a reason for another method.
-WITH_REASONS = {"harmonic_maps": "RKL2", "heat": "CF4", "porous_medium": "RKL2", "spins": "CF4"}
+WITH_REASONS = {
+    "flow_on_spheres": "RKMK8",
+    "harmonic_maps": "RKL2",
+    "heat": "CF4",
+    "porous_medium": "RKL2",
+    "spins": "CF4",
+}
 
 
 def test_scenes_solve_with_the_method_that_readme_recommends():
@@ -241,7 +247,7 @@ def test_scenes_solve_with_the_method_that_readme_recommends():
             # A Magnus method refuses fields that depend on the state.
             assert chosen in ("CF4", "Magnus6", projected), name
         seen.add(chosen)
-    assert seen == {"CF4", "ETD54", "Kraus4", "Magnus4", "Magnus6", "RKL2", projected}
+    assert seen == {"CF4", "ETD54", "Kraus4", "Magnus4", "Magnus6", "RKL2", "RKMK8", projected}
 
 
 # What solvers keep to their order alone: relative to the start, to 1e-3 with the steps below, of

@@ -134,7 +134,8 @@ class _Elements(NamedTuple):
             return combine_nonzero(row, self.fields)
         # A sum over an axis, which XLA computes once; one of slices it computes for each use.
         n = self.stacked.size
-        first = self.stacked.combination(Weights.of([row[:n]], len(row[:n])).row(0))
+        weights = np.asarray(row[:n], float)
+        first = self.stacked.combination(Weights(weights, weights != 0))
         return combine_nonzero((1, *row[n:]), (first, *self.fields[n:]))
 
     def add_zero(self, zero: Real[Array, ""] | None) -> "_Elements":

@@ -89,9 +89,6 @@ class Weights(NamedTuple):
         padded = np.array([[*map(float, row), *[0.0] * (n - len(row))] for row in rows])
         return cls(padded, padded != 0)
 
-    def row(self, k: int) -> "Weights":
-        return Weights(self.weights[k], self.nonzero[k])
-
 
 class Stacked(eqx.Module):
     """Fields with the default `combine`, stacked along a new first axis of their arrays.

@@ -21,7 +21,6 @@ arXiv:2006.10605.
 
 from typing import Any, NamedTuple
 
-import diffrax
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -33,7 +32,8 @@ from . import _figures as figures
 from ._scene import PROJECTED, by_name
 
 t0, t1 = 0.0, 1.0
-solver = cfjax.Projected(diffrax.Dopri8())
+# It reaches rounding in half the steps of Projected, and in less time.
+solver = cfjax.RKMK8()
 pole = np.array([0.0, 0.0, 1.0])
 
 # `vector`, shape `(*times, 3)`, and `rotation`, shape `(*times, 3, 3)`.
