@@ -272,6 +272,18 @@ class AbstractCoordinates(AbstractFrozenField):
         there is such an end.
         """
 
+    def kept(self, start: Any) -> Array | None:
+        """What the ends of all steps have in common with the start of a solve, which `keeping`
+        takes; None, the default, where each step keeps what there is at its own start.
+        """
+
+    def keeping(self, kept: Array) -> Any:
+        """The same coordinates, whose `landing` restores what is kept.
+
+        In single precision rounding would otherwise add up, as it is alike in steps that are alike.
+        """
+        raise NotImplementedError
+
 
 class Rest(AbstractAlgebraElement):
     """The field of a part of the state that a term does not move: there a user writes None.
@@ -528,6 +540,24 @@ def landing(field: PyTree, start: PyTree) -> tuple[PyTree, Bool[Array, ""]]:
     pairs = list(map(part, fields, treedef.flatten_up_to(start)))
     is_there = functools.reduce(jnp.logical_and, [x for _, x in pairs], jnp.asarray(True))
     return treedef.unflatten([increment for increment, _ in pairs]), is_there
+
+
+def kept(field: PyTree, start: PyTree) -> PyTree:
+    """What `keeping` takes, part by part."""
+    return jtu.tree_map(
+        lambda f, p: f.kept(p) if isinstance(f, AbstractCoordinates) else None,
+        field,
+        start,
+        is_leaf=is_field,
+    )
+
+
+def keeping(field: PyTree, kept: PyTree) -> PyTree:
+    """A field in such coordinates, whose `landing` restores what is kept of the start."""
+    fields, treedef = jtu.tree_flatten(field, is_leaf=is_field)
+    parts = jtu.tree_leaves(kept, is_leaf=lambda x: x is None)
+    pairs = zip(fields, parts, strict=True)
+    return treedef.unflatten([f if x is None else f.keeping(x) for f, x in pairs])
 
 
 def _no_coordinates_message(name: str, field: AbstractFrozenField) -> str:

@@ -4,6 +4,7 @@
 """
 
 from collections.abc import Callable
+from dataclasses import replace
 from typing import Any, ClassVar
 
 import equinox as eqx
@@ -21,6 +22,7 @@ from .._numerics.cayley import (
     without_turns,
 )
 from .._numerics.lengths import length_correction, vector_of_length
+from .._numerics.matmul import small_product
 from .._numerics.polar import phase_correction, polar_correction, polar_correction_of_rows
 from .._numerics.squaring import magnitude
 from .._numerics.vectors import entries, pack, placed
@@ -49,9 +51,16 @@ class OfLength(AbstractProjected):
 
     v: Real[Array, "*batch n"]
     is_unit: bool = eqx.field(static=True)
+    square: Real[Array, ""] | None = None
+
+    def kept(self, start: Array) -> Array | None:
+        return None if self.is_unit else jnp.sum(start * start)
+
+    def keeping(self, kept: Array) -> "OfLength":
+        return replace(self, square=kept)
 
     def landing(self, start: Array) -> tuple[Array, Bool[Array, ""]]:
-        return vector_of_length(start, self.v, self.is_unit)
+        return vector_of_length(start, self.v, self.is_unit, self.square)
 
 
 class Pose(AbstractProjected):
@@ -127,6 +136,7 @@ class Polar(AbstractProjected):
     - `trace`: that of the matrix, if the determinant of points is to follow it; or None.
     - `are_orthonormal`: whether the columns are orthonormal at the end, instead of keeping their
       products.
+    - `products`: those that the columns keep, or None for those at the start of the step.
     """
 
     v: Inexact[Array, "..."]
@@ -134,6 +144,16 @@ class Polar(AbstractProjected):
     trace: Complex[Array, "*batch"] | None = None
     are_rows: bool = eqx.field(static=True, default=False)
     are_orthonormal: bool = eqx.field(static=True, default=False)
+    products: Inexact[Array, "k k"] | None = None
+
+    def kept(self, start: Array) -> Array | None:
+        columns = self._columns(start)
+        if self.are_orthonormal or columns.shape[1] > len(columns):
+            return None
+        return small_product(columns.conj().T, columns)
+
+    def keeping(self, kept: Array) -> "Polar":
+        return replace(self, products=kept)
 
     def has_rate(self) -> Bool[Array, ""]:
         # A sum of fields of which one has no value here has none either.
@@ -145,7 +165,7 @@ class Polar(AbstractProjected):
         if columns.shape[1] > len(columns):
             v, is_there = polar_correction_of_rows(columns, v)
         else:
-            v, is_there = polar_correction(columns, v, self.are_orthonormal)
+            v, is_there = polar_correction(columns, v, self.are_orthonormal, self.products)
         if self.trace is not None:
             v = phase_correction(columns, v, self.trace)
         v = v.T if self.are_rows else v

@@ -284,3 +284,10 @@ class ElementwiseCoordinates(Elementwise, AbstractCoordinates):
         # With 3 x 3 matrices and RKMK8 the program of single numbers has 29 000 instructions in
         # place of 800, and takes three times as long.
         return increment, kept_on_arrays(jnp.all(is_there))
+
+    def kept(self, start: Any) -> Array | None:
+        return self._each(lambda u, start: u.kept(start))(self.field, start)
+
+    def keeping(self, kept: Array) -> Any:
+        field = self._each(lambda u, kept: u.keeping(kept))(self.field, kept)
+        return elementwise(field, self.num_axes)

@@ -11,18 +11,24 @@ from .vectors import Vector, entries, pack, smooth
 
 
 @smooth
-def length_correction(y: Vector, v: Vector, is_unit: bool) -> tuple[Vector, Bool[Array, ""]]:
+def length_correction(
+    y: Vector, v: Vector, is_unit: bool, kept: Real[Array, ""] | None = None
+) -> tuple[Vector, Bool[Array, ""]]:
     """v so corrected that `y + v` has the length of y, and whether there is such a vector.
 
     There is none where `y + v` is off by more than half of its own length. With `is_unit` the
-    length is 1, which that of y must be but for a small error. Vectors are given by their entries.
-    The correction is as small as what it corrects, and so is its rounding.
+    length is 1, which that of y must be but for a small error. With `kept` it is the root of that,
+    from which the length of y differs by rounding, whose derivative is not taken. Vectors are given
+    by their entries. The correction is as small as what it corrects, and so is its rounding.
     """
     square = _sum([a * a for a in y])
     e = _sum([(a + a + b) * b for a, b in zip(y, v, strict=True)])
     if is_unit:
         e = e + (square - 1)
     else:
+        if kept is not None:
+            off = lax.stop_gradient(square - kept)
+            e, square = e + off, square - off
         # A vector of length zero does not move.
         e = e / jnp.where(square == 0, 1, square)
     ratio = lax.stop_gradient(1 + e)
@@ -34,13 +40,16 @@ def length_correction(y: Vector, v: Vector, is_unit: bool) -> tuple[Vector, Bool
 
 
 def vector_of_length(
-    y: Real[Array, " n"], v: Real[Array, " n"], is_unit: bool
+    y: Real[Array, " n"],
+    v: Real[Array, " n"],
+    is_unit: bool,
+    kept: Real[Array, ""] | None = None,
 ) -> tuple[Real[Array, " n"], Bool[Array, ""]]:
     """The same for arrays."""
     if len(y) <= 4:
-        corrected, is_there = length_correction(entries(y), entries(v), is_unit)
+        corrected, is_there = length_correction(entries(y), entries(v), is_unit, kept)
         return pack(corrected, sums=True), is_there
-    (corrected,), is_there = length_correction([y], [v], is_unit)
+    (corrected,), is_there = length_correction([y], [v], is_unit, kept)
     return corrected, is_there
 
 

@@ -1,5 +1,7 @@
 """The nearest columns with given products."""
 
+from collections.abc import Callable
+
 import jax.numpy as jnp
 from jax import lax
 from jaxtyping import Array, Bool, Complex, Inexact, Real
@@ -10,28 +12,37 @@ from .span import square
 from .squaring import max_over_batch
 from .vectors import unpack
 
-# Each squares the defect, times 3/4. From a defect of 0.3 on five of them do not lead to rounding.
-_MOST = 5
+# Each cubes the defect, times 5/8. Four of them lead to rounding from a defect of -0.6 to 0.8.
+_MOST = 4
 
 
 def polar_correction(
-    y: Inexact[Array, "n k"], v: Inexact[Array, "n k"], are_orthonormal: bool
+    y: Inexact[Array, "n k"],
+    v: Inexact[Array, "n k"],
+    are_orthonormal: bool,
+    products: Inexact[Array, "k k"] | None = None,
 ) -> tuple[Inexact[Array, "n k"], Bool[Array, ""]]:
     """v so corrected that the columns `y + v` have the products of those of y; and whether they do.
 
     With `are_orthonormal` they are orthonormal, which y must be up to a small error; otherwise y
-    must have full rank. The defect `e = (y + v)^H (y + v) - y^H y` is as small as v, and so is its
-    rounding. One correction is `v - (y + v) g^-1 e / 2` with `g = y^H y`. The next follows if e was
-    above a hundredth of the root of a unit of rounding.
+    must have full rank. With `products` they have these, from which those of y differ by rounding
+    and whose derivative is not taken. The defect `e = (y + v)^H (y + v) - y^H y` is as small as v,
+    and so is its rounding. One correction is `v - (y + v) (f / 2 - 3/8 f^2)` with `f = g^-1 e` and
+    `g = y^H y`, Taylor's polynomial of the inverse of the root of `1 + f`. The next follows if f
+    was above a 25th of the cube root of a unit of rounding.
     """
     gram = square(y) if are_orthonormal else _times(y.conj().T, y)
     eye = jnp.eye(len(gram), dtype=gram.dtype)
-    distance = gram - eye
+    distance = 0
+    if are_orthonormal:
+        distance = gram - eye
+    elif products is not None:
+        distance = lax.stop_gradient(gram - products)
     eps = float(jnp.finfo(gram.dtype).eps)
     if are_orthonormal:
         relative = lambda e: e  # noqa: E731
     else:
-        is_identity = max_over_batch(_size(distance)) <= 1e3 * eps
+        is_identity = max_over_batch(_size(gram - eye)) <= 1e3 * eps
         inverse = lax.cond(is_identity, lambda gram: eye, jnp.linalg.inv, gram)
 
         def relative(e: Array) -> Array:
@@ -40,20 +51,10 @@ def polar_correction(
     def correct(v: Array) -> tuple[Array, Real[Array, ""]]:
         half = _times((y + v / 2).conj().T, v)
         e = half + half.conj().T
-        e = relative(e + distance if are_orthonormal else e)
-        return v - _times(y + v, e) / 2, _size(e)
+        e = relative(e + distance)
+        return v - _times(y + v, _half(e)), _size(e)
 
-    # The correction after a defect of this size leaves a defect of rounding; but over many steps
-    # these add up, as all have one sign.
-    bound = 0.25 * eps**0.5
-
-    def turn(carry: tuple[Array, Real[Array, ""]], _: None) -> tuple[tuple[Array, Array], None]:
-        v, size = carry
-        is_needed = max_over_batch(size) > 0.01 * eps**0.5
-        return lax.cond(is_needed, correct, lambda v: (v, size), v), None
-
-    (v, size), _ = lax.scan(turn, correct(v), length=_MOST - 1)
-    return v, size <= bound
+    return _corrected(correct, v)
 
 
 def polar_correction_of_rows(
@@ -66,8 +67,36 @@ def polar_correction_of_rows(
     y, v = promoted(y, v)
     adjoint = y.conj().T
     taken = _times(_times(v, adjoint), jnp.linalg.inv(_times(y, adjoint)))
-    taken, is_there = polar_correction(jnp.eye(len(y), dtype=y.dtype), taken, are_orthonormal=True)
+
+    def correct(v: Array) -> tuple[Array, Real[Array, ""]]:
+        # Not by the products of 1 + v/2, whose rounding is the same in all steps, and would add up.
+        e = v + v.conj().T + _times(v.conj().T, v)
+        half = _half(e)
+        return v - (half + _times(v, half)), _size(e)
+
+    taken, is_there = _corrected(correct, taken)
     return _times(taken, y), is_there
+
+
+def _corrected(
+    correct: Callable[[Array], tuple[Array, Real[Array, ""]]], v: Array
+) -> tuple[Array, Bool[Array, ""]]:
+    """v after as many corrections as it needs, and whether these are enough.
+
+    `correct(v)` returns v after a correction, and the defect before.
+    """
+    eps = float(jnp.finfo(v.dtype).eps)
+    # The correction after a defect of this size leaves a defect of rounding; but over many steps
+    # these add up, as all have one sign, and no further correction is above the rounding of v.
+    bound = 0.4 * eps ** (1 / 3)
+
+    def turn(carry: tuple[Array, Real[Array, ""]], _: None) -> tuple[tuple[Array, Array], None]:
+        v, size = carry
+        is_needed = max_over_batch(size) > bound / 10
+        return lax.cond(is_needed, correct, lambda v: (v, size), v), None
+
+    (v, size), _ = lax.scan(turn, correct(v), length=_MOST - 1)
+    return v, size <= bound
 
 
 def phase_correction(
@@ -96,6 +125,11 @@ def _phase_of_determinant(m: Complex[Array, "n n"]) -> Complex[Array, ""]:
     cyclic = (0, 1, 2), (1, 2, 0), (2, 0, 1)
     a, b, c = (x[i] * (x[3 + j] * x[6 + k] - x[3 + k] * x[6 + j]) for i, j, k in cyclic)
     return a + b + c
+
+
+def _half(e: Inexact[Array, "k k"]) -> Inexact[Array, "k k"]:
+    """`1 - (1 + e)^(-1/2)` up to the third power of e."""
+    return e / 2 - 0.375 * _times(e, e)
 
 
 def _size(x: Array) -> Real[Array, ""]:

@@ -233,7 +233,7 @@ class State(eqx.Module):
     - `first`: the value of the field at the start of the next step, if the last step ended with it.
     - `zero`: carries the checks of the start. Every step uses it, as otherwise diffrax would drop
       it.
-    - `kept`: values at the start of the solve that stay what they are, or None.
+    - `kept`: what stays as it is at the start of the solve, or None.
     """
 
     compensation: PyTree

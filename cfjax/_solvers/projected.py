@@ -14,7 +14,7 @@ from jax.flatten_util import ravel_pytree
 from jaxtyping import Array, Bool, PyTree, Real
 
 from .._control_term import is_driven
-from .._field import AbstractCoordinates, has_rate, in_coordinates, is_field, landing
+from .._field import AbstractCoordinates, has_rate, in_coordinates, is_field, keeping, kept, landing
 from .._fields.coordinates import BesideCayley
 from .._fields.elementwise import ElementwiseCoordinates, elementwise
 from .._term import product
@@ -88,7 +88,8 @@ class Projected(AbstractRungeKutta, diffrax.AbstractAdaptiveSolver):
 
     name: str = eqx.field(static=True)
     invariants: Invariants | None = eqx.field(static=True, default=None)
-    # Of the end of a step: its time, `args`, and what invariants are to be.
+    # Of the end of a step: its time, `args`, what it has in common with the start, and what
+    # invariants are to be.
     target: PyTree = eqx.field(default=None, repr=False)
 
     def __init__(
@@ -120,26 +121,27 @@ class Projected(AbstractRungeKutta, diffrax.AbstractAdaptiveSolver):
     def start(self, terms, t0, t1, y0, args):
         state, fault = super().start(terms, t0, t1, y0, args)
         field = product(terms, terms.vf(t0, y0, args), terms.contr(t0, t1))
-        has_step = has_rate(in_coordinates("projected", lax.stop_gradient(field), y0))
+        field, start = lax.stop_gradient((field, y0))
+        field = in_coordinates("projected", field, start)
+        has_step = has_rate(field)
         if has_step is not None:
             fault = fault.with_case(~has_step, _NOT_SKEW)
+        values = None
         if self.invariants is not None:
-            state = replace(state, kept=_values(self.invariants, t0, y0, args))
-        return state, fault
+            values = _values(self.invariants, t0, y0, args)
+        return replace(state, kept=(kept(field, start), values)), fault
 
     def step(self, terms, t0, t1, y0, args, solver_state, made_jump):
-        solver: Any = self
-        if self.invariants is not None:
-            solver = self._with(target=(t1, args, solver_state.kept))
+        solver: Any = self._with(target=(t1, args, *solver_state.kept))
         return AbstractRungeKutta.step(solver, terms, t0, t1, y0, args, solver_state, made_jump)
 
     def end_of(self, chart, v):
-        end, is_there = super().end_of(chart, v)
+        t1, args, of_start, values = self.target
+        end, is_there = super().end_of(chart, keeping(v, of_start))
         if self.invariants is None:
             return end, is_there
-        t1, args, kept = self.target
         correction, is_kept = _correction(
-            lambda y: _values(self.invariants, t1, y, args), kept, v, chart.sums.state(end)
+            lambda y: _values(self.invariants, t1, y, args), values, v, chart.sums.state(end)
         )
         correction = plus_zero(correction, zero_or_nan(is_kept, v))
         is_there = is_kept if is_there is None else is_there & is_kept

@@ -41,6 +41,15 @@ def test_it_leads_to_length_one():
     assert abs(np.linalg.norm(y + found) - 1) < 3e-16
 
 
+@pytest.mark.parametrize("n", [3, 6])
+def test_a_length_of_before_is_restored(n):
+    start, v = jnp.asarray(RNG.normal(size=(2, n)))
+    y = start * (1 + 1e-9)
+    found, _ = vector_of_length(y, 0.1 * v, False, start @ start)
+    # Two roundings of the length.
+    assert abs(np.linalg.norm(y + found) / np.linalg.norm(start) - 1) < 5e-16
+
+
 def test_there_is_none_more_than_half_of_the_length_away():
     y = jnp.asarray([0.0, 2.0, 0.0])
     for factor, expected in [(0.66, False), (0.67, True), (1.99, True), (2.01, False)]:

@@ -57,6 +57,19 @@ def test_columns_become_the_nearest_ones_or_keep_their_products(subtests):
                 assert np.linalg.norm(found - step) < 2 * np.linalg.norm(step)
 
 
+def test_products_of_before_are_restored():
+    """The start is off them by what rounding may add up to, and so is the end without them."""
+    start, direction = matrices.random((7, 3), 1), 1e-3 * matrices.random((7, 3), 2)
+    products = jnp.asarray(start.T @ start)
+    y = start + 1e-9 * matrices.random((7, 3), 3)
+    for given, error in [(products, 0.0), (None, 1e-9)]:
+        found, is_there = polar_correction(jnp.asarray(y), jnp.asarray(direction), False, given)
+        off = np.abs((y + found).T @ (y + found) - products).max()
+        assert is_there
+        # Some roundings of products up to 20.
+        assert error <= off < 20 * error + 2e-14
+
+
 def test_rounding_is_as_small_as_the_step():
     """Over many steps what is left adds up, so it must be below the rounding of the products."""
     y = matrices.random((6, 3), 1)
