@@ -13,6 +13,7 @@ import jax
 
 from . import scenes
 from ._measure.extra import paper_extra
+from ._measure.small_loops import compile_small_loops
 from .scenes._scene import Scene
 
 _SCENES = {
@@ -50,6 +51,8 @@ class _Parser(argparse.ArgumentParser):
 
 def main(argv: Sequence[str] | None = None) -> int:
     """Runs one command and returns the exit status. Bad arguments exit with status 2."""
+    if argv is None:
+        compile_small_loops()
     parser = _Parser(
         prog="cfjax",
         description="Commutator-free Lie group integrators for JAX.",

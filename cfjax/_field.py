@@ -555,8 +555,7 @@ def kept(field: PyTree, start: PyTree) -> PyTree:
 def keeping(field: PyTree, kept: PyTree) -> PyTree:
     """A field in such coordinates, whose `landing` restores what is kept of the start."""
     fields, treedef = jtu.tree_flatten(field, is_leaf=is_field)
-    parts = jtu.tree_leaves(kept, is_leaf=lambda x: x is None)
-    pairs = zip(fields, parts, strict=True)
+    pairs = zip(fields, treedef.flatten_up_to(kept), strict=True)
     return treedef.unflatten([f if x is None else f.keeping(x) for f, x in pairs])
 
 
