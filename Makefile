@@ -5,7 +5,7 @@ PYTEST := -m pytest --numprocesses auto --dist worksteal
 # Each solver and each field once, what the code relies on in jax, equinox and diffrax, and imports.
 QUICK := tests/test_quick.py tests/xla/test_struct_of_arrays.py tests/test_canary.py tests/test_public.py tests/test_architecture.py
 
-.PHONY: paper lint suite test test-all test-quick test-lowest test-newest coverage mutations benchmarks benchmark-gpu pages docs clean
+.PHONY: paper lint suite test test-all test-quick test-lowest test-newest coverage mutations benchmarks benchmark-gpu benchmark-older pages docs clean
 
 # Tables and figures of the paper, in figures/.
 paper: .venv/paper
@@ -42,12 +42,17 @@ test-newest:
 	.venv-newest/bin/python -m pip install --quiet --upgrade --upgrade-strategy eager --editable '.[dev]'
 	.venv-newest/bin/python $(PYTEST)
 
-# Measures everything anew, one after the other, for the pages. ARGS=--quick is rough, and quicker.
-BENCHMARKS := rigid_body tolerances attitude million_steps gradients fits fields leading_axes compile first_call second_process getting_started chain expm unitary heat stiff stabilised coordinates batch charts stability energy noise noise_lattice quantum lindblad operators variations peers scenes
+# Measures everything anew, one after the other, for the pages: on Python 3.12 or newer, for the
+# newest jax, and on a machine with nothing else to do. ARGS=--quick is rough, and quicker.
+BENCHMARKS := rigid_body equal_error tolerances million_steps gradients fits fields leading_axes compile first_call second_process getting_started chain expm unitary heat stiff stabilised coordinates batch charts stability energy noise noise_steps noise_lattice quantum lindblad operators variations peers scenes
 benchmarks: .venv/dev
 	@$(BIN)/python benchmarks/results.py
 	for name in $(BENCHMARKS); do $(BIN)/python benchmarks/$$name.py $(ARGS) || exit 1; done
 	$(MAKE) pages
+
+# For the page on older JAX, with a Python whose newest jax is below 0.12.
+benchmark-older: .venv/dev
+	$(BIN)/python benchmarks/older_jax.py $(ARGS)
 
 # On a machine with a GPU, whose results are stored too.
 benchmark-gpu: .venv/dev

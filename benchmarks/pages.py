@@ -27,7 +27,12 @@ MARKED = re.compile(
 # Methods that the results have by their tableaus.
 SHORT = {"RKMK(Tsit5)": "RKMK5", "RKMK(Dopri8)": "RKMK8"}
 # Names of ways to solve in the pages.
-WAYS = {"controlled steps": "adaptive steps"}
+WAYS = {
+    "controlled steps": "adaptive steps",
+    "a scan by hand": "`jax.lax.scan` by hand",
+    "diffeqsolve": "`diffeqsolve`, `UnsafeBrownianPath`",
+    "diffeqsolve, tree": "`diffeqsolve`, `VirtualBrownianTree`",
+}
 # Benchmarks with pictures, and dots per inch.
 PICTURES = {
     "batch": 120,
@@ -160,14 +165,26 @@ def scenes_magnus() -> str:
     return _medians(row["over Tsit5"] for row in rows if "over Tsit5" in row)
 
 
+def _equal_error(kind: str) -> str:
+    """Of `Projected(Dopri8())` for attitudes and poses, which README recommends there."""
+    rows = pick(load("equal_error")["rows"], method="Projected, Dopri8", kind=kind, to=1e-8)
+    scenes = ("rigid body", "spacecraft", "given rate", "pose", "heavy top")
+    return _medians(row[_OVER_PLAIN] for row in rows if row["scene"] in scenes)
+
+
 @number
-def attitude_rkmk8() -> str:
-    rows = pick(load("attitude")["rows"], scene="spacecraft", to=1e-8)
-    return _medians(
-        row["over the better in plain space"]
-        for row in rows
-        if SHORT.get(row["method"], row["method"]) == "RKMK8"
-    )
+def equal_error_one() -> str:
+    return _equal_error("one")
+
+
+@number
+def equal_error_gradient() -> str:
+    return _equal_error("gradient")
+
+
+@number
+def equal_error_many() -> str:
+    return _equal_error("many")
 
 
 @number
@@ -229,16 +246,24 @@ def diffusion_gain() -> str:
 
 @number
 def machine() -> str:
-    stored = [load(name) for name in results.names()]
-    kinds = dict.fromkeys(
-        "{cores} cores of {processor}, {instructions}, Python {python}, jax {jax}, "
-        "diffrax {diffrax}, cfjax {cfjax}".format_map(results["machine"])
-        for results in stored
-    )
+    stored = [load(name) for name in results.names() if name != "older_jax"]
+    kinds = dict.fromkeys(_machine(results["machine"]) for results in stored)
     days = [results["machine"]["date"] for results in stored]
     when = " to ".join(dict.fromkeys((min(days), max(days))))
     rough = any(results["quick"] for results in stored)
     return f"{'; '.join(kinds)}; {when}" + ", with `--quick`, so rough" * rough
+
+
+def _machine(facts: dict[str, object]) -> str:
+    return (
+        "{cores} cores of {processor}, {instructions}, Python {python}, jax {jax}, "
+        "diffrax {diffrax}, cfjax {cfjax}"
+    ).format_map(facts)
+
+
+@number
+def older_machine() -> str:
+    return _machine(load("older_jax")["machine"])
 
 
 @table
@@ -295,17 +320,65 @@ def scenes() -> list[list[str]]:
     return table
 
 
+_OVER_PLAIN = "over the better in plain space"
+# Of programs of the benchmark of equal errors.
+KINDS = {"one": "one system", "gradient": "its gradient", "many": "each of 1000"}
+
+
+def _method(name: str) -> str:
+    """As a user writes it."""
+    kind, _, inner = name.partition(", ")
+    match kind:
+        case "Projected":
+            return f"`Projected(diffrax.{inner}())`"
+        case "diffrax":
+            return f"`diffrax.{inner}`, in plain space"
+    return f"`{kind}`" + (", Cayley's coordinates" if inner else "")
+
+
 @table
-def attitude() -> list[list[str]]:
-    rows = load("attitude")["rows"]
-    counts = values(rows, "systems")
-    table = [["", "error", "method", "steps", *(f"time, {systems(n)}" for n in counts)]]
-    keys = (values(rows, key) for key in ("scene", "to", "method"))
-    for scene, error, method in itertools.product(*keys):
-        of_method = [one(rows, scene=scene, to=error, method=method, systems=n) for n in counts]
-        (steps,) = {row["steps"] for row in of_method}
-        times = [cell(row["over the better in plain space"]) for row in of_method]
-        table.append([scene, power(error), code(method), str(steps), *times])
+def equal_errors() -> list[list[str]]:
+    rows = load("equal_error")["rows"]
+    columns = [f"1e-8, {label}" for label in KINDS.values()]
+    table = [["", "method", "1e-5, one system", "steps to 1e-8", *columns]]
+    for row in pick(rows, to=1e-8, kind="one"):
+        if not row["method"].startswith("diffrax"):
+            same = pick(rows, scene=row["scene"], method=row["method"])
+            loose = one(same, to=1e-5)
+            found = {other["kind"]: cell(other[_OVER_PLAIN]) for other in pick(same, to=1e-8)}
+            times = [cell(loose[_OVER_PLAIN]), str(row["steps"]), *map(found.get, KINDS)]
+            table.append([row["scene"], _method(row["method"]), *(x or "" for x in times)])
+    return table
+
+
+@table
+def older_jax() -> list[list[str]]:
+    rows = pick(load("older_jax")["rows"], to=1e-8)
+    options = values(rows, "option")
+    columns = [f"{label}, {option}" for label in KINDS.values() for option in options]
+    table = [["", "method", *columns]]
+    for scene in values(rows, "scene"):
+        for method in values(pick(rows, scene=scene), "method"):
+            same = pick(rows, scene=scene, method=method)
+            times = [
+                in_units(one(same, kind=kind, option=option)["seconds"][2])
+                for kind in KINDS
+                for option in options
+            ]
+            table.append([scene, _method(method), *times])
+    return table
+
+
+@table
+def noise_in_equal_steps() -> list[list[str]]:
+    rows = load("noise_steps")["rows"]
+    kinds = values(rows, "kind")
+    table = [["method", "by", *kinds]]
+    for method in values(rows, "method"):
+        for way in values(pick(rows, method=method), "way"):
+            found = {row["kind"]: row for row in pick(rows, method=method, way=way)}
+            times = [in_units(found[k]["seconds"][2]) if k in found else "" for k in kinds]
+            table.append([f"`{method}`", WAYS.get(way) or code(way), *times])
     return table
 
 
