@@ -16,6 +16,7 @@ from .._numerics.expm import expm_parts
 from .._numerics.expm_multiply import Dense, expm_minus_one_multiply, row_norm
 from .._numerics.matmul import by_columns, plus_identity, promoted, small_product
 from .._numerics.squaring import max_over_batch
+from .._numerics.vectors import computed_once
 from .coordinates import Cayley, Polar, skew_defect
 from .elementwise import check_other, check_point, each, elementwise
 
@@ -89,10 +90,12 @@ class AbstractOneSided(AbstractMatrix):
     def projected(self, point: Inexact[Array, "..."]) -> Any:
         if self._num_axes:
             return elementwise(self, self._num_axes).projected(point)
-        velocity, trace = self.tangent(point), None
-        if jnp.iscomplexobj(velocity) and point.shape == self.a.shape:
-            trace = jnp.trace(self.a).astype(velocity.dtype)
-        return Polar(velocity, skew_defect(self.a), trace, are_rows=self.axis == -1)
+        # In a batch XLA would compute the matrix for each of these anew, entry by entry.
+        a = computed_once(self.a)
+        velocity, trace = type(self)(a).tangent(point), None
+        if jnp.iscomplexobj(velocity) and point.shape == a.shape:
+            trace = jnp.trace(a).astype(velocity.dtype)
+        return Polar(velocity, skew_defect(a), trace, are_rows=self.axis == -1)
 
     def cayley(self, point: Inexact[Array, "..."]) -> Any:
         trace = None
