@@ -37,7 +37,12 @@ STYLES: dict[str, dict[str, Any]] = {
     "one jax.vmap": dict(color="#000000", linestyle=":", marker="D"),
 }
 ADAPTIVE, TIMES, TOLERANCE = 1000, 21, 1e-7
-METHODS = {"CF54": cfjax.CF54(), "RKMK8": cfjax.RKMK8(), "Tsit5": diffrax.Tsit5()}
+METHODS = {
+    "CF54": cfjax.CF54(),
+    "RKMK8": cfjax.RKMK8(),
+    "Projected(Dopri8)": cfjax.Projected(diffrax.Dopri8()),
+    "Tsit5": diffrax.Tsit5(),
+}
 Member = Any  # Angular momentum and principal moments.
 
 

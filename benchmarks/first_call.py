@@ -15,7 +15,7 @@ if TYPE_CHECKING:
 
 PROBLEMS = ("rigid body", "spacecraft", "4 x 4 matrices", "Oja's flow on Stiefel(200, 5)")
 WAYS = ("fixed steps", "controlled steps")
-METHODS = ("Tsit5", "CF4", "CF54", "RKMK(Dopri8)")
+METHODS = ("Tsit5", "CF4", "CF54", "RKMK(Dopri8)", "Projected(Dopri8)")
 
 
 def fields(problem: str, xp: Any) -> tuple[Callable[..., Any], Callable[..., Any], Any]:
@@ -92,11 +92,12 @@ def solve(problem: str, method: str, way: str) -> None:
         import cfjax
 
         term = cfjax.LieTerm(frozen(cfjax))
-        solver = (
-            cfjax.RKMK(diffrax.Dopri8.tableau)
-            if method == "RKMK(Dopri8)"
-            else {"CF4": cfjax.CF4, "CF54": cfjax.CF54}[method]()
-        )
+        solver = {
+            "CF4": lambda: cfjax.CF4(),
+            "CF54": lambda: cfjax.CF54(),
+            "RKMK(Dopri8)": lambda: cfjax.RKMK8(),
+            "Projected(Dopri8)": lambda: cfjax.Projected(diffrax.Dopri8()),
+        }[method]()
     options: dict[str, Any] = {}
     if way == "controlled steps":
         options["stepsize_controller"] = diffrax.PIDController(rtol=0.0, atol=1e-6)

@@ -10,6 +10,7 @@ import time
 from collections.abc import Callable, Iterator
 from typing import Any
 
+import diffrax
 import jax
 import jax.numpy as jnp
 
@@ -44,12 +45,13 @@ SOLVERS = {
     "CF54": cfjax.CF54(),
     "RKMK5": cfjax.RKMK5(),
     "RKMK8": cfjax.RKMK8(),
+    "Projected(Dopri8)": cfjax.Projected(diffrax.Dopri8()),
 }
-# Whether it is rewritten, and how often the state is saved.
+# Whether one system is rewritten, and how often the state is saved.
 FORMS = {
-    "every step": (True, 1),
-    "every fifth": (True, 5),
-    "every step, not rewritten": (False, 1),
+    "every step": (False, 1),
+    "every fifth": (False, 5),
+    "every step, rewritten": (True, 1),
 }
 
 

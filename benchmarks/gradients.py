@@ -45,8 +45,8 @@ def in_space(field: Callable[..., Any]) -> diffrax.ODETerm:
     return diffrax.ODETerm(lambda t, y, args: cfjax.tangent(field(t, y, args), y))
 
 
-def by_cfjax(field: Callable[..., Any], y0: Any) -> Any:
-    return cfjax.integrate(cfjax.LieTerm(field), cfjax.CF4(), 0.0, END, y0, num_steps=STEPS)
+def by_cfjax(field: Callable[..., Any], solver: diffrax.AbstractSolver, y0: Any) -> Any:
+    return cfjax.integrate(cfjax.LieTerm(field), solver, 0.0, END, y0, num_steps=STEPS)
 
 
 def by_diffrax(term: Any, solver: diffrax.AbstractSolver, y0: Any) -> Any:
@@ -55,7 +55,10 @@ def by_diffrax(term: Any, solver: diffrax.AbstractSolver, y0: Any) -> Any:
 
 
 PROGRAMS: dict[str, Callable[[Callable[..., Any], Any], Any]] = {
-    "cfjax.integrate, CF4": by_cfjax,
+    "cfjax.integrate, CF4": lambda field, y0: by_cfjax(field, cfjax.CF4(), y0),
+    "cfjax.integrate, Projected(Tsit5)": lambda field, y0: by_cfjax(
+        field, cfjax.Projected(diffrax.Tsit5()), y0
+    ),
     "diffrax, CF4": lambda field, y0: by_diffrax(cfjax.LieTerm(field), cfjax.CF4(), y0),
     "diffrax, CF4(estimate=None)": lambda field, y0: by_diffrax(
         cfjax.LieTerm(field), cfjax.CF4(estimate=None), y0

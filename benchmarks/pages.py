@@ -145,7 +145,7 @@ def code(program: str) -> str:
     for measured, name in SHORT.items():
         program = program.replace(measured, name)
     return re.sub(
-        r"cfjax\.integrate|C[FG]\d+(\([\w=]+\))?|ETD\d+|(Magnus|RKMK)\d+|(Richardson|RKMK)\(\w+\)",
+        r"cfjax\.integrate|C[FG]\d+(\([\w=]+\))?|ETD\d+|(Magnus|RKMK)\d+|(Richardson|RKMK|Projected)\(\w+\)",
         r"`\g<0>`",
         program,
     )
@@ -390,6 +390,7 @@ def unit_quaternion() -> list[list[str]]:
     names = {
         "diffrax, Tsit5": "neither: `Tsit5` in plain space",
         "diffrax, Tsit5, projected": "divide by the norm: `Tsit5`, after each step",
+        "Projected(Dopri8)": "`QuaternionRotation` with `Projected(diffrax.Dopri8())`",
         "RKMK(Dopri8)": "`QuaternionRotation` with `RKMK8`",
         "CF4": "`QuaternionRotation` with `CF4`",
     }

@@ -175,6 +175,9 @@ def of_spacecraft() -> Scene:
         "RKMK(Dopri8)": Program(
             "cfjax", equal_steps(field, cfjax.RKMK(diffrax.Dopri8.tableau), t1), steps(12)
         ),
+        "Projected(Dopri8)": Program(
+            "cfjax", equal_steps(field, cfjax.Projected(diffrax.Dopri8()), t1), steps(12)
+        ),
         "diffrax, Tsit5": Program(
             "diffrax", in_plain_space(velocity, diffrax.Tsit5(), t1), steps(50)
         ),

@@ -127,7 +127,7 @@ COLORS = {
     "exponax": "#E69F00",
     "scipy": "#CC79A7",
 }
-MARKERS = "os^vDPX"
+MARKERS = "os^vDPX*<>hp"
 
 
 def draw() -> dict[str, Figure]:
@@ -137,7 +137,7 @@ def draw() -> dict[str, Figure]:
     for package, color in COLORS.items():
         package_rows = [row for row in rows if row["package"].startswith(package)]
         names = dict.fromkeys(row["program"] for row in package_rows)
-        for name, marker in zip(names, MARKERS, strict=False):
+        for name, marker in zip(names, MARKERS[: len(names)], strict=True):
             for scene, axes in panels.items():
                 curve = results.pick(package_rows, program=name, scene=scene)
                 curve = sorted(curve, key=lambda row: -row["error"])

@@ -39,8 +39,8 @@ TOLERANCES = (1e-4, 1e-6, 1e-8, 1e-11)
 TIMED = (1e-6, 1e-8, 1e-11)
 
 
-# Of fields of matrices and columns: with exponentials, and with stages in plain space.
-ON_MATRICES = cfjax.CF54(), *PROJECTED
+# Of fields of matrices, columns and spins: with exponentials, and with stages in plain space.
+WITH_CF54 = cfjax.CF54(), *PROJECTED
 
 
 class Scene(NamedTuple):
@@ -53,7 +53,7 @@ class Scene(NamedTuple):
 
 
 def scenes() -> dict[str, Scene]:
-    attitude, magnus = (cfjax.RKMK8(),), (cfjax.Magnus6(),)
+    attitude, magnus = (cfjax.RKMK8(), *PROJECTED), (cfjax.Magnus6(),)
     track, turning, flowing = covariance.problem(), spins.problem(), wilson_flow.problem()
     rod, fluid, tilted = heat.problem(), zeitlin.problem(), heavy_top.problem()
     return {
@@ -71,28 +71,28 @@ def scenes() -> dict[str, Scene]:
             heavy_top.velocity,
         ),
         "spins": Scene(
-            (cfjax.CF54(),),
+            WITH_CF54,
             turning,
             lambda: spins.reference(spins.t1, turning["y0"], turning["args"]),
             1e-12,
             spins.velocity,
         ),
         "Wilson flow": Scene(
-            ON_MATRICES,
+            WITH_CF54,
             flowing,
             lambda: wilson_flow.reference(wilson_flow.t1, flowing["y0"]),
             1e-12,
             wilson_flow.velocity,
         ),
         "Stiefel, first": Scene(
-            ON_MATRICES, stiefel.problem("first"), lambda: stiefel.reference("first", 100)
+            WITH_CF54, stiefel.problem("first"), lambda: stiefel.reference("first", 100)
         ),
         "Stiefel, second": Scene(
-            ON_MATRICES, stiefel.problem("second"), lambda: stiefel.reference("second", 100)
+            WITH_CF54, stiefel.problem("second"), lambda: stiefel.reference("second", 100)
         ),
-        "Toda": Scene(ON_MATRICES, toda.problem(), lambda: toda.reference(toda.t1)),
+        "Toda": Scene(WITH_CF54, toda.problem(), lambda: toda.reference(toda.t1)),
         "Zeitlin": Scene(
-            ON_MATRICES,
+            WITH_CF54,
             fluid,
             lambda: zeitlin.reference(zeitlin.t1, fluid["y0"]),
             1e-11,

@@ -35,6 +35,8 @@ SPACE = diffrax.ODETerm(lambda t, y, inertia: jnp.cross(y, y / inertia))
 METHODS: dict[str, tuple[Any, diffrax.AbstractSolver]] = {
     "diffrax, Tsit5, in plain space": (SPACE, diffrax.Tsit5()),
     "diffrax, Dopri8, in plain space": (SPACE, diffrax.Dopri8()),
+    "Projected(Tsit5)": (LIE, cfjax.Projected(diffrax.Tsit5())),
+    "Projected(Dopri8)": (LIE, cfjax.Projected(diffrax.Dopri8())),
     "CF4": (LIE, cfjax.CF4()),
     "CF43": (LIE, cfjax.CF43()),
     "CF54": (LIE, cfjax.CF54()),

@@ -14,7 +14,7 @@ from jaxtyping import PyTree
 from .._field import combine
 from .._methods.tableau import Product, Row, Tableau
 from .commutator_free import AbstractCommutatorFree, trimmed
-from .compiled import limits
+from .stacked import LARGE, MANY
 from .stages import Stages, is_uniform
 from .step import Chart
 
@@ -77,7 +77,7 @@ class AbstractLowStorage(AbstractCommutatorFree, diffrax.AbstractStratonovichSol
         size = sum(jnp.size(leaf) for leaf in jtu.tree_leaves(point))
         # Unrolled stages cost compile time quadratically. And XLA keeps the fields of several of
         # them, to add them up at once.
-        return len(self.b) <= limits.MANY and size <= 2 * limits.LARGE
+        return len(self.b) <= MANY and size <= 2 * LARGE
 
 
 def _tableau(a: Row, b: Row, embedded: Callable[[Product], Any] | None = None) -> Tableau:

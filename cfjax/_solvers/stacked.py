@@ -17,6 +17,18 @@ from .._numerics.matmul import matmul
 from .._numerics.vectors import pack
 from .compiled import limits, over_stages, scalarised, where_scalarised
 
+# The numbers of a large point. If a loop over stages is differentiated, it keeps the points of all
+# stages for each of its turns, which is too much memory for larger ones; and unrolled, XLA keeps
+# several fields to add them up at once, which is too much for those of twice as many. (scenes)
+LARGE = 2048
+# The numbers of a large array of a field. In a loop over stages, combinations of larger ones are
+# matrix products: with 1000 numbers a step takes a twentieth to a quarter less, with 64 as long.
+# (scenes)
+_LARGE_TERM = 512
+# More stages of a method are many. It is mostly not scalarised as a whole, and unrolled its time to
+# compile grows as the square of their number. (compile)
+MANY = 9
+
 
 def can_roll(unroll: bool | None, field: PyTree, point: PyTree) -> bool:
     """Whether flows of combinations of such fields may be one loop, and where `unroll` is None
@@ -169,7 +181,7 @@ def stack_with_zeros(tree: PyTree, n: int) -> PyTree:
 
 def combination_of(row: Weights, fields: Array) -> Array:
     fields = fields[: len(row.weights)]
-    if jnp.size(fields[0]) <= limits.LARGE_TERM:
+    if jnp.size(fields[0]) <= _LARGE_TERM:
         return _sum(row, fields)
     return where_scalarised(lambda: _sum(row, fields), lambda: _product(row.weights, fields))
 

@@ -11,8 +11,10 @@ from jaxtyping import Array, PyTree, Real
 
 from .._field import AbstractFrozenField, combine, is_field
 from .._methods.tableau import Product, Row
-from .compiled import chosen, limits, over_stages
+from .compiled import chosen, over_stages
 from .stacked import (
+    LARGE,
+    MANY,
     Stacked,
     Weights,
     can_roll,
@@ -37,7 +39,7 @@ def _can_roll_in_room(
     field = fields[-1]
     if unroll or not is_field(field) or type(field).room is AbstractFrozenField.room:
         return False
-    pays = unroll is False or size_of(chart.start) <= limits.LARGE
+    pays = unroll is False or size_of(chart.start) <= LARGE
     if not pays or any(x.span is not field.span for x in fields):
         return False
     room = field.room(chart.start, num_stages)
@@ -172,7 +174,7 @@ def rolled_elements(
     if not _can_roll_in_room(unroll, chart, stages, n):
         return None
     # The time of a bracket grows with the cube of the room: the first ones get a smaller room.
-    half = len(rows) // 2 if len(rows) > limits.MANY else 0
+    half = len(rows) // 2 if len(rows) > MANY else 0
     for chunk in (slice(half), slice(half, None)) if half else (slice(None),):
         m = len(stages) + len(rows[chunk])
         fields = _InRoom.of(stages, chart.start, m, m)

@@ -46,15 +46,3 @@ FLAT_ONE = 0 if _IS_NEW else 2 * _FUNCTION
 # The most operations of many systems: of a batch, or of short vectors along leading axes.
 # (gradients, batch, chain)
 FLAT_MANY = (20 if _IS_NEW else 2) * _FUNCTION
-# The numbers of a large point. If a loop over stages is differentiated, it keeps the points of all
-# stages for each of its turns, which is too much memory for larger ones; and unrolled, XLA keeps
-# several fields to add them up at once, which is too much for those of twice as many. (scenes)
-LARGE = 2048
-# The numbers of a large array of a field. In a loop over stages, combinations of larger ones are
-# matrix products: with 1000 numbers a step takes a twentieth to a quarter less, with 64 as long.
-# (scenes)
-LARGE_TERM = 512
-
-# More stages of a method are many. It is mostly not scalarised as a whole, and unrolled its time to
-# compile grows as the square of their number. (compile)
-MANY = 9

@@ -29,7 +29,7 @@ def test_options_of_the_user_stay():
 
 @pytest.mark.skipif(IS_NEW, reason="XLA does so without an option.")
 def test_a_loop_is_one_function():
-    """The loop over steps of 60 spins, in a process that has set the option, and in one that has not."""
+    """The loop over steps of 60 spins, in processes with the option and without."""
     code = """
 import sys
 from cfjax._measure.small_loops import compile_small_loops

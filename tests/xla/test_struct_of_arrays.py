@@ -11,7 +11,8 @@ from jax import lax
 from xla.interpreter import lowered, run
 
 import cfjax
-from cfjax._xla import limits, program, scalarised
+from cfjax._solvers.stacked import LARGE
+from cfjax._xla import program, scalarised
 from cfjax._xla.program import join, split
 from cfjax._xla.scope import is_rows
 from cfjax._xla.struct_of_arrays import StructOfArrays, static_value, struct_of_arrays
@@ -249,7 +250,7 @@ def test_flows_of_a_step_are_computed_once():
 def test_a_solve_of_many_vectors():
     """Their combinations are products of matrices where they are not rewritten."""
     y = np.random.default_rng(1).normal(size=(40, 20, 3))
-    assert y.size > limits.LARGE
+    assert y.size > LARGE
     term = cfjax.LieTerm(lambda t, y, args: cfjax.Rotation(jnp.roll(y, 1, 0) + jnp.cos(t)))
     end = lambda y: cfjax.integrate(term, cfjax.CF2(), 0.0, 0.4, y, num_steps=3).ys[-1]  # noqa: E731
     found = jax.jit(end, compiler_options=problems.QUICK)(y)
