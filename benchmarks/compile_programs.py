@@ -133,7 +133,6 @@ METHODS = {
     "CF4": cfjax.CF4(),
     "CF54": cfjax.CF54(),
     "RKMK8": cfjax.RKMK(diffrax.Dopri8.tableau),
-    "Projected(Dopri8)": cfjax.Projected(diffrax.Dopri8()),
 }
 MATRIX = np.random.default_rng(0).normal(size=(4, 4))
 

@@ -272,12 +272,12 @@ class AbstractCoordinates(AbstractFrozenField):
         there is such an end.
         """
 
-    def kept(self, start: Any) -> Array | None:
+    def kept(self, start: Any) -> PyTree[Array] | None:
         """What the ends of all steps have in common with the start of a solve, which `keeping`
         takes; None, the default, where each step keeps what there is at its own start.
         """
 
-    def keeping(self, kept: Array) -> Any:
+    def keeping(self, kept: PyTree[Array]) -> Any:
         """The same coordinates, whose `landing` restores what is kept.
 
         In single precision rounding would otherwise add up, as it is alike in steps that are alike.

@@ -22,8 +22,12 @@ from .._numerics.cayley import (
     without_turns,
 )
 from .._numerics.lengths import length_correction, vector_of_length
-from .._numerics.matmul import small_product
-from .._numerics.polar import phase_correction, polar_correction, polar_correction_of_rows
+from .._numerics.polar import (
+    Products,
+    phase_correction,
+    polar_correction,
+    polar_correction_of_rows,
+)
 from .._numerics.squaring import magnitude
 from .._numerics.vectors import entries, pack, placed
 
@@ -144,15 +148,15 @@ class Polar(AbstractProjected):
     trace: Complex[Array, "*batch"] | None = None
     are_rows: bool = eqx.field(static=True, default=False)
     are_orthonormal: bool = eqx.field(static=True, default=False)
-    products: Inexact[Array, "k k"] | None = None
+    products: Products | None = None
 
-    def kept(self, start: Array) -> Array | None:
+    def kept(self, start: Array) -> Products | None:
         columns = self._columns(start)
         if self.are_orthonormal or columns.shape[1] > len(columns):
             return None
-        return small_product(columns.conj().T, columns)
+        return Products.of(columns)
 
-    def keeping(self, kept: Array) -> "Polar":
+    def keeping(self, kept: Products) -> "Polar":
         return replace(self, products=kept)
 
     def has_rate(self) -> Bool[Array, ""]:

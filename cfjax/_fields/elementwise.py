@@ -285,9 +285,9 @@ class ElementwiseCoordinates(Elementwise, AbstractCoordinates):
         # place of 800, and takes three times as long.
         return increment, kept_on_arrays(jnp.all(is_there))
 
-    def kept(self, start: Any) -> Array | None:
+    def kept(self, start: Any) -> PyTree[Array] | None:
         return self._each(lambda u, start: u.kept(start))(self.field, start)
 
-    def keeping(self, kept: Array) -> Any:
+    def keeping(self, kept: PyTree[Array]) -> Any:
         field = self._each(lambda u, kept: u.keeping(kept))(self.field, kept)
         return elementwise(field, self.num_axes)

@@ -1,8 +1,11 @@
 """The nearest columns with given products."""
 
 from collections.abc import Callable
+from typing import Any, NamedTuple
 
+import jax
 import jax.numpy as jnp
+import numpy as np
 from jax import lax
 from jaxtyping import Array, Bool, Complex, Inexact, Real
 
@@ -10,48 +13,53 @@ from .cayley import without_turns
 from .matmul import promoted, small_product
 from .span import square
 from .squaring import max_over_batch
-from .vectors import unpack
+from .vectors import chosen, over_stages, unpack, where_scalarised
 
 # Each cubes the defect, times 5/8. Four of them lead to rounding from a defect of -0.6 to 0.8.
 _MOST = 4
+
+
+class Products(NamedTuple):
+    """The products of columns with each other, and the inverse of their matrix."""
+
+    products: Inexact[Array, "k k"]
+    inverse: Inexact[Array, "k k"]
+
+    @classmethod
+    def of(cls, y: Inexact[Array, "n k"]) -> "Products":
+        products = _times(y.conj().T, y)
+        return cls(products, jnp.linalg.inv(products))
 
 
 def polar_correction(
     y: Inexact[Array, "n k"],
     v: Inexact[Array, "n k"],
     are_orthonormal: bool,
-    products: Inexact[Array, "k k"] | None = None,
+    kept: Products | None = None,
 ) -> tuple[Inexact[Array, "n k"], Bool[Array, ""]]:
     """v so corrected that the columns `y + v` have the products of those of y; and whether they do.
 
     With `are_orthonormal` they are orthonormal, which y must be up to a small error; otherwise y
-    must have full rank. With `products` they have these, from which those of y differ by rounding
-    and whose derivative is not taken. The defect `e = (y + v)^H (y + v) - y^H y` is as small as v,
-    and so is its rounding. One correction is `v - (y + v) (f / 2 - 3/8 f^2)` with `f = g^-1 e` and
-    `g = y^H y`, Taylor's polynomial of the inverse of the root of `1 + f`. The next follows if f
-    was above a 25th of the cube root of a unit of rounding.
+    must have full rank. With `kept` they have these products, from which those of y differ by
+    rounding and whose derivative is not taken. The defect `e = (y + v)^H (y + v) - y^H y` is as
+    small as v, and so is its rounding. One correction is `v - (y + v) (f / 2 - 3/8 f^2)` with
+    `f = g^-1 e` and `g = y^H y`, Taylor's polynomial of the inverse of the root of `1 + f`. Others
+    follow if f was above a 25th of the cube root of a unit of rounding.
     """
-    gram = square(y) if are_orthonormal else _times(y.conj().T, y)
-    eye = jnp.eye(len(gram), dtype=gram.dtype)
-    distance = 0
+    distance, inverse = 0, None
     if are_orthonormal:
-        distance = gram - eye
-    elif products is not None:
-        distance = lax.stop_gradient(gram - products)
-    eps = float(jnp.finfo(gram.dtype).eps)
-    if are_orthonormal:
-        relative = lambda e: e  # noqa: E731
+        gram = square(y)
+        distance = gram - jnp.eye(len(gram), dtype=gram.dtype)
+    elif kept is None:
+        inverse = Products.of(y).inverse
     else:
-        is_identity = max_over_batch(_size(gram - eye)) <= 1e3 * eps
-        inverse = lax.cond(is_identity, lambda gram: eye, jnp.linalg.inv, gram)
-
-        def relative(e: Array) -> Array:
-            return lax.cond(is_identity, lambda e: e, lambda e: _times(inverse, e), e)
+        gram = _times(y.conj().T, y)
+        distance, inverse = lax.stop_gradient(gram - kept.products), _inverse(gram, kept.inverse)
 
     def correct(v: Array) -> tuple[Array, Real[Array, ""]]:
         half = _times((y + v / 2).conj().T, v)
-        e = half + half.conj().T
-        e = relative(e + distance)
+        e = half + half.conj().T + distance
+        e = e if inverse is None else _times(inverse, e)
         return v - _times(y + v, _half(e)), _size(e)
 
     return _corrected(correct, v)
@@ -81,7 +89,8 @@ def polar_correction_of_rows(
 def _corrected(
     correct: Callable[[Array], tuple[Array, Real[Array, ""]]], v: Array
 ) -> tuple[Array, Bool[Array, ""]]:
-    """v after as many corrections as it needs, and whether these are enough.
+    """v after a correction, or after four where one is not enough or all are on single numbers; and
+    whether these are enough.
 
     `correct(v)` returns v after a correction, and the defect before.
     """
@@ -90,12 +99,13 @@ def _corrected(
     # these add up, as all have one sign, and no further correction is above the rounding of v.
     bound = 0.4 * eps ** (1 / 3)
 
-    def turn(carry: tuple[Array, Real[Array, ""]], _: None) -> tuple[tuple[Array, Array], None]:
-        v, size = carry
-        is_needed = max_over_batch(size) > bound / 10
-        return lax.cond(is_needed, correct, lambda v: (v, size), v), None
+    def turn(carry: tuple[Array, Array], _: Any) -> tuple[tuple[Array, Array], None]:
+        return correct(carry[0]), None
 
-    (v, size), _ = lax.scan(turn, correct(v), length=_MOST - 1)
+    once = correct(v)
+    more = lambda: over_stages(turn, once, np.arange(1, _MOST))[0]  # noqa: E731
+    as_needed = lambda: chosen(max_over_batch(once[1]) > bound / 10, more, lambda: once)  # noqa: E731
+    v, size = where_scalarised(more, as_needed)
     return v, size <= bound
 
 
@@ -125,6 +135,18 @@ def _phase_of_determinant(m: Complex[Array, "n n"]) -> Complex[Array, ""]:
     cyclic = (0, 1, 2), (1, 2, 0), (2, 0, 1)
     a, b, c = (x[i] * (x[3 + j] * x[6 + k] - x[3 + k] * x[6 + j]) for i, j, k in cyclic)
     return a + b + c
+
+
+@jax.custom_jvp
+def _inverse(gram: Inexact[Array, "k k"], inverse: Inexact[Array, "k k"]) -> Array:
+    """The inverse, which is known, with its derivative."""
+    return inverse
+
+
+@_inverse.defjvp
+def _(primals, tangents):
+    (_, inverse), (tangent, _) = primals, tangents
+    return inverse, -_times(_times(inverse, tangent), inverse)
 
 
 def _half(e: Inexact[Array, "k k"]) -> Inexact[Array, "k k"]:

@@ -10,7 +10,7 @@ import numpy as np
 import scipy.linalg
 from xla.interpreter import run
 
-from cfjax._numerics.polar import polar_correction
+from cfjax._numerics.polar import Products, polar_correction
 
 SIZES = [1e-12, 1e-9, 1e-6, 1e-3, 0.03]
 
@@ -60,11 +60,11 @@ def test_columns_become_the_nearest_ones_or_keep_their_products(subtests):
 def test_products_of_before_are_restored():
     """The start is off them by what rounding may add up to, and so is the end without them."""
     start, direction = matrices.random((7, 3), 1), 1e-3 * matrices.random((7, 3), 2)
-    products = jnp.asarray(start.T @ start)
+    products = Products.of(jnp.asarray(start))
     y = start + 1e-9 * matrices.random((7, 3), 3)
-    for given, error in [(products, 0.0), (None, 1e-9)]:
-        found, is_there = polar_correction(jnp.asarray(y), jnp.asarray(direction), False, given)
-        off = np.abs((y + found).T @ (y + found) - products).max()
+    for kept, error in [(products, 0.0), (None, 1e-9)]:
+        found, is_there = polar_correction(jnp.asarray(y), jnp.asarray(direction), False, kept)
+        off = np.abs((y + found).T @ (y + found) - products.products).max()
         assert is_there
         # Some roundings of products up to 20.
         assert error <= off < 20 * error + 2e-14
