@@ -140,13 +140,14 @@ def _phase_of_determinant(m: Complex[Array, "n n"]) -> Complex[Array, ""]:
 @jax.custom_jvp
 def _inverse(gram: Inexact[Array, "k k"], inverse: Inexact[Array, "k k"]) -> Array:
     """The inverse, which is known, with its derivative."""
-    return inverse
+    # In a batch of one of them its value must be in the batch as its derivative is (jax 0.12).
+    return jnp.where(True, inverse, gram)
 
 
 @_inverse.defjvp
 def _(primals, tangents):
-    (_, inverse), (tangent, _) = primals, tangents
-    return inverse, -_times(_times(inverse, tangent), inverse)
+    (gram, inverse), (tangent, _) = primals, tangents
+    return _inverse(gram, inverse), -_times(_times(inverse, tangent), inverse)
 
 
 def _half(e: Inexact[Array, "k k"]) -> Inexact[Array, "k k"]:
