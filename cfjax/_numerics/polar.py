@@ -5,7 +5,6 @@ from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
-import numpy as np
 from jax import lax
 from jaxtyping import Array, Bool, Complex, Inexact, Real
 
@@ -13,7 +12,7 @@ from .cayley import without_turns
 from .matmul import promoted, small_product
 from .span import square
 from .squaring import max_over_batch
-from .vectors import chosen, over_stages, unpack, where_scalarised
+from .vectors import unpack
 
 # Each cubes the defect, times 5/8. Four of them lead to rounding from a defect of -0.6 to 0.8.
 _MOST = 4
@@ -89,8 +88,7 @@ def polar_correction_of_rows(
 def _corrected(
     correct: Callable[[Array], tuple[Array, Real[Array, ""]]], v: Array
 ) -> tuple[Array, Bool[Array, ""]]:
-    """v after a correction, or after four where one is not enough or all are on single numbers; and
-    whether these are enough.
+    """v after a correction, or after four where one is not enough, and whether these are.
 
     `correct(v)` returns v after a correction, and the defect before.
     """
@@ -102,10 +100,12 @@ def _corrected(
     def turn(carry: tuple[Array, Array], _: Any) -> tuple[tuple[Array, Array], None]:
         return correct(carry[0]), None
 
+    def more(once: tuple[Array, Array]) -> tuple[Array, Array]:
+        return lax.scan(turn, once, length=_MOST - 1)[0]
+
     once = correct(v)
-    more = lambda: over_stages(turn, once, np.arange(1, _MOST))[0]  # noqa: E731
-    as_needed = lambda: chosen(max_over_batch(once[1]) > bound / 10, more, lambda: once)  # noqa: E731
-    v, size = where_scalarised(more, as_needed)
+    is_needed = max_over_batch(once[1]) > bound / 10
+    v, size = lax.cond(is_needed, more, lambda once: once, once)
     return v, size <= bound
 
 

@@ -8,16 +8,13 @@ from typing import Any
 
 from jaxtyping import Array, Float
 
-from .._xla import chosen as chosen
 from .._xla import computed_once as computed_once
 from .._xla import kept_on_arrays as kept_on_arrays
 from .._xla import materialised as materialised
 from .._xla import materialised_in_rows as materialised_in_rows
-from .._xla import over_stages as over_stages
 from .._xla import pack as pack
 from .._xla import smooth as smooth
 from .._xla import unpack as unpack
-from .._xla import where_scalarised as where_scalarised
 
 Vector = Sequence[Any]
 

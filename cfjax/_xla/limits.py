@@ -9,10 +9,6 @@ import jax
 # The longest vector that is scalarised. A pose is a quaternion and a position. (attitude,
 # leading_axes)
 MAX_LENGTH = 7
-# The largest real matrix in the state of a step. With those of size 4, and complex ones of size 3,
-# a batch takes several times as long as if it is not scalarised, and up to a minute to compile.
-# (equal_error)
-MAX_MATRIX = 9
 # A product of two arrays is scalarised into at most this many products of numbers, those of two
 # 6 x 6 matrices. (fields)
 MAX_PRODUCT = (MAX_LENGTH - 1) ** 3

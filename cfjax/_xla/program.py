@@ -41,7 +41,7 @@ from .limits import (
 from .materialise import materialised, materialised_p
 from .over_stages import Loop, is_scalarised_p
 from .rules import on_entries
-from .scope import is_matrix, is_numeric, is_on, is_rows, is_short, unread, within
+from .scope import is_numeric, is_on, is_rows, is_short, unread, within
 from .smooth import by_fixed, has_reciprocals, scaled_reciprocal
 from .struct_of_arrays import (
     StructOfArrays,
@@ -155,14 +155,10 @@ def on_numbers(
 def _is_small_state(y: PyTree, max_entries: int) -> bool:
     leaves = jtu.tree_leaves(y)
     return (
-        any(np.ndim(x) > 0 for x in leaves)
-        and all(is_short(x) or is_matrix(x) or _is_number(x) for x in leaves)
+        any(map(is_short, leaves))
+        and all(is_short(x) or (np.ndim(x) == 0 and is_numeric(x)) for x in leaves)
         and sum(map(np.size, leaves)) <= max_entries
     )
-
-
-def _is_number(x: Any) -> bool:
-    return np.ndim(x) == 0 and is_numeric(x)
 
 
 def _has_rows(y: PyTree, max_entries: int) -> bool:

@@ -9,7 +9,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from .limits import MAX_LENGTH, MAX_MATRIX, MAX_SIZE
+from .limits import MAX_LENGTH, MAX_SIZE
 
 # JAX compiles anew where it changes.
 _on = jax.make_user_context({"0": False, "1": True}.get(os.environ.get("CFJAX_REWRITE", "")))
@@ -82,11 +82,6 @@ def is_rewritten() -> bool:
 def is_short(x: Any) -> bool:
     """Whether this is a vector that is scalarised."""
     return np.ndim(x) == 1 and 1 <= np.size(x) <= MAX_LENGTH and is_numeric(x)
-
-
-def is_matrix(x: Any) -> bool:
-    """Whether this is a matrix that is scalarised."""
-    return np.ndim(x) == 2 and 1 <= np.size(x) <= MAX_MATRIX and np.isrealobj(x) and is_numeric(x)
 
 
 def is_rows(x: Any) -> bool:

@@ -18,7 +18,7 @@ from jax.extend.core import JaxprEqn, Literal
 from jaxtyping import Array
 
 from .jaxprs import is_inexact
-from .limits import MAX_LENGTH, MAX_MATRIX, MAX_SIZE, MAX_STAGES
+from .limits import MAX_LENGTH, MAX_SIZE, MAX_STAGES
 from .materialise import materialised
 from .pack import pack, unpack
 from .scope import is_numeric, is_rows
@@ -155,13 +155,10 @@ def is_small(x: Any) -> bool:
 
 
 def is_small_shape(shape: tuple[int, ...]) -> bool:
-    """Whether arrays of this shape are of few entries, or of a short vector or a small matrix for
-    each stage.
-    """
+    """Whether arrays of this shape are of few entries, or of a short vector for each stage."""
     if math.prod(shape) <= MAX_SIZE:
         return True
-    most = {2: MAX_LENGTH, 3: MAX_MATRIX}.get(len(shape), 0)
-    return most > 0 and shape[0] <= MAX_STAGES and math.prod(shape[1:]) <= most
+    return len(shape) == 2 and shape[0] <= MAX_STAGES and shape[1] <= MAX_LENGTH
 
 
 def struct_of_arrays(x: Any) -> StructOfArrays:

@@ -124,3 +124,23 @@ def test_the_derivative_is_that_of_difference_quotients():
     for found in run(lambda s: (jax.grad(value)(s), jax.jacfwd(value)(s)), s):
         # The quotient is off by h^2 times a third derivative of some hundred.
         np.testing.assert_allclose(found, expected, rtol=0, atol=1e-5)
+
+
+def test_known_products_have_the_same_derivative():
+    """Their inverse is known, and its derivative is not zero. In a batch too, of whose members the
+    products are known together.
+    """
+    y, v, w = (jnp.asarray(matrices.random((4, 2), k)) for k in (1, 2, 3))
+
+    def value(s, find):
+        point = y + s * jnp.cos(y)
+        return jnp.sum(w * jnp.sin(polar_correction(point, 0.01 * v, False, find(point))[0]))
+
+    points = jnp.asarray([0.01, 0.02])
+    derivatives = run(jax.vmap(jax.grad(lambda s: value(s, lambda _: None))), points)
+    known = lambda s: value(s, lambda y: Products.of(jax.lax.stop_gradient(y)))  # noqa: E731
+    # Some hundred roundings.
+    np.testing.assert_allclose(run(jax.vmap(jax.grad(known)), points), derivatives, rtol=1e-12)
+    shared = lambda s: value(s, lambda _: Products.of(y))  # noqa: E731
+    expected = [run(jax.grad(shared), s) for s in points]
+    np.testing.assert_allclose(run(jax.vmap(jax.grad(shared)), points), expected, rtol=1e-12)
