@@ -140,7 +140,7 @@ def _phase_of_determinant(m: Complex[Array, "n n"]) -> Complex[Array, ""]:
 @jax.custom_jvp
 def _inverse(gram: Inexact[Array, "k k"], inverse: Inexact[Array, "k k"]) -> Array:
     """The inverse, which is known, with its derivative."""
-    # In a batch of one of them its value must be in the batch as its derivative is (jax 0.12).
+    # In the batch if the derivative is: otherwise JAX 0.12 sums that of all members in each.
     return jnp.where(True, inverse, gram)
 
 

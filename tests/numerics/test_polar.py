@@ -143,5 +143,6 @@ def test_known_products_have_the_same_derivative():
     np.testing.assert_allclose(run(jax.vmap(jax.grad(known)), points), derivatives, rtol=1e-12)
     shared = lambda s: value(s, lambda _: Products.of(y))  # noqa: E731
     expected = [run(jax.grad(shared), s) for s in points]
-    of_batch = jax.grad(lambda points: jnp.sum(jax.vmap(shared)(points)))
+    # With `jit` within the batch JAX 0.12 has a wrong derivative of a value that is of one.
+    of_batch = jax.grad(lambda points: jnp.sum(jax.vmap(jax.jit(shared))(points)))
     np.testing.assert_allclose(run(of_batch, points), expected, rtol=1e-12)
