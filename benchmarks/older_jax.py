@@ -14,7 +14,7 @@ import jax
 import equal_error
 import results
 
-SCENES = ("rigid body", "spacecraft", "given rate", "pose", "SO(4)")
+SCENES = ("rigid body", "spacecraft", "given rate", "pose")
 # The limit of XLA itself, in bytes, and the one that cfjax's own programs set.
 LIMITS = {"without": 2**10, "with": 2**20}
 
