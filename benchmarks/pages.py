@@ -262,6 +262,15 @@ def _machine(facts: dict[str, object]) -> str:
 
 
 @number
+def older_gain() -> str:
+    rows = pick(load("older_jax")["rows"], kind="one", to=1e-8)
+    rows = [row for row in rows if row["method"].startswith("diffrax")]
+    without, with_it = (pick(rows, option=option) for option in ("without", "with"))
+    pairs = zip(without, with_it, strict=True)
+    return between(a["seconds"][2] / b["seconds"][2] for a, b in pairs)
+
+
+@number
 def older_machine() -> str:
     return _machine(load("older_jax")["machine"])
 
