@@ -23,7 +23,7 @@ from cfjax.scenes import heavy_top
 TARGETS = (1e-5, 1e-8)
 REPEATS = 10  # of a program for one system in one turn
 INERTIA = np.array([3.0, 2.0, 1.0])
-BODY = {"frame": "body", "layout": "wxyz"}
+BODY: dict[str, Any] = {"frame": "body", "layout": "wxyz"}
 RNG = np.random.default_rng(0)
 
 

@@ -53,7 +53,7 @@ def path(key: Any) -> diffrax.UnsafeBrownianPath:
 def by_integrate(solver: Any, terms: Callable[..., Any]) -> Callable[..., Array]:
     def end(y0: Array, size: Any, key: Any) -> Array:
         sol = cfjax.integrate(terms(path(key)), solver, 0.0, 1.0, y0, size, num_steps=STEPS)
-        return sol.ys[-1]
+        return jnp.asarray(sol.ys)[-1]
 
     return end
 
@@ -62,13 +62,14 @@ def by_diffeqsolve(
     solver: Any, terms: Callable[..., Any], *, is_tree: bool = False
 ) -> Callable[..., Array]:
     def end(y0: Array, size: Any, key: Any) -> Array:
-        noise, options = path(key), {"adjoint": diffrax.ForwardMode()}
+        noise: diffrax.AbstractPath = path(key)
+        options: dict[str, Any] = {"adjoint": diffrax.ForwardMode()}
         if is_tree:
             noise, options = diffrax.VirtualBrownianTree(0.0, 1.0, 1 / STEPS, (2,), key), {}
         sol = diffrax.diffeqsolve(
             *(terms(noise), solver, 0.0, 1.0, 1 / STEPS, y0, size), max_steps=STEPS + 1, **options
         )
-        return sol.ys[-1]
+        return jnp.asarray(sol.ys)[-1]
 
     return end
 
@@ -98,7 +99,7 @@ def measure(quick: bool) -> Iterator[results.Row]:
     programs["diffeqsolve", "CF2"] = by_diffeqsolve(cfjax.CF2(), on_sphere)
     programs["diffeqsolve, tree", "CF2"] = by_diffeqsolve(cfjax.CF2(), on_sphere, is_tree=True)
     for kind in ("solve", "gradient"):
-        runs = {}
+        runs: dict[Any, Callable[[], Any]] = {}
         for key, end in programs.items():
             program = end
             if kind == "gradient":
@@ -106,7 +107,7 @@ def measure(quick: bool) -> Iterator[results.Row]:
                     continue
                 program = jax.grad(lambda *args, end=end: jnp.sum(end(*args)), argnums=(0, 1))
             runs[key] = results.compiled(program, *args)
-        seconds = results.in_turns(runs, repeats=1 if quick else 7)
+        seconds: dict[Any, Any] = results.in_turns(runs, repeats=1 if quick else 7)
         for (way, method), times in seconds.items():
             base = seconds["diffeqsolve, tree", method]
             yield {
