@@ -93,9 +93,9 @@ def solve(problem: str, method: str, way: str) -> None:
 
         term = cfjax.LieTerm(frozen(cfjax))
         solver = {
-            "CF4": lambda: cfjax.CF4(),
-            "CF54": lambda: cfjax.CF54(),
-            "RKMK(Dopri8)": lambda: cfjax.RKMK8(),
+            "CF4": cfjax.CF4,
+            "CF54": cfjax.CF54,
+            "RKMK(Dopri8)": cfjax.RKMK8,
             "Projected(Dopri8)": lambda: cfjax.Projected(diffrax.Dopri8()),
         }[method]()
     options: dict[str, Any] = {}

@@ -3,7 +3,7 @@
 import os
 from collections.abc import MutableMapping
 
-import jaxlib
+import jax
 
 _OPTION = "xla_cpu_small_while_loop_byte_threshold"
 
@@ -15,6 +15,5 @@ def compile_small_loops(environ: MutableMapping[str, str] = os.environ) -> None:
     device. Options of the user stay as they are.
     """
     flags = environ.get("XLA_FLAGS", "")
-    is_new = tuple(map(int, jaxlib.__version__.split(".")[:2])) >= (0, 12)
-    if not is_new and "xla_backend_extra_options" not in flags:
+    if jax.__version_info__ < (0, 12) and "xla_backend_extra_options" not in flags:
         environ["XLA_FLAGS"] = f"{flags} --xla_backend_extra_options={_OPTION}={2**20}".strip()

@@ -53,7 +53,7 @@ class Projected(AbstractRungeKutta, diffrax.AbstractAdaptiveSolver):
     - `LeftMatrix` and `RightMatrix` with a skew-Hermitian `a` keep the products of columns or rows,
       so matrices stay orthogonal or unitary. The phase of the determinant of a complex matrix
       follows the trace of `a`. A step takes four or five products with the point more than in plain
-      space, and an inverse where the columns are not orthonormal;
+      space;
     - `LowRankSkew` and `BorderedSkew` keep orthonormal columns;
     - `Conjugation` and `Congruence` without `q`, with any `a`, move by an element of the algebra in
       Cayley's coordinates, which is computed beside the point, and whose estimate is that of the

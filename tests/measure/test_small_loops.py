@@ -4,12 +4,12 @@ import os
 import subprocess
 import sys
 
-import jaxlib
+import jax
 import pytest
 
 from cfjax._measure.small_loops import compile_small_loops
 
-IS_NEW = tuple(map(int, jaxlib.__version__.split(".")[:2])) >= (0, 12)
+IS_NEW = jax.__version_info__ >= (0, 12)
 
 
 @pytest.mark.parametrize("flags", ["", "--xla_force_host_platform_device_count=2"])
@@ -27,6 +27,7 @@ def test_options_of_the_user_stay():
     assert environ == expected
 
 
+@pytest.mark.slow
 @pytest.mark.skipif(IS_NEW, reason="XLA does so without an option.")
 def test_a_loop_is_one_function():
     """The loop over steps of 60 spins, in processes with the option and without."""
