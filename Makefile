@@ -3,7 +3,7 @@ BIN := .venv/bin
 # The whole suite, in as many processes as there are cores.
 PYTEST := -m pytest --numprocesses auto --dist worksteal
 # Each solver and each field once, what the code relies on in jax, equinox and diffrax, and imports.
-QUICK := tests/test_quick.py tests/xla/test_struct_of_arrays.py tests/test_canary.py tests/test_public.py tests/test_architecture.py
+QUICK := tests/test_quick.py tests/xla/test_scalars.py tests/test_canary.py tests/test_public.py tests/test_architecture.py
 
 .PHONY: paper lint suite test test-all test-quick test-lowest test-newest coverage mutations benchmarks benchmark-gpu benchmark-older pages docs clean
 

@@ -49,19 +49,10 @@ def forget_compiled_programs():
 
 @pytest.fixture
 def rewritten():
-    """Programs of small systems are rewritten wherever they can be."""
+    """Programs are rewritten as users' are, whatever is set for other tests."""
     import cfjax  # Not before the import hook.
 
     with cfjax.rewriting(True):
-        yield
-
-
-@pytest.fixture
-def rewritten_by_default():
-    """Programs are rewritten where that pays, whatever is set for other tests."""
-    import cfjax
-
-    with cfjax.rewriting(None):
         yield
 
 

@@ -67,9 +67,7 @@ PRIVATE_IN_TESTS = {
     "test_canary.py": "tables of the names that other libraries have",
     "xla/random_programs.py": "programs rewritten, which no solve is",
     "xla/test_materialise.py": "calls that keep XLA from fusing",
-    "xla/test_pack.py": "primitives that put entries together",
     "xla/test_scalars.py": "programs on single numbers, equation by equation",
-    "xla/test_struct_of_arrays.py": "programs on an array for each entry, equation by equation",
     "xla/test_understood.py": "which equations are understood, and with which parameters",
 }
 

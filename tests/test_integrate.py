@@ -236,26 +236,6 @@ def test_the_derivative_in_the_end_time_is_the_velocity():
     close(d_t0, -np.asarray(d_y0) @ velocity(t0, y0), atol=1e-10)
 
 
-# What the compiler makes of it
-
-
-@pytest.mark.usefixtures("rewritten")
-@pytest.mark.skipif(jax.default_backend() != "cpu", reason="the loops of XLA on CPU")
-def test_a_step_of_a_small_system_is_few_operations_also_backwards():
-    """XLA runs a loop of few operations as one function, and every operation apart otherwise."""
-    term = cfjax.LieTerm(problems.rigid_body)
-
-    def fun(y0, inertia):
-        return jnp.sum(solve(term, cfjax.CF2(), y0=y0, args=inertia, num_steps=100).ys)
-
-    def fusions(fun):
-        return jax.jit(fun).lower(Y0, ARGS).compile().as_text().count(" fusion(")
-
-    # 24 and 41 as measured. A derivative that XLA breaks into pieces has more than 80.
-    assert fusions(fun) < 25
-    assert fusions(jax.grad(fun, (0, 1))) < 50
-
-
 # Memory, as the compiler plans it
 
 

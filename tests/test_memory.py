@@ -55,7 +55,7 @@ PROGRAMS = {
 }
 
 
-@pytest.mark.usefixtures("rewritten_by_default")
+@pytest.mark.usefixtures("rewritten")
 @pytest.mark.representatives(1)
 @pytest.mark.parametrize("name", PROGRAMS)
 def test_nothing_is_kept_but_what_jax_keeps(name):

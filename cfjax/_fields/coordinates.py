@@ -90,9 +90,8 @@ class Pose(AbstractProjected):
                 [y[k] for k in self.indices], [v[k] for k in self.indices], True
             )
             rest = [k for k in range(len(v)) if k not in self.indices]
-            return pack(
-                placed([*number, *(v[k] for k in rest)], [*self.indices, *rest]), sums=True
-            ), is_there
+            turned = placed([*number, *(v[k] for k in rest)], [*self.indices, *rest])
+            return pack(turned), is_there
         block = slice(self.dimension)
         turned, is_there = polar_correction(start[block, block], self.v[block, block], True)
         return self.v.at[block, block].set(turned), is_there

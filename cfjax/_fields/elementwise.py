@@ -1,5 +1,6 @@
 """Fields on leading axes: one motion for each element of an array of points."""
 
+import math
 from collections.abc import Callable, Sequence
 from typing import Any
 
@@ -7,6 +8,7 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 import jax.tree_util as jtu
+import numpy as np
 from jaxtyping import Array, Bool, PyTree, Real
 
 from .._arrays import Weight
@@ -17,20 +19,32 @@ from .._field import (
     combine,
     is_field,
 )
-from .._numerics.vectors import kept_on_arrays
+from .._numerics.vectors import limits, scalarised
 
 
 def each(fun: Callable[..., PyTree], num_axes: int) -> Callable[..., PyTree]:
     """Maps `fun`, a function of arrays without leading axes, over so many leading axes.
 
     An axis of 1 is broadcast, and what depends only on such arrays is computed once. An array that
-    `fun` returns unchanged stays the same object, and arguments that are one object stay one.
+    `fun` returns unchanged stays the same object, and arguments that are one object stay one. For
+    many elements of short vectors XLA gets `fun` on single numbers.
 
     **Raises** `ValueError` where the axes do not broadcast.
     """
+
+    def mapped(*args: PyTree) -> PyTree:
+        sides = [np.shape(x)[:num_axes] for x in jtu.tree_leaves(args)]
+        is_many = max(map(math.prod, sides)) > limits.MAX_SIZE
+        one = (lambda *args: scalarised(lambda args: fun(*args), args)) if is_many else fun
+        return _each(one, num_axes)(*args)
+
+    return mapped if num_axes else fun
+
+
+def _each(fun: Callable[..., PyTree], num_axes: int) -> Callable[..., PyTree]:
     if num_axes == 0:
         return fun
-    inner = each(fun, num_axes - 1)
+    inner = _each(fun, num_axes - 1)
 
     def mapped(*args: PyTree) -> PyTree:
         leaves, treedef = jtu.tree_flatten(args)
@@ -281,9 +295,7 @@ class ElementwiseCoordinates(Elementwise, AbstractCoordinates):
 
     def landing(self, start: Any) -> tuple[Any, Bool[Array, ""]]:
         increment, is_there = self._each(lambda u, start: u.landing(start))(self.field, start)
-        # With 3 x 3 matrices and RKMK8 the program of single numbers has 29 000 instructions in
-        # place of 800, and takes three times as long.
-        return increment, kept_on_arrays(jnp.all(is_there))
+        return increment, jnp.all(is_there)
 
     def kept(self, start: Any) -> PyTree[Array] | None:
         return self._each(lambda u, start: u.kept(start))(self.field, start)

@@ -72,7 +72,7 @@ def quaternion_rotate(
     x0, x1, x2 = (x[..., k] for k in range(3))
     product = [factor * t for t in cross(v, (x0, x1, x2))]
     terms = zip((x0, x1, x2), product, cross(v, product), strict=True)
-    return pack([a + (w * b + c) for a, b, c in terms], axis=w.ndim, sums=True)
+    return pack([a + (w * b + c) for a, b, c in terms], axis=w.ndim)
 
 
 def quaternion_from_matrix(

@@ -132,9 +132,8 @@ def _series(
     `h_i` are the coefficients of the power series of g^m with
     `g(x) = 1 / (1 - c_(n-1) x - .. - c_0 x^n)`.
     """
-    # Otherwise every use of one of them would compute all of them again, as in derivatives outside
-    # of batches.
-    return materialised(_series_of((m, first, count), c), in_batches=True, alone=m > 1)
+    # Otherwise every use of one of them would compute all of them again.
+    return materialised(_series_of((m, first, count), c))
 
 
 @functools.partial(jax.custom_jvp, nondiff_argnums=(0,))

@@ -182,5 +182,5 @@ def _increment(
     *columns, velocity, _ = entries(x[:3].T)
     rotation = of_columns(exponential, w, columns)
     displacement = dot(columns, turned) + (t * velocity + fixed)
-    upper = pack([*rotation, dot(columns, by_force) + g, displacement], axis=1, sums=True)
+    upper = pack([*rotation, dot(columns, by_force) + g, displacement], axis=1)
     return jnp.concatenate([upper, jnp.zeros_like(x[3:])])

@@ -48,7 +48,7 @@ def vector_of_length(
     """The same for arrays."""
     if len(y) <= 4:
         corrected, is_there = length_correction(entries(y), entries(v), is_unit, kept)
-        return pack(corrected, sums=True), is_there
+        return pack(corrected), is_there
     (corrected,), is_there = length_correction([y], [v], is_unit, kept)
     return corrected, is_there
 

@@ -25,7 +25,7 @@ from .expm_series import TAYLOR_THETA
 from .matmul import matmul, plus_identity, promoted, small_product
 from .polynomial import polynomial
 from .squaring import max_over_batch
-from .vectors import materialised_in_rows
+from .vectors import computed_once
 
 # The degrees of the Taylor polynomials that `phi_1_times` chooses from.
 _DEGREES = {"float32": (5, 10, 15), "float64": (12, 16, 20, 25)}
@@ -67,14 +67,10 @@ def phi(
     return phi_1(z) if k == 1 else phis(z, int(k), once=lambda x: x)[k]
 
 
-def _once(arrays: list[Array]) -> list[Array]:
-    return materialised_in_rows(arrays, alone=True)
-
-
 def phis(
     z: Inexact[Array, "*batch"],
     most: int,
-    once: Callable[[list[Array]], list[Array]] = _once,
+    once: Callable[[list[Array]], list[Array]] = computed_once,
 ) -> list[Inexact[Array, "*batch"]]:
     """`phi_0(z)` to `phi_most(z)`.
 

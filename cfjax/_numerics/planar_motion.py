@@ -61,7 +61,7 @@ def bracket(
     w1: Float[Array, ""], v1: Float[Array, "2"], w2: Float[Array, ""], v2: Float[Array, "2"]
 ) -> tuple[Float[Array, ""], Float[Array, "2"]]:
     """`ab - ba` for the matrices a and b of two motions."""
-    return jnp.zeros_like(w1), pack(_bracket(w1, v1, w2, v2), sums=True)
+    return jnp.zeros_like(w1), pack(_bracket(w1, v1, w2, v2))
 
 
 @jax.jit
@@ -71,7 +71,7 @@ def dexpinv(
     """The inverse derivative of the exponential at the first motion, of the second."""
     # The bracket of two motions of the plane is a translation, u.
     u = _bracket(w1, v1, w2, v2)
-    return w2, pack(dexpinv_times(w1 * w1, entries(v2), u, _times_i(w1, u)), sums=True)
+    return w2, pack(dexpinv_times(w1 * w1, entries(v2), u, _times_i(w1, u)))
 
 
 def has_dexpinv(w: Float[Array, "*batch"]) -> Bool[Array, ""]:
@@ -99,19 +99,19 @@ def _increment(
         r0, r1 = x[:, 0], x[:, 1]
         v0, v1 = displacement(w, vs)
         rotation = displacement(-w, _times_i(-w, [r0, r1]))
-        return pack([*rotation, r0 * v0 + r1 * v1], axis=1, sums=True)
+        return pack([*rotation, r0 * v0 + r1 * v1], axis=1)
     if x.ndim == 2:
         *rows, last = entries(x)
         u = plus(_times_i(w, rows), [last * a for a in vs])
-        return pack([*displacement(w, u), jnp.zeros_like(last)], sums=True)
+        return pack([*displacement(w, u), jnp.zeros_like(last)])
     if x.shape == (2,):
-        return pack(displacement(w, plus(_times_i(w, entries(x)), vs)), sums=True)
+        return pack(displacement(w, plus(_times_i(w, entries(x)), vs)))
     z, position = [x[k] for k in indices[:2]], [x[k] for k in indices[2:]]
     if frame == "fixed":
         u = plus(_times_i(w, position), vs)
     else:
         u = plus([z[0] * a for a in vs], _times_i(z[1], vs))
-    return pack(placed([*turn(w, z), *displacement(w, u)], indices), sums=True)
+    return pack(placed([*turn(w, z), *displacement(w, u)], indices))
 
 
 def _times_i(w: Any, x: Vector) -> Vector:

@@ -30,7 +30,7 @@ def parts(q: Float[Array, "*batch 4"], layout: Layout) -> Vector:
 def from_parts(q: Vector, layout: Layout) -> Float[Array, "*batch 4"]:
     """The inverse of `parts`."""
     w, x, y, z = q
-    return pack((w, x, y, z) if layout == "wxyz" else (x, y, z, w), axis=w.ndim, sums=True)
+    return pack((w, x, y, z) if layout == "wxyz" else (x, y, z, w), axis=w.ndim)
 
 
 def times(

@@ -62,7 +62,7 @@ def bracket(
     """`ab - ba` for the matrices a and b of two motions."""
     a, b = map(entries, (w1, w2))
     v = [x - y for x, y in zip(cross(a, entries(v2)), cross(b, entries(v1)), strict=True)]
-    return pack(cross(a, b), sums=True), pack(v, sums=True)
+    return pack(cross(a, b)), pack(v)
 
 
 @jax.jit
@@ -122,7 +122,7 @@ def increments(
     `(4 + 3 k,)`, in which the entries of the quaternion and of the positions are at `indices`.
     """
     if x.shape == (3,):
-        return pack(_along_screw(exponential, w, vs, entries(x), [1]), sums=True)
+        return pack(_along_screw(exponential, w, vs, entries(x), [1]))
     if x.ndim == 1:
         q, *positions = pose_parts(x, indices)
         if frame == "fixed":
@@ -135,11 +135,11 @@ def increments(
     if frame == "fixed":
         rows = entries(x)
         displacement = _along_screw(exponential, w, vs, rows[:3], rows[3:])
-        return pack([*displacement, *(jnp.zeros_like(row) for row in rows[3:])], sums=True)
+        return pack([*displacement, *(jnp.zeros_like(row) for row in rows[3:])])
     columns = entries(x.T)[:3]
     rotation = of_columns(exponential, w, columns)
     positions = [dot(columns, of_origin(exponential, w, v)) for v in vs]
-    return pack([*rotation, *positions], axis=1, sums=True)
+    return pack([*rotation, *positions], axis=1)
 
 
 def pose_parts(x: Array, indices: tuple[int, ...]) -> list[Vector]:
@@ -150,7 +150,7 @@ def pose_parts(x: Array, indices: tuple[int, ...]) -> list[Vector]:
 
 def pose(parts: Sequence[Vector], indices: tuple[int, ...]) -> Array:
     """The inverse of `pose_parts`."""
-    return pack(placed([a for part in parts for a in part], indices), sums=True)
+    return pack(placed([a for part in parts for a in part], indices))
 
 
 def of_columns(exponential: Exponential | None, w: Vector, columns: Vector) -> Vector:

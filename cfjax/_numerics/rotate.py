@@ -9,7 +9,7 @@ from .vectors import cross, dot, entries, pack
 
 def cross_product(a: Float[Array, "3"], x: Float[Array, "3 *k"]) -> Float[Array, "3 *k"]:
     """The cross product of `a` with a vector, or with every column of a matrix."""
-    return pack(cross(entries(a), entries(x)), sums=True)
+    return pack(cross(entries(a), entries(x)))
 
 
 @jax.jit  # One trace for the many rotations of a step.
@@ -28,7 +28,7 @@ def increment(a: Float[Array, "3"], x: Float[Array, "3 *k"]) -> Float[Array, "3 
     axis = entries(a)
     velocity = cross(axis, entries(x))
     exponential = stumpff_1_to_3_apart(dot(axis, axis))
-    return pack(exponential.increment(velocity, cross(axis, velocity)), sums=True)
+    return pack(exponential.increment(velocity, cross(axis, velocity)))
 
 
 @jax.jit
@@ -39,7 +39,7 @@ def mean(a: Float[Array, "3"], x: Float[Array, "3 *k"]) -> Float[Array, "3 *k"]:
     near, _, d2, c3 = stumpff_1_to_3_apart(dot(axis, axis))
     c2 = near / 2 + d2
     terms = zip(xs, velocity, cross(axis, velocity), strict=True)
-    return pack([x + (c2 * v + c3 * w) for x, v, w in terms], sums=True)
+    return pack([x + (c2 * v + c3 * w) for x, v, w in terms])
 
 
 @jax.jit
@@ -47,7 +47,7 @@ def dexpinv(a: Float[Array, "3"], x: Float[Array, "3"]) -> Float[Array, "3"]:
     """The inverse derivative of the exponential at `a`, `x - a*x/2 + a*(a*x)/12 - ...`."""
     axis, xs = entries(a), entries(x)
     velocity = cross(axis, xs)
-    return pack(dexpinv_times(dot(axis, axis), xs, velocity, cross(axis, velocity)), sums=True)
+    return pack(dexpinv_times(dot(axis, axis), xs, velocity, cross(axis, velocity)))
 
 
 def has_dexpinv(a: Float[Array, "*batch 3"]) -> Bool[Array, ""]:

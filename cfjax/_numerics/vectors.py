@@ -9,10 +9,10 @@ from typing import Any
 from jaxtyping import Array, Float
 
 from .._xla import computed_once as computed_once
-from .._xla import kept_on_arrays as kept_on_arrays
+from .._xla import limits as limits
 from .._xla import materialised as materialised
-from .._xla import materialised_in_rows as materialised_in_rows
 from .._xla import pack as pack
+from .._xla import scalarised as scalarised
 from .._xla import smooth as smooth
 from .._xla import unpack as unpack
 

@@ -19,7 +19,6 @@ from .._xla import chosen as chosen
 from .._xla import computed_again as computed_again
 from .._xla import computed_once as computed_once
 from .._xla import limits as limits
-from .._xla import materialised_in_rows as materialised_in_rows
 from .._xla import materialised_together as materialised_together
 from .._xla import over_stages as over_stages
 from .._xla import scalarised as scalarised

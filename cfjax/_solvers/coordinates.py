@@ -8,7 +8,7 @@ from jaxtyping import Array, Bool, PyTree, Real
 
 from .._field import has_rate, in_coordinates, landing, rate
 from .._numerics.vectors import smooth
-from .compiled import materialised_in_rows, materialised_together
+from .compiled import materialised_together
 from .step import Chart
 
 _NOT_SKEW = (
@@ -76,8 +76,7 @@ class AbstractCoordinateChart(Chart):
     def flow_of_step(self, field):
         increment, is_there = _landing_or_nan(field, self.origin)
         # A part that is no sum has its state there.
-        end = jtu.tree_map(jnp.add, self.start, increment)
-        return materialised_in_rows(end), is_there
+        return jtu.tree_map(jnp.add, self.start, increment), is_there
 
 
 class ProjectedChart(AbstractCoordinateChart):

@@ -13,11 +13,10 @@ import jax.tree_util as jtu
 import numpy as np
 from jaxtyping import Array, Float, PyTree, Real
 
-from .._field import combine, from_chart
+from .._field import combine, flow, from_chart
 from .._methods.tableau import ContinuousExtension
 from .compiled import scalarised
 from .stacked import can_roll, rolled_flows
-from .sums import flow_once
 
 
 class Interpolation(diffrax.AbstractLocalInterpolation):
@@ -107,7 +106,7 @@ class Path(AbstractPath):
         continuous_extension: ContinuousExtension,
         start: PyTree,
         fields: list[PyTree],
-        apply_flow: Callable[[PyTree, PyTree], PyTree] = flow_once,
+        apply_flow: Callable[[PyTree, PyTree], PyTree] = flow,
     ) -> "Path":
         leaves, treedef = jtu.tree_flatten((start, fields))
         arrays = {id(leaf): leaf for leaf in leaves}
@@ -126,11 +125,11 @@ class Path(AbstractPath):
         point, fields = self.unflatten(self.arrays)
         # For small states too: an event's root finder differentiates this, and in batches a loop of
         # flows on short vectors is as fast.
-        if self.apply_flow is flow_once and num_flows > 1 and can_roll(None, fields[0], point):
+        if self.apply_flow is flow and num_flows > 1 and can_roll(None, fields[0], point):
             # There may be no field at the end of the step, where it has no weight.
             rows = powers.swapaxes(0, 1)[..., : len(fields)].astype(theta.dtype)
             weights = functools.partial(_polynomials, theta=theta)
-            return rolled_flows(rows, fields, point, flow_once, weights)
+            return rolled_flows(rows, fields, point, flow, weights)
 
         weights = _polynomials(powers, theta)
 

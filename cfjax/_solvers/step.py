@@ -13,6 +13,7 @@ from jax.core import Tracer
 from jaxtyping import Array, Bool, PyTree, Real
 
 from .._field import dexpinv, from_chart, has_dexpinv, is_field
+from .._field import flow as carried
 from .._term import product
 from .base import (
     AbstractLieSolver,
@@ -22,14 +23,9 @@ from .base import (
     result_of,
     time_at,
 )
-from .compiled import (
-    computed_again,
-    control_of,
-    materialised_in_rows,
-    scalarised,
-)
+from .compiled import computed_again, computed_once, control_of, scalarised
 from .dense import AbstractPath, Interpolation
-from .sums import Sums, flow_once
+from .sums import Sums
 
 # A part of the step.
 Time = float | Real[Array, ""]
@@ -119,7 +115,7 @@ class Chart(NamedTuple):
         return has_dexpinv(u)
 
     # Within a step, from the state at its start, for `Path`.
-    apply_flow = staticmethod(flow_once)
+    apply_flow = staticmethod(carried)
 
     def end(self, point: PyTree) -> PyTree:
         """The state at a point, or its increment from the start where it is a compensated sum."""
@@ -146,7 +142,7 @@ class Chart(NamedTuple):
         """
 
         def part(f: Any, p: PyTree) -> PyTree:
-            return materialised_in_rows(p, alone=True) if is_field(f) and f.is_entrywise else p
+            return computed_once(p) if is_field(f) and f.is_entrywise else p
 
         return jtu.tree_map(part, self.first_field, point, is_leaf=is_field)
 
@@ -200,7 +196,7 @@ class AbstractChartSolver(AbstractLieSolver):
         times = evaluation_times(t0, t1)
 
         def value(c: Time, y: PyTree) -> PyTree:
-            return materialised_in_rows(terms.vf(time_at(c, *times), y, args))
+            return terms.vf(time_at(c, *times), y, args)
 
         def step_from(y0: PyTree) -> Step:
             control = control_of(terms, *self.interval(t0, t1))

@@ -16,17 +16,7 @@ from jax import lax
 from jaxtyping import Array, PyTree
 
 from .._field import Rest, flow, from_chart, is_field, to_chart
-from .compiled import materialised_in_rows, materialised_together
-
-
-def flow_once(field: PyTree, point: PyTree) -> PyTree:
-    """`flow(field, point)`, computed once: with leading axes each use would compute it anew."""
-    return jtu.tree_map(
-        lambda f, p: materialised_in_rows(flow(f, p)) if is_field(f) else flow(f, p),
-        field,
-        point,
-        is_leaf=is_field,
-    )
+from .compiled import computed_once, materialised_together
 
 
 class Sums(NamedTuple):
@@ -92,17 +82,17 @@ class Sums(NamedTuple):
         def part(f: Any, p: PyTree, y: PyTree) -> PyTree:
             # Another term of the equation may make a sum of it.
             is_sum = isinstance(y, jax.Array) and is_field(f) and not isinstance(f, Rest)
-            return materialised_in_rows(p + f.increment(y + p)) if is_sum else flow_once(f, p)
+            return p + f.increment(y + p) if is_sum else flow(f, p)
 
         if self.compensation is None:
-            return flow_once(field, point)
+            return flow(field, point)
         starts = self.map(lambda c, y: None if c is None else y)
         return jtu.tree_map(part, field, point, starts, is_leaf=is_field)
 
     def flow_frozen(self, field: PyTree, point: PyTree) -> PyTree:
         """Where a field that is frozen at a point carries it."""
         field, point = self.to_chart(field, point)
-        return materialised_in_rows(from_chart(field, self.flow(field, point)), alone=True)
+        return computed_once(from_chart(field, self.flow(field, point)))
 
     def materialised(self, end: PyTree, error: PyTree, is_followed: bool) -> tuple[PyTree, PyTree]:
         """The end of a step and its error, which XLA would otherwise compute for each use of an

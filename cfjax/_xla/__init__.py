@@ -3,9 +3,8 @@
 - `scalarised`, `repeat`: a step, and many equal ones, on single numbers.
 - `over_stages`, `chosen`: a loop over the stages of a method, and a choice within it, which are
   part of what is scalarised; `where_scalarised`, `computed_again`: what is computed otherwise
-  there; `kept_on_arrays`: what is not scalarised.
-- `materialised_together`, `materialised_in_rows`, `computed_once`: values
-  that several results need, computed once.
+  there.
+- `materialised_together`, `computed_once`: values that several results need, computed once.
 - `pack`, `unpack`: `jnp.stack` and `jnp.unstack` in a form that XLA fuses.
 - `smooth`: a mark of functions that compare numbers and yet are smooth up to rounding.
 - `materialised`, `call`: arrays and functions that XLA computes on their own.
@@ -20,11 +19,9 @@ from .loop import repeat as repeat
 from .materialise import call as call
 from .materialise import computed_once as computed_once
 from .materialise import materialised as materialised
-from .materialise import materialised_in_rows as materialised_in_rows
 from .materialise import materialised_together as materialised_together
 from .over_stages import chosen as chosen
 from .over_stages import computed_again as computed_again
-from .over_stages import kept_on_arrays as kept_on_arrays
 from .over_stages import over_stages as over_stages
 from .over_stages import where_scalarised as where_scalarised
 from .pack import pack as pack

@@ -1,107 +1,57 @@
-"""Operations that compute something of entries: elementwise ones, sums and products."""
+"""Operations that compute something of numbers: elementwise ones, sums and products."""
 
 import functools
-import itertools
 import math
-import operator
 from collections.abc import Callable, Sequence
-from typing import Any, NamedTuple
+from typing import Any
 
 import jax
 import jax.numpy as jnp
 import numpy as np
 from jax import lax
+from jax.extend.core import JaxprEqn
 
 from .jaxprs import is_inexact
-from .limits import MAX_LENGTH, MAX_PRODUCT
-from .struct_of_arrays import (
-    Call,
-    StructOfArrays,
-    aligned,
-    common,
-    conformed,
-    spread,
-    static_value,
-    struct_of_arrays,
-)
+from .limits import MAX_PRODUCT
+from .numbers import array_of, numbers, of_jax, static_value
 
 
-def elementwise(call: Call) -> StructOfArrays | None:
-    which = static_value(call.values[0])
-    if call.eqn.primitive.name == "select_n" and which is not None and not call.is_large:
-        return _chosen(call, which)
-    if not call.shape:
+def elementwise(eqn: JaxprEqn, values: Sequence[Any]) -> np.ndarray | None:
+    aval: Any = eqn.outvars[0].aval
+    which = static_value(values[0])
+    if eqn.primitive.name == "select_n" and which is not None:
+        # As of the weights of a stage that are zero.
+        cases = [list(numbers(x).flat) for x in values[1:]]
+        chosen = np.broadcast_to(which, aval.shape).astype(int)
+        return array_of([cases[n][k] for k, n in enumerate(chosen.flat)], aval.shape)
+    if not aval.shape:
         return None  # Of numbers.
-    values = [x if np.shape(x) == () else struct_of_arrays(x) for x in call.values]
-    arrays = [x for x in values if isinstance(x, StructOfArrays)]
-    is_short = common(arrays, call.shape)
-    columns = [
-        conformed(x, call.shape, is_short).entries
-        if isinstance(x, StructOfArrays)
-        else itertools.repeat(x)
-        for x in values
-    ]
-    compute = functools.partial(call.eqn.primitive.bind, **call.params)
-    if not call.is_large:
-        # Each on its own, so that a derivative has the order of sums that JAX has.
-        return StructOfArrays(map(compute, *columns), call.shape)
-    computed: dict[Any, Any] = {}
-
-    def entry(*row: Any) -> Any:
-        key = tuple(map(id, row))
-        if key not in computed:
-            # With the row, so that none of it is forgotten and its identity used again.
-            computed[key] = compute(*aligned(row)), row
-        return computed[key][0]
-
-    return StructOfArrays(map(entry, *columns), call.shape, is_short)
+    # An axis may have length 1 in some operands, and others are one number.
+    columns = [np.broadcast_to(numbers(x), aval.shape).flat for x in values]
+    compute = functools.partial(eqn.primitive.bind, **eqn.params)
+    return array_of(list(map(compute, *columns)), aval.shape)
 
 
-def _chosen(call: Call, which: np.ndarray) -> StructOfArrays:
-    """What is chosen, if it is known now, as of the weights of a stage that are zero."""
-    cases = [struct_of_arrays(x).entries for x in call.values[1:]]
-    places = np.broadcast_to(which, call.shape).astype(int)
-    return StructOfArrays([cases[n][k] for k, n in enumerate(places.flat)], call.shape)
-
-
-def reduced(call: Call) -> StructOfArrays | None:
-    x, axes, name = call.first(), call.params["axes"], call.eqn.primitive.name
-    positions = tuple(k for k, axis in enumerate(x.long) if axis in axes)
-    free = [k for k in range(len(x.shape)) if k not in axes]
-    rows = x.places.transpose(*free, *axes)
-    rows = rows.reshape(math.prod(rows.shape[: len(free)]), -1)
-    aval: Any = call.eqn.outvars[0].aval
-    is_lexicographic = jnp.issubdtype(aval.dtype, jnp.complexfloating)
-    if name in _EXTREMES and (is_lexicographic or (positions and rows.shape[1] > 1)):
-        # Each of several largest entries has its share of the derivative, in whichever column it
-        # is.
-        return None
-    entries = x.entries
-    if positions:
-        x = call.through(x)
-        params = call.params | {"axes": positions}
-
-        def column(e: Any) -> Any:
-            sides = list(jnp.shape(e))
-            for k in positions:
-                sides[k] = x.sides[k]
-            return call.eqn.primitive.bind(spread(e, sides), **params)
-
-        entries = list(map(column, x.entries))
+def reduced(eqn: JaxprEqn, values: Sequence[Any]) -> np.ndarray | None:
+    x, axes, name = numbers(values[0]), eqn.params["axes"], eqn.primitive.name
+    aval: Any = eqn.outvars[0].aval
+    if name in _EXTREMES and jnp.issubdtype(aval.dtype, jnp.complexfloating):
+        return None  # In the order of a dictionary.
+    free = [k for k in range(x.ndim) if k not in axes]
+    rows = x.transpose(*free, *axes).reshape(math.prod(aval.shape), -1)
     if name in _EXTREMES and is_inexact(aval):
         combine = functools.partial(_extreme, _EXTREMES[name])
     else:
         combine = functools.partial(functools.reduce, _COMBINED[name])
-    outs = (combine(aligned([jnp.asarray(entries[k]) for k in row])) for row in rows)
-    return StructOfArrays(outs, call.shape, [x.is_short[k] for k in free])
+    return array_of([combine(list(map(of_jax, row))) for row in rows], aval.shape)
 
 
 _EXTREMES: dict[str, Callable[[Any, Any], Any]] = {"reduce_max": lax.max, "reduce_min": lax.min}
 _COMBINED = _EXTREMES | {
-    "reduce_and": operator.and_,
-    "reduce_or": operator.or_,
-    "reduce_prod": operator.mul,
-    "reduce_sum": operator.add,
+    "reduce_and": lax.bitwise_and,
+    "reduce_or": lax.bitwise_or,
+    "reduce_prod": lax.mul,
+    "reduce_sum": lax.add,
 }
 
 
@@ -116,102 +66,30 @@ def _(combine, primals, tangents):
     (entries,), (moving,) = primals, tangents
     extreme = _extreme(combine, entries)
     shares = [lax.convert_element_type(lax.eq(x, extreme), extreme.dtype) for x in entries]
-    total = functools.reduce(operator.add, map(operator.mul, moving, shares))
-    return extreme, total / functools.reduce(operator.add, shares)
+    total = functools.reduce(lax.add, map(lax.mul, moving, shares))
+    return extreme, total / functools.reduce(lax.add, shares)
 
 
-def cumulative(call: Call) -> StructOfArrays | None:
-    x, axis = call.first(), call.params["axis"]
-    if x.is_short[axis]:
-        return None
-    params = call.params | {"axis": x.long.index(axis)}
-    return x.mapped(lambda e: call.eqn.primitive.bind(spread(e, x.sides), **params), x.shape)
-
-
-def transformed(call: Call) -> StructOfArrays | None:
-    """Fourier transforms along the last axes."""
-    x, n = call.first(), len(call.params["fft_lengths"])
-    if any(x.is_short[len(x.shape) - n :]) or 1 in call.shape[-n:]:
-        return None
-    fun = lambda e: call.eqn.primitive.bind(spread(e, x.sides), **call.params)  # noqa: E731
-    return x.mapped(fun, call.shape)
-
-
-class _Factor(NamedTuple):
-    """One side of a product, with its axes in the order that both agree on."""
-
-    # The places of the entries: by batch, by row, by what is summed.
-    places: np.ndarray
-    entries: list[Any]
-    # Whether the axes of the result that come of the row are short.
-    is_short: list[bool]
-    # How many long axes: of the batch, free, summed.
-    long: list[int]
-
-
-def _factor(x: StructOfArrays, batch: Sequence[int], summed: Sequence[int]) -> _Factor:
-    free = [k for k in range(len(x.shape)) if k not in (*batch, *summed)]
-    groups = batch, free, summed
-    order = [*batch, *free, *summed]
-    position = {axis: k for k, axis in enumerate(x.long)}
-    moves = [position[k] for k in order if not x.is_short[k]]
-    long = [sum(not x.is_short[k] for k in group) for group in groups]
-
-    def column(e: Any) -> Any:
-        e = e if moves == sorted(moves) else jnp.transpose(e, moves)
-        # A sum counts what repeats.
-        return spread(e, [x.sides[k] for k in moves]) if long[2] else e
-
-    sizes = [math.prod(x.inner[k] for k in group) for group in groups]
-    places = x.places.transpose(order).reshape(sizes)
-    return _Factor(places, list(map(column, x.entries)), [x.is_short[k] for k in free], long)
-
-
-def product(call: Call) -> StructOfArrays | None:
-    """Small products for each place along the long axes, or products along these."""
-    params = call.params
-    sums, batches = params["dimension_numbers"]
-    x, y = call.arrays()
-    avals: list[Any] = [v.aval for v in (*call.eqn.invars, *call.eqn.outvars)]
+def product(eqn: JaxprEqn, values: Sequence[Any]) -> np.ndarray | None:
+    """`dot_general` of two small arrays."""
+    sums, batches = eqn.params["dimension_numbers"]
+    avals: list[Any] = [v.aval for v in (*eqn.invars, *eqn.outvars)]
     if len({aval.dtype for aval in avals}) != 1:
         return None
-    # Axes that belong together are apart in both, or in none.
-    flags = [list(x.is_short), list(y.is_short)]
-    pairs = itertools.chain(zip(*sums, strict=True), zip(*batches, strict=True))
-    for k, (a, b) in enumerate(pairs):
-        is_sum = k < len(sums[0])
-        if flags[0][a] != flags[1][b]:
-            flags[0][a] = flags[1][b] = is_sum and x.shape[a] <= MAX_LENGTH
-        if is_sum and not flags[0][a] and not any(call.fixed):
-            return None  # Of two matrices, which XLA knows best.
-    x, y = conformed(x, x.shape, flags[0]), conformed(y, y.shape, flags[1])
-    left, right = _factor(x, batches[0], sums[0]), _factor(y, batches[1], sums[1])
-    if left.places.size * right.places.shape[1] > MAX_PRODUCT:
+    left, right = map(_factor, map(numbers, values), batches, sums)
+    if left.size * right.shape[1] > MAX_PRODUCT:
         return None
-    batch, free, summed = left.long
-    options = {k: params[k] for k in ("precision", "preferred_element_type")}
+    pairs = zip(left, right, strict=True)
+    outs = [_dot(row, column) for xs, ys in pairs for row in xs for column in ys]
+    return array_of(outs, avals[-1].shape)
 
-    def times(a: Any, b: Any) -> Any:
-        if summed:
-            ends = range(a.ndim - summed, a.ndim), range(b.ndim - summed, b.ndim)
-            return lax.dot_general(a, b, (ends, (range(batch), range(batch))), **options)
-        if right.long[1]:
-            a = jnp.expand_dims(a, range(a.ndim, a.ndim + right.long[1]))
-        if free:
-            b = jnp.expand_dims(b, range(batch, batch + free))
-        return operator.mul(*aligned((a, b)))
 
-    def dot(row: np.ndarray, column: np.ndarray) -> Any:
-        pairs = zip(row, column, strict=True)
-        return functools.reduce(
-            operator.add, (times(left.entries[i], right.entries[j]) for i, j in pairs)
-        )
+def _factor(x: np.ndarray, batch: Sequence[int], summed: Sequence[int]) -> np.ndarray:
+    """One side of a product: by batch, by row, by what is summed."""
+    free = [k for k in range(x.ndim) if k not in (*batch, *summed)]
+    sides = [math.prod(x.shape[k] for k in axes) for axes in (batch, free, summed)]
+    return x.transpose(*batch, *free, *summed).reshape(sides)
 
-    outs = [
-        dot(row, column)
-        for above, below in zip(left.places, right.places, strict=True)
-        for row in above
-        for column in below
-    ]
-    is_short = [x.is_short[k] for k in batches[0]]
-    return StructOfArrays(outs, call.shape, [*is_short, *left.is_short, *right.is_short])
+
+def _dot(row: np.ndarray, column: np.ndarray) -> Any:
+    return functools.reduce(lax.add, map(lax.mul, row, column))

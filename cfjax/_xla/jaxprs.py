@@ -6,28 +6,19 @@ from typing import Any
 
 import jax
 import jax.numpy as jnp
-import numpy as np
 from jax.extend.core import (
     ClosedJaxpr,
     DropVar,
     Jaxpr,
     JaxprEqn,
     Literal,
-    Primitive,
-    Var,
     jaxpr_as_fun,
     jaxprs_in_params,
 )
-from jax.interpreters import mlir
 from jaxtyping import Array
-
-# A program as it stands, for one that is being traced.
-call_p = Primitive("cfjax_call")
-call_p.multiple_results = True
 
 # Operations that call a program, and under which parameter.
 CALLS = {
-    "cfjax_call": "program",
     "closed_call": "call_jaxpr",
     "custom_jvp_call": "call_jaxpr",
     "custom_vmap_call": "call",
@@ -130,69 +121,6 @@ def evaluate(eqn: JaxprEqn, values: Sequence[Any]) -> Sequence[Any]:
     return [None if isinstance(v, DropVar) else next(outs) for v in eqn.outvars]
 
 
-def called(program: ClosedJaxpr, operands: Sequence[Any]) -> list[Array]:
-    """The results of a program, which is traced and lowered as one operation.
-
-    `jaxpr_as_fun` would trace it again, operation by operation.
-    """
-    return call_p.bind(*program.consts, *operands, program=without_constants(program))
-
-
-def without_constants(program: ClosedJaxpr) -> ClosedJaxpr:
-    """The program that takes what it closes over before its operands, and keeps none of it."""
-    jaxpr = program.jaxpr
-    invars = [*jaxpr.constvars, *jaxpr.invars]
-    return ClosedJaxpr(altered(jaxpr, constvars=[], invars=invars), [])
-
-
-def renamed(atoms: Iterable[Any], names: dict[Any, Any]) -> list[Any]:
-    """The atoms, of which some variables have other names."""
-    return [v if isinstance(v, Literal) else names.get(v, v) for v in atoms]
-
-
-def flattened(program: ClosedJaxpr, calls: Container[str], is_once: bool = False) -> ClosedJaxpr:
-    """The program without calls of some kinds, and `is_once` with everything once that is computed
-    alike.
-    """
-    consts: dict[int, tuple[Var, Any]] = {}
-    eqns: list[JaxprEqn] = []
-    computed: dict[Any, list[Any]] = {}
-
-    def run(program: ClosedJaxpr, atoms: Sequence[Any]) -> list[Any]:
-        jaxpr, names = program.jaxpr, dict(zip(program.jaxpr.invars, atoms, strict=True))
-        for v, value in zip(jaxpr.constvars, program.consts, strict=True):
-            names[v], _ = consts.setdefault(id(value), (Var(v.aval), value))
-        for eqn in jaxpr.eqns:
-            invars, name = renamed(eqn.invars, names), eqn.primitive.name
-            if name in calls:
-                outvars = run(eqn.params[CALLS[name]], invars)
-            else:
-                key = _key(eqn, invars) if is_once else object()
-                outvars = computed.get(key)
-                if outvars is None:
-                    outvars = [v if isinstance(v, DropVar) else Var(v.aval) for v in eqn.outvars]
-                    computed[key] = outvars
-                    eqns.append(eqn.replace(invars=invars, outvars=outvars))
-            names.update(zip(eqn.outvars, outvars, strict=True))
-        return renamed(jaxpr.outvars, names)
-
-    outvars = run(program, program.jaxpr.invars)
-    constvars, values = zip(*consts.values(), strict=True) if consts else ((), ())
-    jaxpr = altered(program.jaxpr, constvars=list(constvars), eqns=eqns, outvars=outvars)
-    return ClosedJaxpr(without_dead_code(jaxpr), list(values))
-
-
-def _key(eqn: JaxprEqn, invars: Sequence[Any]) -> Hashable:
-    """What tells an operation from others."""
-    atoms = (
-        # Every bit: as text, numbers that agree in eight digits would be one.
-        (str(v.aval), np.asarray(v.val).tobytes()) if isinstance(v, Literal) else v
-        for v in invars
-    )
-    dropped = [isinstance(v, DropVar) for v in eqn.outvars]
-    return eqn.primitive, *atoms, *dropped, parameters(eqn)
-
-
 def parameters(eqn: JaxprEqn) -> Hashable:
     """What tells the operation from others on the same operands."""
     values = tuple(sorted(eqn.params.items(), key=lambda item: item[0]))
@@ -201,23 +129,3 @@ def parameters(eqn: JaxprEqn) -> Hashable:
     except TypeError:
         return object()  # Equal to no other, so such operations are never merged.
     return values
-
-
-@call_p.def_impl
-def _run(*operands, program):
-    # A literal comes out as NumPy's.
-    return list(map(jnp.asarray, jaxpr_as_fun(program)(*operands)))
-
-
-@call_p.def_abstract_eval
-def _(*operands, program):
-    return program.out_avals
-
-
-mlir.register_lowering(
-    call_p,
-    lambda ctx, *args, program: mlir.core_call_lowering(
-        ctx, *args, name="cfjax", call_jaxpr=program.jaxpr
-    ),
-)
-call_p.to_lojax = _run

@@ -6,8 +6,7 @@ They were set on two cores with AVX-512. What follows from one of them is below 
 
 import jax
 
-# The longest vector that is scalarised. A pose is a quaternion and a position. (attitude,
-# leading_axes)
+# The longest vector that is scalarised. A pose is a quaternion and a position. (attitude)
 MAX_LENGTH = 7
 # A product of two arrays is scalarised into at most this many products of numbers, those of two
 # 6 x 6 matrices. (fields)
@@ -27,22 +26,12 @@ MAX_STAGES = 16
 # the step and a result. As many directions or parameters are few, too. (chain)
 MAX_ENTRIES = {"step": 16, "loop": 2 * 16 + 2}
 
-# XLA takes what more entries are made of apart, and computes all that leads there for each of them.
-# (scenes, adaptive steps)
-MAX_RESULTS = 15
-# The most entries that are materialised together in a batch. If there are more, XLA does not
-# compute several members at once in a vector, which takes three times as long, and from 18 entries
-# on five times or more. (batch)
-MAX_RESULTS_IN_BATCHES = 13
+# The most numbers that are materialised together. If there are more, XLA does not compute several
+# members of a batch at once in a vector, which takes three times as long, and from 18 numbers on
+# five times or more. (batch)
+MAX_RESULTS = 13
 
-# About as many operations XLA puts into one function.
-_FUNCTION = 2000
-# From jax 0.12 on XLA compiles a loop of one system as one function, and on single numbers it gains
-# nothing. Before, what two functions need it computes in both, in long programs exponentially
-# often.
-_IS_NEW = jax.__version_info__ >= (0, 12)
-# The most operations of one system. (gradients, compile)
-FLAT_ONE = 0 if _IS_NEW else 2 * _FUNCTION
-# The most operations of many systems: of a batch, or of short vectors along leading axes.
-# (gradients, batch, chain)
-FLAT_MANY = (20 if _IS_NEW else 2) * _FUNCTION
+# The most operations on single numbers of a step, with its loops unrolled. Before jax 0.12 XLA
+# computes what two of its functions need in both, in long programs exponentially often, and a
+# function has some 2000. (gradients, batch, chain)
+MAX_OPERATIONS = 40_000 if jax.__version_info__ >= (0, 12) else 4000

@@ -32,11 +32,6 @@ def chosen(predicate: Array, yes: Callable[[], PyTree], no: Callable[[], PyTree]
         return lax.cond(predicate, yes, no)
 
 
-def kept_on_arrays(predicate: Array) -> Array:
-    """The same predicate, by a branch, so that a step it is part of is not scalarised."""
-    return lax.cond(predicate, lambda: True, lambda: False)
-
-
 def computed_again(value: PyTree, compute: Callable[[], PyTree]) -> PyTree:
     """`value`, which `compute()` computes again where this is scalarised and not differentiated.
 

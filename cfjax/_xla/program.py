@@ -1,12 +1,10 @@
-"""A step on single numbers instead of short vectors, and on one array for each of their entries.
+"""The program of a step, on single numbers instead of short vectors.
 
 XLA fuses numbers well and vectors of three badly: it computes what several entries need once for
 each of them, or materialises it. So the program of a step is read, and evaluated again with
-every small array as its entries. In a state with leading axes, many short vectors, the entries
-are arrays of these axes.
+every small array as its entries.
 """
 
-import functools
 import itertools
 import math
 from collections.abc import Callable, Sequence
@@ -29,55 +27,27 @@ from .jaxprs import (
     are_among,
     evaluate,
     is_inexact,
-    structs,
     without_dead_code,
 )
-from .limits import (
-    FLAT_MANY,
-    MAX_ENTRIES,
-    MAX_LENGTH,
-    MAX_SIZE,
-)
+from .limits import MAX_ENTRIES, MAX_OPERATIONS, MAX_SIZE
 from .materialise import materialised, materialised_p
-from .over_stages import Loop, is_scalarised_p
-from .rules import on_entries
-from .scope import is_numeric, is_on, is_rows, is_short, unread, within
-from .smooth import by_fixed, has_reciprocals, scaled_reciprocal
-from .struct_of_arrays import (
-    StructOfArrays,
-    apart_like,
-    common,
-    conformed,
+from .numbers import (
+    array_of,
+    as_array,
+    as_tree,
     is_small,
-    is_small_shape,
     is_whole,
     literal,
+    numbers,
+    of_jax,
     static_value,
-    struct_of_arrays,
+    whole,
 )
+from .over_stages import Loop, is_scalarised_p
+from .rules import on_numbers
+from .scope import is_numeric, is_on, is_short, is_small_shape, unread, within
+from .smooth import by_fixed, has_reciprocals, scaled_reciprocal
 from .understood import MOVES, REDUCTIONS, is_in_place, is_readable
-
-
-def split(tree: PyTree, rows: bool = False) -> PyTree:
-    """The tree, small arrays as scalars and with `rows` short vectors as structs of arrays."""
-
-    def apart(x: Any) -> Any:
-        return struct_of_arrays(x) if is_small(x) or (rows and is_rows(x)) else x
-
-    return jtu.tree_map(apart, tree, is_leaf=_is_apart)
-
-
-def join(tree: PyTree) -> PyTree:
-    """The reverse of `split`."""
-    return jtu.tree_map(_whole, tree, is_leaf=_is_apart)
-
-
-def _is_apart(x: Any) -> bool:
-    return isinstance(x, StructOfArrays)
-
-
-def _whole(x: Any) -> Any:
-    return x.whole() if _is_apart(x) else x
 
 
 class Declined(Exception):
@@ -88,13 +58,12 @@ class Reading(NamedTuple):
     """The program of a function that can be scalarised.
 
     It takes what the function closes over first, but for what is known now. `shape` is that of its
-    results. With `rows` its state has short vectors along leading axes.
+    results.
     """
 
     program: ClosedJaxpr
     parameters: Sequence[Array]
     shape: PyTree
-    rows: bool
 
 
 def read(
@@ -102,23 +71,24 @@ def read(
 ) -> Reading | None:
     """The program of `fun` at `y`, which has at most so many entries.
 
-    None if it does not pay or cannot be scalarised. It must have no effects and be readable
+    None if it cannot be scalarised or is too long. It must have no effects and be readable
     (`is_readable`).
     """
-    rows = _has_rows(y, max_entries)
-    if not is_on() or not (rows or _is_small_state(y, max_entries)):
+    leaves = jtu.tree_leaves(y)
+    is_small_state = any(map(is_short, leaves)) and all(
+        is_short(x) or (np.ndim(x) == 0 and is_numeric(x)) for x in leaves
+    )
+    if not (is_on() and is_small_state and sum(map(np.size, leaves)) <= max_entries):
         return None
     with within():
         jaxpr, shape = jax.make_jaxpr(fun, return_shape=True)(y)
     try:
         code = without_dead_code(jaxpr.jaxpr)
-        if jaxpr.effects or not is_readable(code):
-            return None
-        if length(code) > FLAT_MANY:
+        if jaxpr.effects or not is_readable(code) or length(code) > MAX_OPERATIONS:
             return None
     except Exception as error:
         return unread(error)
-    return Reading(*_with_parameters(code, jaxpr.consts), shape, rows)
+    return Reading(*_with_parameters(code, jaxpr.consts), shape)
 
 
 def _with_parameters(code: Jaxpr, consts: Sequence[Any]) -> tuple[ClosedJaxpr, list[Array]]:
@@ -128,47 +98,6 @@ def _with_parameters(code: Jaxpr, consts: Sequence[Any]) -> tuple[ClosedJaxpr, l
     invars = [*(v for v, _ in parameters), *code.invars]
     code = altered(code, constvars=[v for v, _ in static], invars=invars)
     return ClosedJaxpr(code, [x for _, x in static]), [jnp.asarray(x) for _, x in parameters]
-
-
-def on_numbers(
-    program: ClosedJaxpr,
-    fixed: Sequence[bool],
-    operands: Sequence[Any],
-    rows: bool,
-    is_last: bool = True,
-) -> list[Any]:
-    """The results of a program, apart. So are its operands.
-
-    `fixed` says which of them are the same in every step, and `is_last` whether nothing is
-    differentiated any more.
-    """
-    jaxpr = program.jaxpr
-    form = _Form(rows, has_reciprocals(jaxpr, fixed), is_last, {})
-    outs, _ = _evaluate(program, operands, fixed, form)
-    likes = jax.eval_shape(functools.partial(split, rows=rows), structs(program.out_avals))
-    # What is known before the program runs may come out as NumPy's.
-    outs = [x if _is_apart(x) else jnp.asarray(x) for x in outs]
-    pairs = zip(likes, outs, strict=True)
-    return [apart_like(like, x) if _is_apart(like) else _whole(x) for like, x in pairs]
-
-
-def _is_small_state(y: PyTree, max_entries: int) -> bool:
-    leaves = jtu.tree_leaves(y)
-    return (
-        any(map(is_short, leaves))
-        and all(is_short(x) or (np.ndim(x) == 0 and is_numeric(x)) for x in leaves)
-        and sum(map(np.size, leaves)) <= max_entries
-    )
-
-
-def _has_rows(y: PyTree, max_entries: int) -> bool:
-    """Whether this is a state with short vectors along leading axes."""
-    leaves = jtu.tree_leaves(y)
-    return (
-        any(map(is_rows, leaves))
-        and all(map(is_numeric, leaves))
-        and sum(map(_entries, map(np.shape, leaves))) <= max_entries
-    )
 
 
 def length(jaxpr: Jaxpr) -> float:
@@ -198,22 +127,41 @@ def _length_of(eqn: JaxprEqn) -> float:
         terms = 2 * math.prod(left.shape[k] for k in axes)
         terms = terms if terms <= 2 * MAX_SIZE else 1
     elif name in REDUCTIONS:
-        terms = _entries(getattr(eqn.invars[0].aval, "shape", ()))
-    shapes: list[tuple[int, ...]] = [getattr(v.aval, "shape", ()) for v in eqn.outvars]
-    return sum(terms * n for n in map(_entries, shapes))
+        terms = _entries(eqn.invars[0])
+    return sum(terms * _entries(v) for v in eqn.outvars)
 
 
-def _entries(shape: tuple[int, ...]) -> int:
-    """About how many numbers or whole arrays an array is scalarised into, if it is."""
-    if is_small_shape(shape):
-        return math.prod(shape)
-    return shape[-1] if len(shape) > 1 and shape[-1] <= MAX_LENGTH else 1
+def _entries(v: Any) -> int:
+    """How many numbers or whole arrays an array is scalarised into."""
+    shape = getattr(v.aval, "shape", ())
+    return math.prod(shape) if is_small_shape(shape) else 1
+
+
+def of_numbers(
+    program: ClosedJaxpr, fixed: Sequence[bool], operands: Sequence[Any], is_last: bool = True
+) -> list[Any]:
+    """The results of a program, apart. So are its operands.
+
+    `fixed` says which of them are the same in every step, and `is_last` whether nothing is
+    differentiated any more.
+    """
+    form = _Form(has_reciprocals(program.jaxpr, fixed), is_last, {})
+    outs, _ = _evaluate(program, list(map(as_array, operands)), fixed, form)
+    return list(map(_result, outs))
+
+
+def _result(x: Any) -> Any:
+    """As `split` has it, and without what is NumPy's."""
+    if is_whole(x) and not is_small(x):
+        return x
+    x = numbers(x)
+    x = array_of(list(map(of_jax, x.flat)), x.shape)
+    return as_tree(x) if x.shape else x[()]
 
 
 class _Form(NamedTuple):
     """How a program is scalarised."""
 
-    rows: bool  # It has arrays with leading axes.
     has_reciprocals: bool  # In the place of divisions by what is fixed.
     is_last: bool  # Nothing is differentiated any more.
     literals: dict[Any, Any]  # Each is made once.
@@ -227,8 +175,7 @@ def _evaluate(
     varying = set(itertools.compress(jaxpr.invars, (not x for x in fixed)))
     env: dict[Any, Any] = {}
     for v, x in zip((*jaxpr.constvars, *jaxpr.invars), (*consts, *operands), strict=True):
-        is_array = isinstance(x, np.ndarray) and x.ndim > 0
-        env[v] = struct_of_arrays(x) if is_array or is_small(x) else x
+        env[v] = numbers(x) if is_small(x) else x
 
     def read(v: Any) -> Any:
         if not isinstance(v, Literal):
@@ -267,13 +214,14 @@ def _evaluate(
             x, divisor = values
             if id(divisor) not in divisors:
                 # With the divisor, so that it is not forgotten and its identity used again.
-                divisors[id(divisor)] = *scaled_reciprocal(divisor), divisor
+                parts = map(as_array, scaled_reciprocal(as_tree(divisor)))
+                divisors[id(divisor)] = *parts, divisor
             scale, reciprocal, _ = divisors[id(divisor)]
             eqn = eqn.replace(primitive=lax.mul_p, params=_PARAMETERS_OF_A_PRODUCT)
-            outs = _results(eqn, [x, scale], fixed, form)
-            outs = _results(eqn, [*outs, reciprocal], fixed, form)
+            outs = _results(eqn, [x, scale])
+            outs = _results(eqn, [*outs, reciprocal])
         else:
-            outs = _results(eqn, values, fixed, form)
+            outs = _results(eqn, values)
         env.update(zip(eqn.outvars, outs, strict=True))
         varying.update(v for v, x in zip(eqn.outvars, outs_fixed, strict=True) if not x)
     return list(map(read, jaxpr.outvars)), [not x for x in are_among(jaxpr.outvars, varying)]
@@ -300,21 +248,14 @@ def _unrolled(
 
 def _entry(x: Any, k: int) -> Any:
     """Entry k along the first axis."""
-    if not _is_apart(x):
-        return x[k]
-    places = x.places[k]
-    return x.at(places, x.shape[1:], x.is_short[1:]) if x.shape[1:] else x.entries[int(places)]
+    return np.asarray(x[k]) if isinstance(x, np.ndarray) and x.dtype != object else x[k]
 
 
 def _stacked(rows: Sequence[Any]) -> Any:
     """Rows along a new first axis."""
     if any(map(is_whole, rows)):
-        return jnp.stack(list(map(_whole, rows)))
-    parts = list(map(struct_of_arrays, rows))
-    shape = parts[0].shape
-    flags = common(parts, shape)
-    entries = [e for x in parts for e in conformed(x, shape, flags).entries]
-    return StructOfArrays(entries, (len(parts), *shape), [True, *flags])
+        return jnp.stack(list(map(whole, rows)))
+    return np.stack(list(map(numbers, rows)))
 
 
 def _is_static(x: Any) -> bool:
@@ -332,9 +273,9 @@ def _constant(x: Any) -> Any:
     if not is_numeric(x) or not is_inexact(np.asarray(x)):
         return x
     # As JAX's, which may overflow.
-    if np.ndim(x) == 0 or np.size(x) > _MAX_STATIC or is_rows(x):
+    if np.ndim(x) == 0 or np.size(x) > _MAX_STATIC:
         return jnp.asarray(x)
-    return StructOfArrays(list(map(jnp.asarray, np.ravel(x))), np.shape(x))
+    return array_of(list(map(jnp.asarray, np.ravel(x))), np.shape(x))
 
 
 # As of the weights of a method of 16 stages.
@@ -343,12 +284,15 @@ _MAX_STATIC = 4 * MAX_SIZE
 _PARAMETERS_OF_A_PRODUCT = jax.make_jaxpr(lax.mul)(1.0, 1.0).jaxpr.eqns[0].params
 
 
-def _results(eqn: JaxprEqn, values: list[Any], fixed: Sequence[bool], form: _Form) -> Sequence[Any]:
-    """The results of one operation: scalarised, if there is a rule for it."""
+def _results(eqn: JaxprEqn, values: list[Any]) -> Sequence[Any]:
+    """The results of one operation: on numbers, if there is a rule for it."""
     if eqn.primitive is materialised_p:
-        leaves, structure = jtu.tree_flatten(values)
-        return structure.unflatten(materialised(leaves, **eqn.params))
-    outs = on_entries(eqn, values, fixed, form.rows)
-    if outs is None and is_in_place(eqn):
+        leaves, structure = jtu.tree_flatten(list(map(as_tree, values)))
+        return list(map(as_array, structure.unflatten(materialised(leaves))))
+    outs = on_numbers(eqn, values)
+    if outs is not None:
+        return outs
+    if is_in_place(eqn):
         raise Declined
-    return list(map(split, evaluate(eqn, list(map(_whole, values))))) if outs is None else outs
+    outs = evaluate(eqn, list(map(whole, values)))
+    return [numbers(x) if is_small(x) else x for x in outs]

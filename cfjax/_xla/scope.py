@@ -1,6 +1,7 @@
-"""What is rewritten: the switch, the place within a program, and short vectors."""
+"""What is rewritten: the switch, the place within a program, and what is small."""
 
 import contextlib
+import math
 import os
 import warnings
 from typing import Any
@@ -9,24 +10,18 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from .limits import MAX_LENGTH, MAX_SIZE
+from .limits import MAX_LENGTH, MAX_SIZE, MAX_STAGES
 
 # JAX compiles anew where it changes.
-_on = jax.make_user_context({"0": False, "1": True}.get(os.environ.get("CFJAX_REWRITE", "")))
+_on = jax.make_user_context(os.environ.get("CFJAX_REWRITE", "") != "0")
 
 
-def rewriting(on: bool | None) -> contextlib.AbstractContextManager:
-    """Switches the rewriting of small systems for XLA on or off within a `with` block.
+def rewriting(on: bool) -> contextlib.AbstractContextManager:
+    """Switches the rewriting of small systems for XLA off, or on again, within a `with` block.
 
-    Rewriting makes steps of many systems several times faster on CPU and GPU, and takes time to
-    compile. The values agree to rounding.
-
-    - None, the default: rewrites batches, and short vectors along leading axes. Before jax 0.12
-      also short programs of one system.
-    - True: rewrites one system too. Gradients of long solves may then take half the time, and up to
-      7 times as long to compile. Values and Jacobians rarely gain.
-    - False: XLA gets every program as it was traced, for debugging and for programs that run a few
-      times.
+    Rewriting makes steps of batches several times faster on CPU and GPU, and takes time to compile.
+    The values agree to rounding. Without it XLA gets every program as it was traced, for debugging
+    and for batches that run a few times. A single system is never rewritten.
 
     The environment variable `CFJAX_REWRITE`, 0 or 1, sets the default of a process.
 
@@ -35,22 +30,17 @@ def rewriting(on: bool | None) -> contextlib.AbstractContextManager:
         sol = cfjax.integrate(term, solver, 0.0, 1.0, y0, num_steps=100)
     ```
 
-    **Raises** `TypeError` if `on` is neither a bool nor None.
+    **Raises** `TypeError` if `on` is not a bool.
     """
-    if not (on is None or isinstance(on, bool)):
-        raise TypeError(f"on must be True, False or None, got {on!r}.")
+    if not isinstance(on, bool):
+        raise TypeError(f"on must be True or False, got {on!r}.")
     return _on(on)
 
 
 def is_on() -> bool:
     # Values that say how they are spread over a mesh: nothing here hands that on.
     axes = jax.sharding.get_abstract_mesh().axis_types or ()
-    return _on.value is not False and all(kind == jax.sharding.AxisType.Auto for kind in axes)
-
-
-def is_everywhere() -> bool:
-    """Whether one system is scalarised as many are."""
-    return _on.value is True
+    return _on.value and all(kind == jax.sharding.AxisType.Auto for kind in axes)
 
 
 def unread(error: Exception) -> None:
@@ -84,10 +74,11 @@ def is_short(x: Any) -> bool:
     return np.ndim(x) == 1 and 1 <= np.size(x) <= MAX_LENGTH and is_numeric(x)
 
 
-def is_rows(x: Any) -> bool:
-    """Whether these are many short vectors along leading axes, more than are taken one by one."""
-    length = np.shape(x)[-1] if np.ndim(x) > 1 else 0
-    return 1 < length <= MAX_LENGTH and np.size(x) > length * MAX_SIZE and is_numeric(x)
+def is_small_shape(shape: tuple[int, ...]) -> bool:
+    """Whether arrays of this shape are of few entries, or of a short vector for each stage."""
+    if math.prod(shape) <= MAX_SIZE:
+        return True
+    return len(shape) == 2 and shape[0] <= MAX_STAGES and shape[1] <= MAX_LENGTH
 
 
 def is_numeric(x: Any) -> bool:

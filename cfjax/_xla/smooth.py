@@ -25,11 +25,10 @@ from .understood import is_understood
 _SCOPE = "cfjax_smooth"
 # Functions that are smooth wherever they have values, and those that only move entries or add them.
 _SMOOTH = frozenset(
-    "acos acosh add add_any asin asinh atan atan2 atanh broadcast_in_dim cbrt cfjax_pack "
-    "cfjax_unpack complex concatenate conj copy cos cosh cumprod cumsum div dot_general erf exp "
-    "exp2 expm1 fft imag integer_pow log log1p logistic mul neg pad pow real reduce_prod "
-    "reduce_sum reshape rev rsqrt scatter-add scatter-mul sin sinh slice split sqrt square "
-    "squeeze stack stop_gradient sub tan tanh transpose unstack".split()
+    "acos acosh add add_any asin asinh atan atan2 atanh broadcast_in_dim cbrt complex concatenate "
+    "conj copy cos cosh div dot_general erf exp exp2 expm1 imag integer_pow log log1p logistic mul "
+    "neg pad pow real reduce_prod reduce_sum reshape rev rsqrt scatter-add scatter-mul sin sinh "
+    "slice split sqrt square squeeze stack stop_gradient sub tan tanh transpose unstack".split()
 )
 # Which of their operands may be what a division gives. The others are indices and predicates.
 _SMOOTH_IN_PART = {

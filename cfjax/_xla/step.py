@@ -10,7 +10,6 @@ the numbers, which knows what is zero; in the derivative of a loop over stages z
 others are, and the program is up to twice as long.
 """
 
-import functools
 from collections.abc import Callable, Sequence
 from typing import Any, NamedTuple
 
@@ -19,30 +18,16 @@ import jax.numpy as jnp
 import jax.tree_util as jtu
 from jax import lax
 from jax.core import ShapedArray
-from jax.extend.core import ClosedJaxpr, JaxprEqn, Primitive, jaxpr_as_fun
+from jax.extend.core import ClosedJaxpr, JaxprEqn, Literal, Primitive, jaxpr_as_fun
 from jax.interpreters import ad, batching, mlir
 from jaxtyping import PyTree
 
-from .jaxprs import (
-    CALLS,
-    called,
-    flattened,
-    is_inexact,
-    narrowed,
-    program_of,
-    reached,
-    replaced,
-    structs,
-)
-from .limits import (
-    FLAT_MANY,
-    FLAT_ONE,
-    MAX_ENTRIES,
-    MAX_RESULTS_IN_BATCHES,
-)
-from .materialise import not_materialised, together
-from .program import Declined, Reading, join, length, on_numbers, read, split
-from .scope import is_everywhere, is_rewritten, unread
+from .jaxprs import is_inexact, narrowed, program_of, reached, replaced, structs
+from .limits import MAX_ENTRIES, MAX_OPERATIONS, MAX_RESULTS
+from .materialise import together
+from .numbers import join, split
+from .program import Declined, Reading, length, of_numbers, read
+from .scope import is_rewritten, unread
 
 step_p = Primitive("cfjax_step")
 step_p.multiple_results = True
@@ -108,19 +93,12 @@ class Kind(NamedTuple):
 
     # Which operands the step closes over.
     fixed: tuple[bool, ...]
-    # Whether the state has short vectors along leading axes.
-    rows: bool
-    # Whether one system is treated as many are.
-    is_everywhere: bool
     # Whether values are left as they are if they are differentiated.
     only_values: bool = False
     # The axes of each `vmap` around it, the innermost first.
     levels: tuple[tuple[int | None, ...], ...] = ()
     # How many of the last operands it is linear in, if it is a derivative.
     linear: int = 0
-    # Whether its results are materialised together, as what needs several of them would compute it
-    # anew for each.
-    is_once: bool = False
     # What a derivative is derived from.
     of: Of | None = None
 
@@ -131,19 +109,12 @@ class Kind(NamedTuple):
 
     @property
     def is_many(self) -> bool:
-        """Whether it is of many systems, or treated as if it were."""
-        levels = range(len(self.levels))
-        return self.rows or self.is_everywhere or not all(map(self.is_of_directions, levels))
-
-    def limit(self) -> int:
-        """How long a program may be, to be scalarised."""
-        if self.linear and self.only_values:
-            return 0
-        return FLAT_MANY if self.is_many else FLAT_ONE
+        """Whether it is of many systems."""
+        return not all(map(self.is_of_directions, range(len(self.levels))))
 
 
 def scalarised(fun: Callable[[PyTree], PyTree], y: PyTree, only_values: bool = False) -> PyTree:
-    """`fun(y)`, computed on single numbers for many systems with a small state of short vectors.
+    """`fun(y)`, in a batch computed on single numbers, if `y` is a small state of short vectors.
 
     The result agrees with that of `fun` to rounding. `fun` may close over traced values. Operations
     that have no rule get the array whole. Where `y` is another state or the program cannot be
@@ -152,16 +123,13 @@ def scalarised(fun: Callable[[PyTree], PyTree], y: PyTree, only_values: bool = F
     closes over, and computes the step again.
     """
     reading = None if is_rewritten() else read(fun, y)
-    if reading is None:
-        return fun(y)
-    structure = jtu.tree_structure(reading.shape)
-    outs = bound(reading, list(map(jnp.asarray, jtu.tree_leaves(y))), only_values)
-    return jtu.tree_unflatten(structure, outs)
+    return fun(y) if reading is None else bound(reading, y, only_values)
 
 
-def bound(reading: Reading, state: Sequence[Any], only_values: bool = False) -> list[Any]:
+def bound(reading: Reading, y: PyTree, only_values: bool = False) -> PyTree:
     """The results of a step as one operation. `Kind` says what the other arguments are."""
     program, parameters = reading.program, reading.parameters
+    state = list(map(jnp.asarray, jtu.tree_leaves(y)))
     operands, outs = [*parameters, *state], program.out_avals
     fixed = (*[True] * len(parameters), *[False] * len(state))
     # Integers that depend on integers alone, as the number of a step, are on their own: a transpose
@@ -170,11 +138,18 @@ def bound(reading: Reading, state: Sequence[Any], only_values: bool = False) -> 
     exact = [k for k, x in enumerate(outs) if not (is_inexact(x) or are_reached[k])]
     others = _others(outs, exact)
     code, _ = narrowed(program, others, range(len(operands)))
-    kind = Kind(fixed, reading.rows, is_everywhere(), only_values)
+    kind = Kind(fixed, only_values)
     new = step_p.bind(*operands, program=code, kind=kind)
     counting, places = narrowed(program, exact)
     counts = map(jnp.asarray, jaxpr_as_fun(counting)(*(operands[k] for k in places)))
-    return replaced(replaced([None] * len(outs), others, new), exact, list(counts))
+    leaves = replaced(replaced([None] * len(outs), others, new), exact, list(counts))
+    # What it returns as it is stays the same object.
+    same = {v: x for v, x in zip(program.jaxpr.invars, operands, strict=True)}
+    leaves = [
+        x if isinstance(v, Literal) else same.get(v, x)
+        for v, x in zip(program.jaxpr.outvars, leaves, strict=True)
+    ]
+    return jtu.tree_unflatten(jtu.tree_structure(reading.shape), leaves)
 
 
 @step_p.def_abstract_eval
@@ -216,8 +191,7 @@ def _jvp(primals, tangents, *, program, kind):
 
 
 def _derivative(kind: Kind, of: Of, operands: Sequence[Any]) -> list[Any]:
-    kind = kind._replace(is_once=True, of=of)
-    return step_p.bind(*operands, program=of.derived(), kind=kind)
+    return step_p.bind(*operands, program=of.derived(), kind=kind._replace(of=of))
 
 
 def _transpose(cotangents, *operands, program, kind):
@@ -278,32 +252,51 @@ def _one_of(xs):
 
 @step_p.def_impl
 def _run(*operands, program, kind):
-    if length(program.jaxpr) > kind.limit() or (kind.levels and not kind.is_many):
+    is_left = kind.linear and kind.only_values
+    if not kind.is_many or is_left or length(program.jaxpr) > MAX_OPERATIONS:
         return _as_traced(operands, program, kind)
     for k, size in enumerate(reversed(_sizes(operands, kind.levels))):
         if kind.is_of_directions(k) and size <= MAX_ENTRIES["step"]:
             return _one_by_one(operands, program, kind, k)
-    if kind.linear and kind.levels:
+    try:
+        return _on_numbers(operands, program, kind)
+    except Declined:
+        pass
+    except Exception as error:
+        unread(error)
+    return _as_traced(operands, program, kind)
+
+
+def _on_numbers(operands, program, kind) -> list[Any]:
+    fun = _of_numbers(program, kind.fixed, kind.of)
+    # But for what is known, as the derivative by what has no part in it.
+    are_reached = reached(program.jaxpr, [kind.of is not None] * len(operands))
+    coming = [k for k, is_one in enumerate(are_reached) if is_one]
+
+    def of_members(*operands: Any) -> list[Any]:
+        outs = fun(*split(operands))
+        # What needs several results of a derivative would compute it anew for each. More of them
+        # are left to XLA, which drops what nobody uses.
+        leaves, structure = jtu.tree_flatten([outs[k] for k in coming])
+        if len(leaves) <= MAX_RESULTS:
+            outs = replaced(outs, coming, structure.unflatten(together(leaves)))
+        return join(outs)
+
+    if kind.linear:
         # What is kept of many steps lies entry beside entry, and XLA would read it where it lies,
         # one member at a time: `CF4` on 1000 bodies took 6.5 ms for 50 steps, and takes 3.0 ms.
         operands = together(operands)
-    outs = _flat(operands, program, kind)
-    return _as_traced(operands, program, kind) if outs is None else outs
+    return _in_batches(of_members, kind.levels)(*operands)
 
 
 def _of_numbers(
-    program: ClosedJaxpr,
-    fixed: Sequence[bool],
-    of: Of | None,
-    rows: bool,
-    is_last: bool = True,
+    program: ClosedJaxpr, fixed: Sequence[bool], of: Of | None, is_last: bool = True
 ) -> Callable[..., list[Any]]:
     """The program of operands that are apart. A derivative is that of the numbers."""
     if of is None:
-        return lambda *xs: on_numbers(program, fixed, xs, rows, is_last)
-    fun = _of_numbers(of.program, of.fixed, of.of, rows, False)
-    shapes = jax.eval_shape(functools.partial(split, rows=rows), structs(of.program.in_avals))
-    return of.applied(fun, shapes)
+        return lambda *xs: of_numbers(program, fixed, xs, is_last)
+    fun = _of_numbers(of.program, of.fixed, of.of, False)
+    return of.applied(fun, jax.eval_shape(split, structs(of.program.in_avals)))
 
 
 def _one_by_one(operands, program, kind, k):
@@ -324,36 +317,6 @@ def _one_by_one(operands, program, kind, k):
     return [jnp.moveaxis(x, 0, len(levels) - 1 - k) for x in outs]
 
 
-def _flat(operands: Sequence[Any], program: ClosedJaxpr, kind: Kind) -> list[Any] | None:
-    """The results, computed on single numbers; None if the program declines."""
-    levels, rows = kind.levels, kind.rows
-    fun = _of_numbers(program, kind.fixed, kind.of, rows)
-
-    def apart(k: int) -> Any:
-        axes = [(axes[k],) for axes in levels if axes[k] is not None]
-        return _in_batches(functools.partial(split, rows=rows), axes)(operands[k])
-
-    entries = [apart(k) for k in range(len(operands))]
-    try:
-        closed, out = jax.make_jaxpr(_in_batches(fun, levels), return_shape=True)(*entries)
-        code = flattened(closed, CALLS, is_once=True)
-    except Declined:
-        return None
-    except Exception as error:
-        return unread(error)
-    leaves = jtu.tree_leaves(entries)
-    new = called(code, leaves)
-    if kind.is_once:
-        # But for what is known, as the derivative by what has no part in it.
-        are_reached = reached(code.jaxpr, [True] * len(leaves))
-        places = [k for k, is_one in enumerate(are_reached) if is_one]
-        # More results are left to XLA, which drops what nobody uses.
-        if len(places) <= MAX_RESULTS_IN_BATCHES:
-            new = together(new, places)
-    outs = jtu.tree_unflatten(jtu.tree_structure(out), new)
-    return [_in_batches(join, [(0,)] * len(levels))(x) for x in outs]
-
-
 def whole(eqn: JaxprEqn) -> ClosedJaxpr:
     """The program of an operation as it was traced, of all members of a batch."""
     program, levels = eqn.params["program"], eqn.params["kind"].levels
@@ -362,7 +325,7 @@ def whole(eqn: JaxprEqn) -> ClosedJaxpr:
 
 
 def _as_traced(operands, program, kind) -> list[Any]:
-    fun = _in_batches(jaxpr_as_fun(not_materialised(program)), kind.levels)
+    fun = _in_batches(jaxpr_as_fun(program), kind.levels)
     # A literal comes out as NumPy's.
     return list(map(jnp.asarray, fun(*operands)))
 

@@ -18,23 +18,18 @@ ELEMENTWISE = frozenset(
 REDUCTIONS = frozenset("reduce_and reduce_max reduce_min reduce_or reduce_prod reduce_sum".split())
 # Operations that only move entries.
 MOVES = frozenset(
-    "broadcast_in_dim cfjax_pack cfjax_unpack concatenate dynamic_slice dynamic_update_slice "
-    "gather pad reshape rev scatter slice split squeeze stack transpose unstack".split()
+    "broadcast_in_dim concatenate dynamic_slice dynamic_update_slice gather pad reshape rev "
+    "scatter slice split squeeze stack transpose unstack".split()
 )
 # The parameters of each operation. The rules of elementwise ones hand all of theirs on.
 _HANDED_ON = "accuracy input_dtype new_dtype out_dtype rounding_method sharding weak_type y"
 _INDEXED = "dimension_numbers indices_are_sorted mode unique_indices "
 _TEXTS: dict[str, str] = {
     "broadcast_in_dim": "broadcast_dimensions shape sharding",
-    "cfjax_pack": "axis sums",
-    "cfjax_unpack": "axis",
     "concatenate": "dimension",
-    "cumprod": "axis reverse",
-    "cumsum": "axis reverse",
     "dot_general": "dimension_numbers out_sharding precision preferred_element_type",
     "dynamic_slice": "slice_sizes",
     "dynamic_update_slice": "",
-    "fft": "fft_lengths fft_type",
     "gather": _INDEXED + "fill_value slice_sizes",
     "pad": "padding_config",
     "reshape": "dimensions new_sizes sharding",

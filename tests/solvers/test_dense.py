@@ -36,8 +36,8 @@ def test_output_within_a_step_is_a_short_program():
     def within(t):
         return solver.interpolation_cls(t0=times[0], t1=times[1], **info).evaluate(t)
 
-    # 8 flows of 8 stages, whose weights have 5 powers of the time: 832 number by number, else 197.
-    assert problems.num_operations(jax.make_jaxpr(within)(0.05).jaxpr) < 250
+    # 8 flows of 8 stages, whose weights have 5 powers of the time: 832 number by number, else 259.
+    assert problems.num_operations(jax.make_jaxpr(within)(0.05).jaxpr) < 300
 
 
 def dense(solver, n, field, y0, args, t1=1.0, **kwargs):

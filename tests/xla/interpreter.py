@@ -24,8 +24,7 @@ _made: dict[int, ClosedJaxpr] = {}
 
 _CALLS = {"jit": "jaxpr", "pjit": "jaxpr", "closed_call": "call_jaxpr", "core_call": "call_jaxpr",
           "custom_jvp_call": "call_jaxpr", "custom_vjp_call": "call_jaxpr", "checkpoint": "jaxpr",
-          "remat2": "jaxpr", "cfjax_call": "program", "cfjax_operation": "program",
-          "custom_lin": "call_jaxpr"}  # fmt: skip
+          "remat2": "jaxpr", "custom_lin": "call_jaxpr"}  # fmt: skip
 
 
 def run(fun: Callable[..., Any], *args: Any) -> Any:
@@ -503,8 +502,6 @@ _RULES: dict[str, Callable[..., Any]] = {
     "shift_right_logical": _logical,
     "shift_right_arithmetic": _shifted_right,
     "cfjax_materialised": lambda *xs, aval, **_: list(xs),
-    "cfjax_pack": lambda *xs, aval, axis, **_: np.stack(xs, axis),
-    "cfjax_unpack": lambda x, *, aval, axis: [x.take(k, axis) for k in range(x.shape[axis])],
     "clamp": _clamp,
     "complex": _complex_of,
     "concatenate": lambda *xs, aval, dimension: np.concatenate(xs, dimension),

@@ -1,18 +1,54 @@
-"""What goes through memory. That nothing else changes is in test_pack.py."""
+"""What goes through memory: the same numbers, and computed once."""
 
 import re
+import sys
 
-import diffrax
 import jax
 import jax.numpy as jnp
+import meshes
 import numpy as np
 import pytest
+from xla.interpreter import run
 
 import cfjax
-from cfjax._xla import scalarised
-from cfjax._xla.materialise import materialised
-from cfjax._xla.pack import pack, unpack
-from cfjax.scenes import rigid_body
+from cfjax._xla import materialised, pack, scalarised, unpack
+
+RNG = np.random.default_rng(0)
+
+
+def weighted(keep):
+    """A function whose derivatives differ from entry to entry. One entry is never used."""
+
+    def fun(x, y):
+        a, b, c = unpack(y)
+        whole = jnp.stack(keep([x * a, jnp.sin(b * x), x * x, c * a, x]))
+        return jnp.sum(jnp.exp(whole[1:4] / 2) * whole[:3])
+
+    return fun
+
+
+TRANSFORMS = [
+    jax.grad,
+    lambda f: jax.grad(f, 1),
+    lambda f: lambda x, y: jax.jvp(f, (x, y), (x + 1, y * y)),
+    lambda f: lambda x, y: jax.jvp(lambda x: f(x, y), (x,), (x + 1,)),
+    lambda f: jax.hessian(f, 1),
+    lambda f: jax.grad(lambda x, y: jnp.sum(jax.grad(f, 1)(x, y) ** 2)),
+    lambda f: lambda x, y: jax.vmap(jax.grad(f), (None, 0))(x, jnp.stack([y, y * y])),
+    lambda f: lambda x, y: jax.vmap(f, (0, 1), 0)(y[:2], jnp.stack([y, y * y], 1)),
+    lambda f: jax.grad(lambda x, y: jnp.sum(jax.vmap(f, (0, None))(x * y, y))),
+]
+
+
+def test_transformations():
+    def all_of(keep):
+        return lambda x, y: [transform(weighted(keep))(x, y) for transform in TRANSFORMS]
+
+    x, y = jnp.asarray(0.7), jnp.asarray(RNG.normal(size=3))
+    found, expected = run(all_of(materialised), x, y), run(all_of(list), x, y)
+    # The same sums of at most some ten terms, perhaps in another order.
+    for a, b in zip(jax.tree.leaves(found), jax.tree.leaves(expected), strict=True):
+        np.testing.assert_allclose(a, b, rtol=0, atol=1e-13)
 
 
 def test_what_is_materialised_is_computed_once():
@@ -27,9 +63,34 @@ def test_what_is_materialised_is_computed_once():
             entries = keep(entries)
             return pack(entries), pack([a * a for a in entries])
 
-        return jax.jit(fun).lower(jnp.ones(3)).compile().cost_analysis()["flops"]
+        batch = jax.jit(jax.vmap(fun)).lower(jnp.ones((5, 3)))
+        return batch.compile().cost_analysis()["flops"]
 
     assert program(materialised) < program(list)
+
+
+def test_only_in_a_batch():
+    """There a call is what XLA does not fuse. In a derivative too."""
+
+    def has_call(transform, is_batch, is_mark=False):
+        def fun(x):
+            return jnp.sum(jnp.sin(pack(materialised(unpack(x * x), is_mark))))
+
+        made = jax.vmap(transform(fun)) if is_batch else transform(fun)
+        text = jax.jit(made).lower(jnp.ones((5, 3) if is_batch else 3)).compile().as_text()
+        return " call(" in str(text)
+
+    for transform in (lambda fun: fun, jax.grad):
+        assert has_call(transform, True)
+        assert not has_call(transform, False)
+        # A mark is nothing by itself.
+        assert not has_call(transform, True, is_mark=True)
+
+
+def test_other_dtypes_stay():
+    x = [jnp.asarray(True), jnp.asarray(3), jnp.asarray(0.5), jnp.asarray(2j, np.complex64)]
+    for got, want in zip(jax.jit(lambda x: materialised(x))(x), x, strict=True):
+        assert got.dtype == want.dtype and got == want
 
 
 def test_increments_of_a_step_are_computed_together(rewritten):
@@ -50,55 +111,6 @@ def test_increments_of_a_step_are_computed_together(rewritten):
     assert 7 in map(sum, lengths)
 
 
-# The estimate of the first needs the field at the end, that of the second does not.
-@pytest.mark.representatives(1)
-@pytest.mark.parametrize("solver", [cfjax.CF4(), cfjax.CF43(), cfjax.RKMK(diffrax.Tsit5.tableau)])
-def test_a_step_is_computed_once_and_its_error_goes_through_memory(rewritten, solver):
-    """It was computed four or five times: for each entry of the end, for the error and for a ratio
-    in it. And of two sums in one function XLA makes, of what they share, a tree of calls, which
-    takes a hundred times as long as the step.
-    """
-    functions = _functions(rigid_body, solver)
-    # A step is more than 500 operations, a norm some tens.
-    assert len([size for size, _ in functions if size > 500]) == 1
-    assert all(size < 200 for size, sums in functions if sums > 1)
-
-
-def _functions(scene, solver):
-    """How long each function of XLA's program for adaptive steps is, and its number of sums."""
-    given = scene.problem()
-
-    def solve(y0, args):
-        controller = diffrax.PIDController(rtol=0.0, atol=1e-6)
-        return diffrax.diffeqsolve(
-            given["term"], solver, 0.0, 1.0, 0.1, y0, args, stepsize_controller=controller
-        ).ys
-
-    program = jax.jit(solve).lower(given["y0"], given["args"]).compile().as_text()
-    functions = re.findall(r"^%fused_computation[^\n]*\n(?:  .*\n)*", program, flags=re.MULTILINE)
-    return [(text.count("\n"), text.count(" reduce(")) for text in functions]
-
-
-def test_in_a_batch_only_if_asked_for():
-    """There a call is what XLA does not fuse. In a derivative too."""
-
-    def has_call(in_batches, transform):
-        def fun(x):
-            return jnp.sum(jnp.sin(pack(materialised(unpack(x * x), in_batches=in_batches))))
-
-        batch = jax.jit(jax.vmap(transform(fun)))
-        return " call(" in str(batch.lower(jnp.ones((5, 3))).compile().as_text())
-
-    assert has_call(True, lambda fun: fun) and has_call(True, jax.grad)
-    assert not has_call(False, lambda fun: fun)
-
-
-def test_other_dtypes_stay():
-    x = [jnp.asarray(True), jnp.asarray(3), jnp.asarray(0.5), jnp.asarray(2j, np.complex64)]
-    for got, want in zip(jax.jit(lambda x: materialised(x))(x), x, strict=True):
-        assert got.dtype == want.dtype and got == want
-
-
 def test_a_linear_solve_in_a_program_that_is_left_as_it_was_traced(rewritten):
     """Its programs have names."""
 
@@ -108,3 +120,23 @@ def test_a_linear_solve_in_a_program_that_is_left_as_it_was_traced(rewritten):
     both = jax.jit(lambda y: (scalarised(fun, y, only_values=True), fun(y)))
     # The same operations.
     np.testing.assert_allclose(*both(jnp.arange(3.0)), rtol=1e-15)
+
+
+def over_a_batch(ys):
+    def one(y):
+        entries = unpack(y)
+        # It has an entry of the batch, and one that all have.
+        whole = pack([*entries, jnp.asarray(2.0)])
+        along = materialised([whole, *entries])
+        return jnp.sum(along[0]) * pack(along[1:])
+
+    return jax.vmap(one)(ys) + jax.grad(lambda ys: jnp.sum(jax.vmap(one)(ys) ** 2))(ys)
+
+
+@pytest.mark.slow
+def test_a_batch_on_a_mesh_is_that_on_one_device():
+    meshes.check(__file__, [f"packed, {kind}" for kind in meshes.KINDS], "both")
+
+
+if __name__ == "__main__":
+    meshes.show(sys.argv[1], [("packed", over_a_batch, False)])

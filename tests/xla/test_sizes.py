@@ -9,7 +9,7 @@ import cfjax
 import compile_programs
 import results
 
-pytestmark = pytest.mark.usefixtures("rewritten_by_default")
+pytestmark = pytest.mark.usefixtures("rewritten")
 
 INERTIA = jnp.array([3.0, 2.0, 1.0])
 CRAFT = {"q": jnp.array([1.0, 0.0, 0.0, 0.0]), "m": jnp.array([0.05, 1.0, 0.0])}

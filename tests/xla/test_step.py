@@ -39,7 +39,7 @@ def lengths(request, monkeypatch):
     # Forgets the programs of the other way, of the same functions.
     jax.clear_caches()
     if request.param == "as traced":
-        monkeypatch.setattr(random_programs.lowering, "FLAT_MANY", 0)
+        monkeypatch.setattr(random_programs.lowering, "MAX_OPERATIONS", 0)
     yield request.param
     jax.clear_caches()
 
