@@ -26,25 +26,13 @@ def each(fun: Callable[..., PyTree], num_axes: int) -> Callable[..., PyTree]:
     """Maps `fun`, a function of arrays without leading axes, over so many leading axes.
 
     An axis of 1 is broadcast, and what depends only on such arrays is computed once. An array that
-    `fun` returns unchanged stays the same object, and arguments that are one object stay one. For
-    many elements of short vectors XLA gets `fun` on single numbers.
+    `fun` returns unchanged stays the same object, and arguments that are one object stay one.
 
     **Raises** `ValueError` where the axes do not broadcast.
     """
-
-    def mapped(*args: PyTree) -> PyTree:
-        sides = [np.shape(x)[:num_axes] for x in jtu.tree_leaves(args)]
-        is_many = max(map(math.prod, sides)) > limits.MAX_SIZE
-        one = (lambda *args: scalarised(lambda args: fun(*args), args)) if is_many else fun
-        return _each(one, num_axes)(*args)
-
-    return mapped if num_axes else fun
-
-
-def _each(fun: Callable[..., PyTree], num_axes: int) -> Callable[..., PyTree]:
     if num_axes == 0:
         return fun
-    inner = _each(fun, num_axes - 1)
+    inner = each(fun, num_axes - 1)
 
     def mapped(*args: PyTree) -> PyTree:
         leaves, treedef = jtu.tree_flatten(args)
@@ -76,6 +64,18 @@ def _each(fun: Callable[..., PyTree], num_axes: int) -> Callable[..., PyTree]:
         )
 
     return mapped
+
+
+def each_flow(fun: Callable[..., PyTree], num_axes: int) -> Callable[..., PyTree]:
+    """The same of a flow, which XLA gets on single numbers if many short vectors are moved."""
+
+    def mapped(*args: PyTree) -> PyTree:
+        sides = [np.shape(x)[:num_axes] for x in jtu.tree_leaves(args)]
+        is_many = max(map(math.prod, sides)) > limits.MAX_SIZE
+        one = (lambda *args: scalarised(lambda args: fun(*args), args)) if is_many else fun
+        return each(one, num_axes)(*args)
+
+    return mapped if num_axes else fun
 
 
 def each_of_its_own(field: Any, num_axes: int, point: Array) -> Any:
@@ -201,13 +201,15 @@ class Elementwise(AbstractFrozenField):
         return self.field.acts_on_subtree
 
     def flow(self, point: Any) -> Any:
-        return self._each(lambda field, point: field.flow(point))(self.field, point)
+        flow = each_flow(lambda field, point: field.flow(point), self.num_axes)
+        return flow(self.field, point)
 
     def tangent(self, point: Any) -> Any:
         return self._each(lambda field, point: field.tangent(point))(self.field, point)
 
     def increment(self, point: Any) -> Any:
-        return self._each(lambda field, point: field.increment(point))(self.field, point)
+        increment = each_flow(lambda field, point: field.increment(point), self.num_axes)
+        return increment(self.field, point)
 
     def framed(self, point: Any) -> Any:
         framed = self._each(lambda field, point: field.framed(point))(self.field, point)

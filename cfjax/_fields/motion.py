@@ -11,7 +11,15 @@ from .._field import AbstractAlgebraElement
 from .._numerics.matmul import matmul
 from .._numerics.quaternion import Frame
 from .coordinates import Pose
-from .elementwise import check_other, check_point, check_real, each, each_of_its_own, elementwise
+from .elementwise import (
+    check_other,
+    check_point,
+    check_real,
+    each,
+    each_flow,
+    each_of_its_own,
+    elementwise,
+)
 
 
 class AbstractMotion(AbstractAlgebraElement):
@@ -38,10 +46,12 @@ class AbstractMotion(AbstractAlgebraElement):
     numerics: ClassVar[Any]
 
     def flow(self, point: Float[Array, "..."]) -> Float[Array, "..."]:
-        return point + self._each(partial(self.numerics.increment, leads_back=False), point)
+        return point + self._each(
+            partial(self.numerics.increment, leads_back=False), point, each_flow
+        )
 
     def increment(self, point: Float[Array, "..."]) -> Float[Array, "..."]:
-        return self._each(partial(self.numerics.increment, leads_back=True), point)
+        return self._each(partial(self.numerics.increment, leads_back=True), point, each_flow)
 
     def tangent(self, point: Float[Array, "..."]) -> Float[Array, "..."]:
         return self._each(self.numerics.tangent, point)
@@ -139,7 +149,7 @@ class AbstractMotion(AbstractAlgebraElement):
     def _check_point(self, point: Array) -> None:
         check_point(self, self.vector, self._num_axes, self._pose_shapes, point)
 
-    def _each(self, fun: Any, point: Array) -> Any:
+    def _each(self, fun: Any, point: Array, each: Any = each) -> Any:
         axes = self._num_axes
         self._check_point(point)
         dtype = getattr(self, self.vector).dtype
