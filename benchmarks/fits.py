@@ -47,12 +47,8 @@ SOLVERS = {
     "RKMK8": cfjax.RKMK8(),
     "Projected(Dopri8)": cfjax.Projected(diffrax.Dopri8()),
 }
-# Whether one system is rewritten, and how often the state is saved.
-FORMS = {
-    "every step": (False, 1),
-    "every fifth": (False, 5),
-    "every step, rewritten": (True, 1),
-}
+# How often the state is saved.
+FORMS = {"every step": 1, "every fifth": 5}
 
 
 def fit(field: Any, solver: Any, save_every: int) -> Callable[[Any, Any], Any]:
@@ -78,11 +74,10 @@ def measure(quick: bool) -> Iterator[results.Row]:
         args = jax.tree.map(jnp.asarray, args)
         for name, solver in SOLVERS.items():
             runs, seconds = [], {}
-            for form, (is_on, save_every) in FORMS.items():
-                with cfjax.rewriting(is_on):
-                    begin = time.process_time()
-                    run = results.compiled(fit(field, solver, save_every), *args, repeats=REPEATS)
-                    seconds[form] = time.process_time() - begin
+            for form, save_every in FORMS.items():
+                begin = time.process_time()
+                run = results.compiled(fit(field, solver, save_every), *args, repeats=REPEATS)
+                seconds[form] = time.process_time() - begin
                 runs.append(run)
             times = take_turns(runs, repeats=5 if quick else 25) / REPEATS
             base = times[list(FORMS).index("every fifth")]

@@ -126,7 +126,7 @@ PROGRAMS: dict[str, tuple[Callable[..., Any], Any]] = {
 LEFT_OUT = {("lattice", name) for name in ("jacfwd", "jacrev", "Hessian")}
 
 
-WAYS = {"by default": None, "as traced": False}
+WAYS = {"by default": True, "as traced": False}
 
 
 def measure(quick: bool, only: tuple[str, ...] = ()) -> Iterator[results.Row]:
@@ -159,7 +159,7 @@ def measure(quick: bool, only: tuple[str, ...] = ()) -> Iterator[results.Row]:
                     }
 
 
-def _compiled(fun: Callable[..., Any], on: bool | None, y: Any) -> tuple[Callable[[], Any], float]:
+def _compiled(fun: Callable[..., Any], on: bool, y: Any) -> tuple[Callable[[], Any], float]:
     """The compiled program, and the processor seconds to trace, lower and compile."""
     with cfjax.rewriting(on):
         start = time.process_time()
