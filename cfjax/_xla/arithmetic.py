@@ -74,7 +74,8 @@ def product(eqn: JaxprEqn, values: Sequence[Any]) -> np.ndarray | None:
     """`dot_general` of two small arrays."""
     sums, batches = eqn.params["dimension_numbers"]
     avals: list[Any] = [v.aval for v in (*eqn.invars, *eqn.outvars)]
-    if len({aval.dtype for aval in avals}) != 1:
+    # Of numbers there is no product of truth values.
+    if len({aval.dtype for aval in avals}) != 1 or avals[0].dtype == bool:
         return None
     left, right = map(_factor, map(numbers, values), batches, sums)
     if left.size * right.shape[1] > MAX_PRODUCT:
