@@ -80,8 +80,8 @@ def test_what_is_unrolled_has_no_terms_that_are_zero():
         batch = batch_of(*step_of(rigid_body, cfjax.CF3(unroll=unroll)))
         return sum("stablehlo.multiply" in line for line in lines_of(*batch))
 
-    # A flow more would be forty.
-    assert 100 < products(True) <= products(None) < products(True) + 10
+    # A flow more would be forty. XLA merges what is computed twice alike.
+    assert 100 < products(True) <= products(None) < products(True) + 30
 
 
 def compiled(fun):
