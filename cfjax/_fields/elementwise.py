@@ -22,16 +22,19 @@ from .._field import (
 from .._numerics.vectors import limits, scalarised
 
 
-def each(fun: Callable[..., PyTree], num_axes: int) -> Callable[..., PyTree]:
+def each(fun: Callable[..., PyTree], num_axes: int, is_flow: bool = False) -> Callable[..., PyTree]:
     """Maps `fun`, a function of arrays without leading axes, over so many leading axes.
 
     An axis of 1 is broadcast, and what depends only on such arrays is computed once. An array that
-    `fun` returns unchanged stays the same object, and arguments that are one object stay one.
+    `fun` returns unchanged stays the same object, and arguments that are one object stay one. A
+    flow of many short vectors XLA gets on single numbers.
 
     **Raises** `ValueError` where the axes do not broadcast.
     """
     if num_axes == 0:
         return fun
+    if is_flow:
+        return _each_on_numbers(fun, num_axes)
     inner = each(fun, num_axes - 1)
 
     def mapped(*args: PyTree) -> PyTree:
@@ -66,16 +69,14 @@ def each(fun: Callable[..., PyTree], num_axes: int) -> Callable[..., PyTree]:
     return mapped
 
 
-def each_flow(fun: Callable[..., PyTree], num_axes: int) -> Callable[..., PyTree]:
-    """The same of a flow, which XLA gets on single numbers if many short vectors are moved."""
-
+def _each_on_numbers(fun: Callable[..., PyTree], num_axes: int) -> Callable[..., PyTree]:
     def mapped(*args: PyTree) -> PyTree:
         sides = [np.shape(x)[:num_axes] for x in jtu.tree_leaves(args)]
         is_many = max(map(math.prod, sides)) > limits.MAX_SIZE
         one = (lambda *args: scalarised(lambda args: fun(*args), args)) if is_many else fun
         return each(one, num_axes)(*args)
 
-    return mapped if num_axes else fun
+    return mapped
 
 
 def each_of_its_own(field: Any, num_axes: int, point: Array) -> Any:
@@ -201,14 +202,14 @@ class Elementwise(AbstractFrozenField):
         return self.field.acts_on_subtree
 
     def flow(self, point: Any) -> Any:
-        flow = each_flow(lambda field, point: field.flow(point), self.num_axes)
+        flow = each(lambda field, point: field.flow(point), self.num_axes, is_flow=True)
         return flow(self.field, point)
 
     def tangent(self, point: Any) -> Any:
         return self._each(lambda field, point: field.tangent(point))(self.field, point)
 
     def increment(self, point: Any) -> Any:
-        increment = each_flow(lambda field, point: field.increment(point), self.num_axes)
+        increment = each(lambda field, point: field.increment(point), self.num_axes, is_flow=True)
         return increment(self.field, point)
 
     def framed(self, point: Any) -> Any:

@@ -11,15 +11,7 @@ from .._field import AbstractAlgebraElement
 from .._numerics.matmul import matmul
 from .._numerics.quaternion import Frame
 from .coordinates import Pose
-from .elementwise import (
-    check_other,
-    check_point,
-    check_real,
-    each,
-    each_flow,
-    each_of_its_own,
-    elementwise,
-)
+from .elementwise import check_other, check_point, check_real, each, each_of_its_own, elementwise
 
 
 class AbstractMotion(AbstractAlgebraElement):
@@ -47,11 +39,11 @@ class AbstractMotion(AbstractAlgebraElement):
 
     def flow(self, point: Float[Array, "..."]) -> Float[Array, "..."]:
         return point + self._each(
-            partial(self.numerics.increment, leads_back=False), point, each_flow
+            partial(self.numerics.increment, leads_back=False), point, is_flow=True
         )
 
     def increment(self, point: Float[Array, "..."]) -> Float[Array, "..."]:
-        return self._each(partial(self.numerics.increment, leads_back=True), point, each_flow)
+        return self._each(partial(self.numerics.increment, leads_back=True), point, is_flow=True)
 
     def tangent(self, point: Float[Array, "..."]) -> Float[Array, "..."]:
         return self._each(self.numerics.tangent, point)
@@ -149,7 +141,7 @@ class AbstractMotion(AbstractAlgebraElement):
     def _check_point(self, point: Array) -> None:
         check_point(self, self.vector, self._num_axes, self._pose_shapes, point)
 
-    def _each(self, fun: Any, point: Array, each: Any = each) -> Any:
+    def _each(self, fun: Any, point: Array, is_flow: bool = False) -> Any:
         axes = self._num_axes
         self._check_point(point)
         dtype = getattr(self, self.vector).dtype
@@ -161,7 +153,7 @@ class AbstractMotion(AbstractAlgebraElement):
         is_vector = point.shape[axes:] == self._pose_shapes[1]
         options = {name: getattr(self, name) for name in self.conventions if name != "layout"}
         fun = partial(fun, indices=self._indices if is_vector else (), **options)
-        return each(fun, axes)(*self._arrays, point)
+        return each(fun, axes, is_flow)(*self._arrays, point)
 
 
 class AbstractFramedMotion(AbstractMotion):

@@ -13,7 +13,7 @@ from .._field import AbstractAlgebraElement
 from .._numerics.quaternion import Frame, Layout, check_choice, increment, times
 from .._numerics.rotate import cross_product, dexpinv, has_dexpinv
 from .coordinates import OfLength
-from .elementwise import check_point, each, each_flow, each_of_its_own, elementwise
+from .elementwise import check_point, each, each_of_its_own, elementwise
 from .rotation import check_angular_velocity
 
 
@@ -58,10 +58,10 @@ class QuaternionRotation(AbstractAlgebraElement):
         check_angular_velocity(self.omega)
 
     def flow(self, point: Float[Array, "*batch 4"]) -> Float[Array, "*batch 4"]:
-        return point + self._each(partial(increment, leads_back=False), point, each_flow)
+        return point + self._each(partial(increment, leads_back=False), point, is_flow=True)
 
     def increment(self, point: Float[Array, "*batch 4"]) -> Float[Array, "*batch 4"]:
-        return self._each(partial(increment, leads_back=True), point, each_flow)
+        return self._each(partial(increment, leads_back=True), point, is_flow=True)
 
     def tangent(self, point: Float[Array, "*batch 4"]) -> Float[Array, "*batch 4"]:
         return self._each(times, point)
@@ -102,9 +102,9 @@ class QuaternionRotation(AbstractAlgebraElement):
     def _num_axes(self) -> int:
         return self.omega.ndim - 1
 
-    def _each(self, fun: Any, point: Array, each: Any = each) -> Array:
+    def _each(self, fun: Any, point: Array, is_flow: bool = False) -> Array:
         check_point(self, "omega", self._num_axes, [(4,)], point)
         if jnp.iscomplexobj(point):
             raise TypeError(f"QuaternionRotation acts on real arrays, got {point.dtype}.")
         fun = partial(fun, frame=self.frame, layout=self.layout)
-        return each(fun, self._num_axes)(self.omega, point)
+        return each(fun, self._num_axes, is_flow)(self.omega, point)

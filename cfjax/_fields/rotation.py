@@ -10,15 +10,7 @@ from jaxtyping import Array, Bool, Float
 from .._field import AbstractAlgebraElement
 from .._numerics.rotate import cross_product, dexpinv, has_dexpinv, increment, mean, rotate
 from .coordinates import OfLength, Polar
-from .elementwise import (
-    check_other,
-    check_point,
-    check_real,
-    each,
-    each_flow,
-    each_of_its_own,
-    elementwise,
-)
+from .elementwise import check_other, check_point, check_real, each, each_of_its_own, elementwise
 
 
 class Rotation(AbstractAlgebraElement):
@@ -50,10 +42,10 @@ class Rotation(AbstractAlgebraElement):
         check_angular_velocity(self.omega)
 
     def flow(self, point: Float[Array, "..."]) -> Float[Array, "..."]:
-        return self._each(rotate, point, each_flow)
+        return self._each(rotate, point, is_flow=True)
 
     def increment(self, point: Float[Array, "..."]) -> Float[Array, "..."]:
-        return self._each(increment, point, each_flow)
+        return self._each(increment, point, is_flow=True)
 
     def tangent(self, point: Float[Array, "..."]) -> Float[Array, "..."]:
         return self._each(cross_product, point)
@@ -91,11 +83,13 @@ class Rotation(AbstractAlgebraElement):
     def _num_axes(self) -> int:
         return self.omega.ndim - 1
 
-    def _each(self, fun: Callable[[Array, Array], Array], point: Array, each: Any = each) -> Array:
+    def _each(
+        self, fun: Callable[[Array, Array], Array], point: Array, is_flow: bool = False
+    ) -> Array:
         check_point(self, "omega", self._num_axes, [(3,), (3, "k")], point)
         if jnp.iscomplexobj(point):
             raise TypeError(f"Rotation acts on real arrays, got {point.dtype}.")
-        return each(fun, self._num_axes)(self.omega, point)
+        return each(fun, self._num_axes, is_flow)(self.omega, point)
 
 
 def check_angular_velocity(omega: Array) -> None:
