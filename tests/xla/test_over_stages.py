@@ -1,5 +1,7 @@
 """Loops over the stages of a method, which are unrolled in programs of many systems."""
 
+import re
+
 import diffrax
 import jax
 import jax.numpy as jnp
@@ -43,7 +45,10 @@ def lines_of(fun, *args):
 
 
 def num_loops(fun, *args):
-    return sum("stablehlo.while" in line for line in lines_of(fun, *args))
+    """Those over stages: the number of turns of one that has one turn goes through a barrier."""
+    lines = lines_of(fun, *args)
+    of_one_turn = sum(bool(re.search(r"optimization_barrier %\w+ : tensor<i32>", x)) for x in lines)
+    return sum("stablehlo.while" in line for line in lines) - of_one_turn
 
 
 def batch_of(fun, y, args):
@@ -63,6 +68,25 @@ def test_which_steps_are_unrolled():
     assert num_loops(jax.jacfwd(short[0]), *short[1:]) > 0
     with cfjax.rewriting(False):
         assert num_loops(*batch_of(*short)) > 0
+
+
+@pytest.mark.skipif(jax.__version_info__ < (0, 12), reason="XLA compiles shorter loops so.")
+@pytest.mark.parametrize("name", ["CF54", "RKMK8"])
+def test_a_gradient_of_a_step_in_no_loop_is_one_function(name):
+    """Otherwise XLA computes in each of its functions what they need of the others."""
+    step, y, args = step_of(rigid_body, getattr(cfjax, name)())
+    batch, ys, args = batch_of(jax.grad(size(step)), y, args)
+    text = jax.jit(batch).lower(ys, args).compile().as_text()
+    start = text.index("\nENTRY")
+    # What is long is called as one.
+    assert 'xla_cpu_small_call="true"' in text[start:]
+    lengths = {
+        name: len(lines.splitlines())
+        for name, lines in re.findall(r"\n%(\S+) .*?\{\n(.*?)\n\}", text[:start], re.DOTALL)
+    }
+    assert max(lengths.values()) > 1000
+    called = re.findall(r"fusion\(.*calls=%([\w.-]+)", text[start:])
+    assert called and max(lengths[name] for name in called) < 500
 
 
 @pytest.mark.slow
