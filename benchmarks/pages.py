@@ -218,8 +218,8 @@ def lindblad_gain() -> str:
 
 
 @number
-def batch_rkmk8() -> str:
-    rows = pick(load("batch")["rows"], method="RKMK8", what="end alone")
+def batch_end() -> str:
+    rows = pick(load("batch")["rows"], method="Projected(Dopri8)", what="end alone")
     return _medians(row["over Tsit5"] for row in rows)
 
 
@@ -399,6 +399,7 @@ def unit_quaternion() -> list[list[str]]:
     names = {
         "diffrax, Tsit5": "neither: `Tsit5` in plain space",
         "diffrax, Tsit5, projected": "divide by the norm: `Tsit5`, after each step",
+        "Projected(Dopri8)": "`QuaternionRotation` with `Projected(Dopri8())`",
         "RKMK(Dopri8)": "`QuaternionRotation` with `RKMK8`",
         "CF4": "`QuaternionRotation` with `CF4`",
     }

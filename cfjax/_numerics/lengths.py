@@ -7,6 +7,7 @@ import jax.numpy as jnp
 from jax import lax
 from jaxtyping import Array, Bool, Real
 
+from .inverses import inverse_root, reciprocal
 from .vectors import Vector, entries, pack, smooth
 
 
@@ -34,8 +35,8 @@ def length_correction(
     ratio = lax.stop_gradient(1 + e)
     is_there = (ratio >= 4 / 9) & (ratio <= 4)
     e = jnp.where(is_there, e, 0)
-    root = jnp.sqrt(1 + e)
-    factor = -e / (root * (1 + root))
+    inverse = inverse_root(1 + e)
+    factor = -e * inverse * reciprocal(1 + (1 + e) * inverse)
     return [b + factor * (a + b) for a, b in zip(y, v, strict=True)], is_there
 
 

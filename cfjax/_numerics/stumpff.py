@@ -3,7 +3,7 @@
 import functools
 from collections.abc import Sequence
 from math import factorial, pi
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -11,6 +11,7 @@ import numpy as np
 from jax import lax
 from jaxtyping import Array, Bool, Float
 
+from .inverses import factors_of_inverse_root, reciprocal
 from .polynomial import polynomial
 from .vectors import Vector, smooth
 
@@ -189,7 +190,7 @@ def cotangent_excess(s: Float[Array, "*batch"]) -> Float[Array, "*batch"]:
     a full turn on the result is 1/12 and has no meaning: see `is_below_full_turn`.
     """
     s = jnp.where(s < _FULL_TURN, s, 0)
-    return 2 * _reciprocal(_FULL_TURN - s) + polynomial(_constants(s).excess, s)
+    return 2 * reciprocal(_FULL_TURN - s) + polynomial(_constants(s).excess, s)
 
 
 def is_below_full_turn(s: Float[Array, "*batch"]) -> Bool[Array, ""]:
@@ -200,36 +201,13 @@ def is_below_full_turn(s: Float[Array, "*batch"]) -> Bool[Array, ""]:
     return jnp.all(s < _FULL_TURN) if s.ndim else s < _FULL_TURN
 
 
-@jax.custom_jvp
-def _reciprocal(x: Float[Array, "*batch"]) -> Float[Array, "*batch"]:
-    """`1 / x` for a positive x, without a division, which XLA would materialise: see `_turns`."""
-    constants = _constants(x)
-    bits = lax.bitcast_convert_type(x, constants.bits)
-    # Off by 5.1 % at most.
-    guess = lax.bitcast_convert_type(constants.reciprocal_seed - bits, x.dtype)
-    e = 1 - x * guess
-    square = e * e
-    guess = guess * (1 + e) * (1 + square) * (1 + square * square)
-    return guess + guess * (1 - x * guess)
-
-
-@_reciprocal.defjvp
-def _(primals, tangents):
-    y = _reciprocal(*primals)
-    return y, -(y * y) * tangents[0]
-
-
 class _Constants(NamedTuple):
     """Polynomials that interpolate at Chebyshev nodes, in powers of their variable."""
 
     sin: Sequence[float]  # sin(sqrt z) / sqrt z for 0 <= z <= 3.1417^2
     versin: Sequence[float]  # (1 - cos(sqrt z)) / z on the same interval
-    rsqrt: Sequence[float]  # 1 / sqrt(1 - e) for |e| <= 0.0682
     # `cotangent_excess` without its pole, for 0 <= s <= 4 pi^2.
     excess: Sequence[float]
-    seed: int
-    reciprocal_seed: int
-    bits: Any
 
 
 def _constants(x: Array) -> _Constants:
@@ -245,9 +223,7 @@ def _turns(
     the arithmetic. So 1/x comes from its exponent bits and one polynomial. No branch is needed:
     without a full turn `turns` is exactly 0, and `1 / x` is finite at x = 0 too.
     """
-    bits = lax.bitcast_convert_type(s, constants.bits)
-    guess = lax.bitcast_convert_type(constants.seed - (bits >> 1), s.dtype)
-    correction = polynomial(constants.rsqrt, 1 - (s * guess) * guess)
+    guess, correction = factors_of_inverse_root(s)
     # Grouped so that the product without the correction does not wait for it.
     turns = jnp.round(((s * (0.5 / pi)) * guess) * correction)
     # A larger angle is accurate to a hundredth of a radian at best.
@@ -268,11 +244,6 @@ _DOUBLE = _Constants(
         *(1.1470744505903215e-11, -4.779456606604926e-14, 1.5616675610328964e-16),
         *(-4.0910585753793584e-19, 8.062113626809763e-22),
     ),
-    rsqrt=(
-        *(1.0, 0.500000000000004, 0.37500000000000383, 0.3124999999828909),
-        *(0.2734374999836026, 0.2460937705876731, 0.22558595723120636, 0.20946255027202312),
-        *(0.19637092974129178, 0.18763809600293596, 0.17827435092178798),
-    ),
     excess=(
         *(0.03267274151216445, 0.0001056411070533713, 5.637370282477897e-07),
         *(3.3571419523746884e-09, 2.074286428036511e-11, 1.300065473251767e-13),
@@ -280,9 +251,6 @@ _DOUBLE = _Constants(
         *(2.565368035640021e-22, -1.07088013770628e-25, 3.5773832274050867e-26),
         *(-2.7528472959079524e-28, 2.3243625920517675e-30),
     ),
-    seed=0x5FE6E8EABEAD1636,
-    reciprocal_seed=0x7FDE623822FC16E6,
-    bits=jnp.int64,
 )
 _SINGLE = _Constants(
     sin=(
@@ -293,12 +261,8 @@ _SINGLE = _Constants(
         *(0.5, -0.041666668, 0.0013888881, -2.480112e-05),
         *(2.7543695e-07, -2.0672082e-09, 9.928024e-12),
     ),
-    rsqrt=(1.0, 0.49999833, 0.37499848, 0.3139365, 0.2747544),
     excess=(
         *(0.03267274, 0.00010564049, 5.63984e-07, 3.3205831e-09),
         *(2.3270427e-11, 4.3504524e-14, 2.160351e-15),
     ),
-    seed=0x5F374755,
-    reciprocal_seed=0x7EF311C7,
-    bits=jnp.int32,
 )

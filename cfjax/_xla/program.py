@@ -138,14 +138,18 @@ def _entries(v: Any) -> int:
 
 
 def of_numbers(
-    program: ClosedJaxpr, fixed: Sequence[bool], operands: Sequence[Any], is_last: bool = True
+    program: ClosedJaxpr,
+    fixed: Sequence[bool],
+    operands: Sequence[Any],
+    is_last: bool = True,
+    has_marks: bool = True,
 ) -> list[Any]:
     """The results of a program, apart. So are its operands.
 
-    `fixed` says which of them are the same in every step, and `is_last` whether nothing is
-    differentiated any more.
+    `fixed` says which of them are the same in every step, `is_last` whether nothing is
+    differentiated any more, and `has_marks` whether what is marked for it is materialised.
     """
-    form = _Form(has_reciprocals(program.jaxpr, fixed), is_last, {})
+    form = _Form(has_reciprocals(program.jaxpr, fixed), is_last, has_marks, {})
     outs, _ = _evaluate(program, list(map(as_array, operands)), fixed, form)
     return list(map(_result, outs))
 
@@ -164,6 +168,7 @@ class _Form(NamedTuple):
 
     has_reciprocals: bool  # In the place of divisions by what is fixed.
     is_last: bool  # Nothing is differentiated any more.
+    has_marks: bool  # What is marked for it is materialised.
     literals: dict[Any, Any]  # Each is made once.
 
 
@@ -196,6 +201,8 @@ def _evaluate(
         name = eqn.primitive.name
         if name in (OPENED_LAST if form.is_last else OPENED):
             outs, outs_fixed = _evaluate(eqn.params[CALLS[name]], values, fixed, form)
+        elif eqn.primitive is materialised_p and not form.has_marks:
+            outs = values
         elif eqn.primitive is is_scalarised_p:
             # In a derivative, what is computed again at the end of a step that fails would be zero
             # times NaN.
