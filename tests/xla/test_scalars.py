@@ -1,6 +1,7 @@
 """`scalarised`: the same numbers as the function itself, under every transformation."""
 
 import math
+from typing import Any
 
 import equinox as eqx
 import jax
@@ -391,7 +392,9 @@ def test_no_small_array_is_built_inside():
     """The reason for the file: however it is written, arithmetic is on numbers alone."""
     program = lowered(whole(lambda y: [f(y) for f in ON_NUMBERS]), Y).jaxpr
     arithmetic = {"add", "div", "dot_general", "max", "mul", "reduce_sum", "sqrt", "sub"}
-    sizes = [(e.primitive.name, math.prod(e.outvars[0].aval.shape)) for e in program.eqns]
+    avals: list[Any] = [e.outvars[0].aval for e in program.eqns]
+    names = (e.primitive.name for e in program.eqns)
+    sizes = [(name, math.prod(x.shape)) for name, x in zip(names, avals, strict=True)]
     on_numbers = [size == 1 for name, size in sizes if name in arithmetic]
     assert len(on_numbers) > 100 and all(on_numbers)
 
