@@ -192,9 +192,13 @@ def _correction(
             increment, _ = landing(_along(field, unravel(w)), unravel(end))
             return end + ravel_pytree(increment)[0]
 
-        now, pullback = jax.vjp(lambda w: values(unravel(moved(w))), jnp.zeros_like(end))
-        (rows,) = jax.vmap(pullback)(jnp.eye(len(kept), dtype=kept.dtype))
-        factors, is_independent = _solved((rows @ rows.conj().T).real, kept - now)
+        point, along = jax.vjp(moved, jnp.zeros_like(end))
+        now, pullback = jax.vjp(lambda end: values(unravel(end)), point)
+        (in_space,) = jax.vmap(pullback)(jnp.eye(len(kept), dtype=kept.dtype))
+        (rows,) = jax.vmap(along)(in_space)
+        factors, is_independent = _solved(
+            (rows @ rows.conj().T).real, kept - now, jnp.linalg.norm(in_space, axis=1)
+        )
         size = jnp.abs(kept) + jnp.abs(rows) @ jnp.abs(end)
         return moved(rows.conj().T @ factors.astype(rows.dtype)), (is_independent, size)
 
@@ -204,18 +208,21 @@ def _correction(
     return unravel(end - start), jnp.all(are_independent) & is_kept
 
 
-def _solved(gram: Real[Array, "m m"], x: Real[Array, " m"]) -> tuple[Array, Bool[Array, ""]]:
+def _solved(
+    gram: Real[Array, "m m"], x: Real[Array, " m"], lengths: Real[Array, " m"]
+) -> tuple[Array, Bool[Array, ""]]:
     """The solution of a system with products of vectors, and whether they are independent.
 
-    It is zero where they are not.
+    It is zero where they are not. A vector is zero if it is rounding beside its length before it
+    was projected.
     """
+    root = float(jnp.finfo(x.dtype).eps) ** 0.5
     scale = jnp.sqrt(jnp.diagonal(gram))
-    is_positive = jnp.all(scale > 0)
+    is_positive = jnp.all(scale > root * lengths)
     scale = jnp.where(is_positive, scale, 1)
     gram = jnp.where(is_positive, gram / jnp.outer(scale, scale), jnp.eye(len(x), dtype=x.dtype))
     factor = jnp.linalg.cholesky(lax.stop_gradient(gram))
     # The sine of the angle between a vector and those before it. NaN is no number above zero.
-    root = float(jnp.finfo(x.dtype).eps) ** 0.5
     found = is_positive & jnp.all(jnp.diagonal(factor) > root)
     gram = jnp.where(found, gram, jnp.eye(len(x), dtype=x.dtype))
     solution = jnp.linalg.solve(gram, x / scale) / scale
