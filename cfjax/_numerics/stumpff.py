@@ -134,7 +134,7 @@ def _stumpff_apart(
     branches and no divisions, which would be slow in a loop of small steps.
     """
     constants = _constants(s)
-    turns, inverse = _turns(s, constants)
+    turns, inverse = _turns(s)
     near = jnp.where(turns == 0, 1, jnp.zeros_like(s))
     excess = turns * ((2 * pi) * inverse)
     scale = 1 - excess
@@ -215,7 +215,7 @@ def _constants(x: Array) -> _Constants:
 
 
 def _turns(
-    s: Float[Array, "*batch"], constants: _Constants
+    s: Float[Array, "*batch"],
 ) -> tuple[Float[Array, "*batch"], Float[Array, "*batch"]]:
     """The number of full turns that take `x = sqrt(s)` to an angle in [-pi, pi], and `1 / x`.
 
