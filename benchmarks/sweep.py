@@ -1,10 +1,11 @@
 """What rewriting gains and costs, over all kinds of states, methods and programs.
 
-Each program is compiled as it is by default, and as it was traced (`cfjax.rewriting(False)`). The
-two take turns. A ratio above 1 is a loss, in the time of a run or in the processor time to trace,
-lower and compile.
+Each program is lowered as it is by default, and as it was traced (`cfjax.rewriting(False)`). Where
+both are the same there is nothing to measure. Else the two are compiled, and take turns. A ratio
+above 1 is a loss, in the time of a run or in the processor time to trace, lower and compile.
 """
 
+import functools
 import time
 from collections.abc import Callable, Iterator
 from typing import Any, NamedTuple
@@ -140,32 +141,34 @@ def measure(quick: bool, only: tuple[str, ...] = ()) -> Iterator[results.Row]:
                     if (state_name, program) in LEFT_OUT:
                         continue
                     fun = transform(drive(state, make(), adjoint))
-                    compiled, waits = {}, {}
-                    for way, on in WAYS.items():
-                        compiled[way], waits[way] = _compiled(fun, on, state.start)
-                    seconds = results.in_turns(compiled, repeats=200, budget=budget)
-                    ours, base = seconds["by default"], seconds["as traced"]
-                    yield {
-                        "problem": state_name,
-                        "method": method,
-                        "driver": driver,
-                        "program": program,
-                        "seconds": results.spread(ours),
-                        "over as traced": results.ratios(ours, base),
-                        "compile seconds": results.digits(waits["by default"]),
-                        "compiling over as traced": results.digits(
-                            waits["by default"] / waits["as traced"]
-                        ),
-                    }
+                    where = {"problem": state_name, "method": method}
+                    where |= {"driver": driver, "program": program}
+                    yield where | _compared(fun, state.start, budget)
 
 
-def _compiled(fun: Callable[..., Any], on: bool, y: Any) -> tuple[Callable[[], Any], float]:
-    """The compiled program, and the processor seconds to trace, lower and compile."""
-    with cfjax.rewriting(on):
-        start = time.process_time()
-        compiled = jax.jit(lambda y, a: fun(y, a)).lower(y, INERTIA).compile()
-        seconds = time.process_time() - start
-    return lambda: compiled(y, INERTIA), seconds
+def _compared(fun: Callable[..., Any], y: Any, budget: float) -> results.Row:
+    lowered, waits, compiled = {}, {}, {}
+    for way, on in WAYS.items():
+        with cfjax.rewriting(on):
+            begin = time.process_time()
+            lowered[way] = jax.jit(lambda y, a: fun(y, a)).lower(y, INERTIA)
+            waits[way] = time.process_time() - begin
+    if len({x.as_text() for x in lowered.values()}) == 1:
+        return {"is rewritten": False}
+    for way, program in lowered.items():
+        begin = time.process_time()
+        compiled[way] = functools.partial(program.compile(), y, INERTIA)
+        waits[way] += time.process_time() - begin
+    seconds = results.in_turns(compiled, repeats=200, budget=budget)
+    ours, base = seconds["by default"], seconds["as traced"]
+    over = waits["by default"] / waits["as traced"]
+    return {
+        "is rewritten": True,
+        "seconds": results.spread(ours),
+        "over as traced": results.ratios(ours, base),
+        "compile seconds": results.digits(waits["by default"]),
+        "compiling over as traced": results.digits(over),
+    }
 
 
 if __name__ == "__main__":
