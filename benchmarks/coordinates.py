@@ -29,9 +29,10 @@ from scipy.linalg import expm
 import cfjax
 import on_host
 import results
-from cfjax._integrate import equal_steps
+from cfjax._integrate import solve_steps
 from cfjax._measure.work_precision import take_turns
 from cfjax._solvers.solver import as_own
+from cfjax._times import EqualTimes
 from cfjax.scenes import toda, wilson_flow, zeitlin
 
 TARGETS = (1e-4, 1e-7, 1e-10)
@@ -188,10 +189,8 @@ class Program:
         solver = as_own(solver).without_estimate()
 
         def solve(y0: Any, args: Any, num_steps: Any, t1: Any) -> Any:
-            solution, _ = equal_steps(
-                *(term, solver, jnp.asarray(0.0), t1, y0, args, num_steps),
-                *(None, False, None, False, False),
-            )
+            times = EqualTimes(jnp.asarray(0.0), t1, num_steps)
+            solution, _ = solve_steps(term, solver, times, y0, args)
             return jax.tree_util.tree_map(lambda y: y[-1], solution.ys)
 
         self.given, self.start = given, jax.tree_util.tree_map(jnp.asarray, given.y0)

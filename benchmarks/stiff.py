@@ -28,10 +28,11 @@ from matplotlib.figure import Figure
 
 import cfjax
 import results
-from cfjax._integrate import equal_steps
+from cfjax._integrate import solve_steps
 from cfjax._measure import style as _style
 from cfjax._measure.work_precision import take_turns
 from cfjax._solvers.solver import as_own
+from cfjax._times import EqualTimes
 from stiff_problems import OTHERS, PROBLEMS, Problem, heat_diagonalised
 
 TARGETS = (1e-3, 1e-6, 1e-9)
@@ -151,8 +152,7 @@ def with_equal_steps(problem: Problem, solver: Any) -> Callable:
     t0, t1 = jnp.asarray(0.0), jnp.asarray(problem.t1)
 
     def solve(y0: Any, num_steps: Any) -> tuple:
-        options = (num_steps, None, False, None, False)
-        sol, _ = equal_steps(term, solver, t0, t1, y0, None, *options, throw=False)
+        sol, _ = solve_steps(term, solver, EqualTimes(t0, t1, num_steps), y0, None)
         assert sol.ys is not None
         return problem.values(sol.ys[-1]), num_steps, 0, True
 

@@ -1,6 +1,6 @@
 """Integration with a fixed number of steps, as one compiled loop."""
 
-from typing import Any
+from typing import Any, NamedTuple
 
 import diffrax
 import equinox as eqx
@@ -10,7 +10,7 @@ import jax.tree_util as jtu
 import numpy as np
 from jax import lax
 from jax.core import Tracer
-from jaxtyping import Array, Bool, Int, PyTree, Real
+from jaxtyping import Array, PyTree, Real
 
 from ._arguments import (
     as_state,
@@ -20,12 +20,14 @@ from ._arguments import (
     time_dtype,
     time_scalar,
 )
+from ._arrays import describe
 from ._control_term import is_driven
 from ._numerics.checks import Fault, error_if, needing
 from ._numerics.squaring import max_over_batch
 from ._solvers.base import is_finite, result_of
 from ._solvers.solver import AbstractSolver, as_own
 from ._step_back import repeat_and_undo
+from ._times import EqualTimes, GivenTimes, max_steps
 from ._xla import repeat
 
 _NOT_FINITE = (
@@ -49,14 +51,15 @@ def integrate(
     y0: PyTree,
     args: PyTree = None,
     *,
-    num_steps: int | np.integer,
+    num_steps: int | np.integer | None = None,
+    ts: Any = None,
     save_every: int | np.integer | None = None,
     save_initial: bool = False,
     checkpoint_every: int | np.integer | None = None,
     step_back: bool = False,
     throw: bool = True,
 ) -> diffrax.Solution:
-    """Integrates from `t0` to `t1` with `num_steps` equal steps of any diffrax solver.
+    """Integrates from `t0` to `t1` with `num_steps` equal steps of any diffrax solver, or to `ts`.
 
     This is a leaner loop than `diffrax.diffeqsolve`, for problems that need no more: one scan,
     constant memory, and one compilation for each shape of the arguments and each number of steps,
@@ -71,7 +74,12 @@ def integrate(
       program, as in equinox.
     - `num_steps`: the number of steps, at least 1, and not so many that a step would be shorter
       than the rounding of a time: in float32 at most 2^24, and fewer for times far from zero.
-    - `save_every`: saves the state each time this many steps are done; must divide `num_steps`. By
+    - `ts`: instead of `num_steps`, and with None for `t1`: the times at which the steps end, shape
+      `(n,)`, such as the time stamps of a log. They increase from `t0` on, or decrease. Infinity
+      after the last of them is no step, so that logs of several lengths fit in one array and one
+      batch: the state and its time stay what they were. A derivative with respect to `ts` takes
+      time proportional to n^2.
+    - `save_every`: saves the state each time this many steps are done; must divide their number. By
       default only the final state is saved.
     - `save_initial`: whether `t0` and the initial state are saved too, before all others, as with
       `diffrax.SaveAt(t0=True)`.
@@ -107,10 +115,13 @@ def integrate(
     check_own_tolerances(solver)
     y0 = as_state(y0)
     solver_to_run = as_own(solver).without_estimate()
-    num_steps = count("num_steps", num_steps)
+    dtype = time_dtype(y0)
+    t0 = time_scalar("t0", t0, dtype)
+    times = _equal_times(t0, t1, num_steps) if ts is None else _given_times(t0, t1, num_steps, ts)
+    number: Any = times.num_steps
     save_every = None if save_every is None else count("save_every", save_every)
-    if save_every is not None and num_steps % save_every:
-        raise ValueError(f"save_every must divide num_steps={num_steps}, got {save_every}.")
+    if save_every is not None and number % save_every:
+        raise ValueError(f"save_every must divide the {number} steps, got {save_every}.")
     if not isinstance(save_initial, bool):
         raise TypeError(f"save_initial must be a bool, got {save_initial!r}.")
     if checkpoint_every is not None:
@@ -132,29 +143,17 @@ def integrate(
         raise ValueError(
             "step_back does not support noise or other path-driven terms: use checkpoint_every."
         )
-    dtype = time_dtype(y0)
-    if num_steps > _max_steps(dtype):
-        raise ValueError(
-            f"num_steps must be at most {_max_steps(dtype)} for times in {dtype}, as the times of "
-            f"more steps would coincide, got {num_steps}. Make y0 float64."
-        )
-    t0, t1 = time_scalar("t0", t0, dtype), time_scalar("t1", t1, dtype)
     args = jtu.tree_map(lambda x: jnp.asarray(x) if isinstance(x, float | complex) else x, args)
     # In a program that the caller compiles, the check of errors is part of it. Other traced values,
     # be they in `args` or in what a field closes over, show in the results.
-    is_compiled = any(isinstance(x, Tracer) for x in (jnp.zeros(()), *jtu.tree_leaves((t0, y0))))
-    solution, fault = equal_steps(
+    is_compiled = any(isinstance(x, Tracer) for x in (jnp.zeros(()), *jtu.tree_leaves((times, y0))))
+    solution, fault = solve_steps(
         term,
         solver_to_run,
-        t0,
-        t1,
+        times,
         y0,
         args,
-        num_steps,
-        save_every,
-        save_initial,
-        checkpoint_every,
-        step_back,
+        Saving(save_every, save_initial, checkpoint_every, step_back),
         throw=throw and is_compiled,
         throw_in_reverse=throw and step_back,
     )
@@ -163,20 +162,27 @@ def integrate(
     return solution
 
 
+class Saving(NamedTuple):
+    """What is saved, and what reverse mode keeps: the arguments of `integrate` of these names."""
+
+    save_every: int | None = None
+    save_initial: bool = False
+    checkpoint_every: int | None = None
+    step_back: bool = False
+
+
+END_ONLY = Saving()
+
+
 @eqx.filter_jit
-def equal_steps(
+def solve_steps(
     term: PyTree[diffrax.AbstractTerm],
     solver: AbstractSolver,
-    t0: Real[Array, ""],
-    t1: Real[Array, ""],
+    times: EqualTimes | GivenTimes,
     y0: PyTree,
     args: PyTree,
-    num_steps: int | Int[Array, ""],
-    save_every: int | None,
-    save_initial: bool,
-    checkpoint_every: int | None,
-    step_back: bool,
-    throw: bool,
+    saving: Saving = END_ONLY,
+    throw: bool = False,
     throw_in_reverse: bool = False,
 ) -> tuple[diffrax.Solution, Fault]:
     """`integrate` of checked arguments, and what is wrong with them, which is an error if `throw`.
@@ -184,28 +190,17 @@ def equal_steps(
     What goes wrong in reverse mode is an error if `throw_in_reverse`: nobody sees it afterwards.
 
     If not, the program calls nothing on the host, so JAX can keep it on disk, and the states are
-    NaN. `num_steps` may be traced where only the final state is saved. Then one program serves all
-    numbers of steps, forward only.
+    NaN. The number of equal steps may be traced where only the final state is saved. Then one
+    program serves all numbers of steps, forward only.
     """
+    save_every, save_initial, checkpoint_every, step_back = saving
     # A state may have no arrays, and then nothing can go wrong.
     throw = throw and bool(jtu.tree_leaves(y0))
     if throw:
         y0 = error_if(y0, lambda y0: ~is_finite(y0), _NOT_FINITE)
-
-    if isinstance(num_steps, int):
-        n, intervals = jnp.asarray(0, jnp.int32 if num_steps < 2**31 else int), num_steps
-    else:
-        n, intervals = jnp.zeros_like(num_steps), num_steps.astype(t0.dtype)
-    is_short = _is_short(t0, t1, intervals)
-
-    h = (t1 - t0) / intervals
-    # Not as a number that is known: next to zero the compiler rounds the times within a step once
-    # less than those at its ends, and the lengths of steps would not add up to the interval.
-    t0 = lax.optimization_barrier(t0)
-
-    def time(n):
-        # From the step's number, so that rounding does not add up, and t1 is met exactly.
-        return jnp.where(n == num_steps, t1, t0 + n.astype(t0.dtype) * h)
+    grid, num_steps = times.grid(), times.num_steps
+    n, time = grid.first, grid.time
+    t0 = time(n)
 
     def step(carry, direction=1):
         n, y, solver_state, result = carry
@@ -217,26 +212,22 @@ def equal_steps(
         if not solver.shows_failure and step_result is not diffrax.RESULTS.successful:
             is_first = result == diffrax.RESULTS.successful
             result = diffrax.RESULTS.where(is_first, step_result, result)
+        if grid.is_step is not None:
+            is_step = grid.is_step(n, n + direction)
+            choose = lambda new, old: jnp.where(is_step, new, old)  # noqa: E731
+            y, solver_state, result = jtu.tree_map(choose, (y, solver_state, result), carry[1:])
         return (n + direction, y, solver_state, result)
 
     solver_state, fault = solver.start(term, t0, time(n + 1), y0, args)
-    fault = fault.with_case(
-        is_short,
-        "num_steps must leave each step longer than the rounding of t0 and t1, and the times of so "
-        f"many steps coincide in {t0.dtype}. Take fewer steps, shift the times towards zero, or "
-        "make y0 float64.",
-    )
-    for name, t in (("t0", t0), ("t1", t1)):
-        fault = fault.with_case(
-            jnp.isinf(t), f"{name} must be finite, got infinity (in {t.dtype}, that of y0)."
-        )
+    fault = fault.with_cases_of(grid.fault)
     is_static = isinstance(num_steps, int)
     valid_num_steps = num_steps if is_static else jnp.where(fault.number == 0, num_steps, 0)
     zero = (fault.error if throw else fault.nan)(jnp.zeros((), t0.dtype))
     # Not the times: if these are constants, CF54 on a heavy top takes less than half the time.
     start = needing(zero, y0)
     carry = (n, start, solver_state, diffrax.RESULTS.successful)
-    solver = solver.for_equal_steps(term, h, t0, y0, args)
+    if grid.length is not None:
+        solver = solver.for_equal_steps(term, grid.length, t0, y0, args)
 
     def advance(carry, length):
         if step_back:
@@ -273,7 +264,7 @@ def equal_steps(
     if save_initial:
         prepend = lambda initial, saved: jnp.concatenate([initial[None], saved])  # noqa: E731
         ts, ys = jtu.tree_map(prepend, (t0, start), (ts, ys))
-    ts, end = needing(zero, (ts, t1))
+    ts, end = needing(zero, (ts, grid.end))
     # Only the saved states are checked, outside the loop: sums and products keep infinity and NaN,
     # so a blow-up shows in what is saved after it.
     result = result_of(ys)
@@ -302,6 +293,32 @@ def equal_steps(
     return solution, ended.with_case(~is_finite(y0), _NOT_FINITE)
 
 
+def _equal_times(t0: Real[Array, ""], t1: Any, num_steps: Any) -> EqualTimes:
+    if num_steps is None:
+        raise ValueError(
+            "num_steps must be an integer of at least 1, got None: give num_steps, or ts for steps "
+            "of other lengths."
+        )
+    num_steps, dtype = count("num_steps", num_steps), t0.dtype
+    if num_steps > max_steps(dtype):
+        raise ValueError(
+            f"num_steps must be at most {max_steps(dtype)} for times in {dtype}, as the times of "
+            f"more steps would coincide, got {num_steps}. Make y0 float64."
+        )
+    return EqualTimes(t0, time_scalar("t1", t1, dtype), num_steps)
+
+
+def _given_times(t0: Real[Array, ""], t1: Any, num_steps: Any, ts: Any) -> GivenTimes:
+    for name, value in (("t1", t1), ("num_steps", num_steps)):
+        if value is not None:
+            raise ValueError(f"{name} must be None with ts, which has all times, got {value!r}.")
+    ts = jnp.asarray(ts)
+    is_real = any(jnp.issubdtype(ts.dtype, kind) for kind in (jnp.integer, jnp.floating))
+    if ts.ndim != 1 or not ts.size or not is_real:
+        raise ValueError(f"ts must be real times of shape (n,), n at least 1, got {describe(ts)}.")
+    return GivenTimes(t0, ts.astype(t0.dtype))
+
+
 def _checked_solution(solution: diffrax.Solution, fault: Fault) -> diffrax.Solution:
     """The solution; raises the error that `fault` or its result reports."""
     if any(isinstance(x, Tracer) for x in jtu.tree_leaves((fault, solution.result))):
@@ -317,25 +334,6 @@ def _checked_solution(solution: diffrax.Solution, fault: Fault) -> diffrax.Solut
                 _BLOW_UP if is_blow_up else diffrax.RESULTS[solution.result]
             )
     return solution
-
-
-def _max_steps(dtype: Any) -> int:
-    """How many steps can be counted in the dtype of the times."""
-    return 2 ** (jnp.finfo(dtype).nmant + 1)
-
-
-def _is_short(
-    t0: Real[Array, ""], t1: Real[Array, ""], num_steps: int | Real[Array, ""]
-) -> Bool[Array, ""]:
-    """Whether a step is shorter than a unit of rounding of the times.
-
-    Of such steps some would have length zero and others twice the length or more.
-    """
-    start, end = lax.stop_gradient((t0, t1))
-    largest = jnp.maximum(jnp.abs(start), jnp.abs(end))
-    spacing = largest - jnp.nextafter(largest, jnp.zeros_like(largest))
-    is_short = (start != end) & (jnp.abs(end - start) / num_steps < spacing)
-    return is_short | (num_steps > _max_steps(t0.dtype))
 
 
 def _zero_or_error(result: diffrax.RESULTS) -> Real[Array, ""]:

@@ -28,7 +28,7 @@ ROWS = [
     {"_fields", "_methods"},
     # Steps; and terms of variations.
     {"_solvers", "_variation"},
-    {"_step_back"},
+    {"_step_back", "_times"},
     {"_integrate"},
     {"_batch", "_testing"},
     {"_measure"},

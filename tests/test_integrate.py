@@ -297,7 +297,7 @@ WRONG_VALUES: list[tuple[str, dict[str, Any]]] = [
     *at_least_1("num_steps", [0, -1, 1.0, 10.5, True, False, None, "3", np.float64(4)]),
     *at_least_1("save_every", [0, -1, 1.0, True, False]),
     *at_least_1("checkpoint_every", [0, -1, 1.0, True]),
-    *((f"save_every must divide num_steps=16, got {n}", {"save_every": n}) for n in (5, 32)),
+    *((f"save_every must divide the 16 steps, got {n}", {"save_every": n}) for n in (5, 32)),
     # Steps shorter than the rounding of a time would have length zero or twice their own.
     *(
         (f"num_steps must be at most 16777216 .* got {n}", SINGLE | {"num_steps": n})

@@ -25,9 +25,10 @@ from .._arguments import (
     time_scalar,
 )
 from .._batch.progress import progress_bar
-from .._integrate import equal_steps
+from .._integrate import solve_steps
 from .._numerics.checks import needing
 from .._solvers.solver import as_own
+from .._times import EqualTimes
 from .cost import Problem, cost_of_steps
 from .result import WorkPrecision
 
@@ -222,9 +223,8 @@ def take_turns(
 
 def _equal_steps(problem: Problem, num_steps: Int[Array, ""]) -> tuple:
     term, solver, t0, t1, _, y0, args = problem
-    solution, fault = equal_steps(
-        term, as_own(solver), t0, t1, y0, args, num_steps, None, False, None, False, throw=False
-    )
+    times = EqualTimes(t0, t1, num_steps)
+    solution, fault = solve_steps(term, as_own(solver), times, y0, args)
     y, *statistics = _outcome(solution, num_steps, 0)
     return needing(fault.error(jnp.zeros(())), y), *statistics
 

@@ -34,6 +34,11 @@ class Fault(eqx.Module):
         messages = *self.messages, message
         return Fault(jnp.where(holds, jnp.int32(len(messages)), self.number), messages)
 
+    def with_cases_of(self, other: "Fault") -> "Fault":
+        """This fault, or the other one if there is one."""
+        number = jnp.where(other.number > 0, other.number + len(self.messages), self.number)
+        return Fault(number, self.messages + other.messages)
+
     def error(self, zero: Real[Array, ""]) -> Real[Array, ""]:
         """The zero, or the error, if there is one: in a batch the one with the largest number.
 
