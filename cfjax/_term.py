@@ -40,10 +40,9 @@ class LieTerm(diffrax.AbstractTerm):
 
     If every part is a translation, this is an ordinary term, and every diffrax solver accepts it.
     With frozen fields diffrax's own solvers either refuse the term (Tsit5, Dopri5 and most others)
-    or make ordinary steps in the ambient space, which leave the manifold (Euler, Heun, Midpoint,
-    Ralston, LeapfrogMidpoint, ImplicitEuler), as `vf_prod` is the tangent vector. So
-    `diffrax.BacksolveAdjoint()` works: it integrates backwards in the ambient space, where a solver
-    of cfjax is a Runge-Kutta method. It also accepts another solver.
+    or make ordinary steps in the ambient space, which leave the manifold (Euler, Heun, Midpoint and
+    others), as `vf_prod` is the tangent vector. So `diffrax.BacksolveAdjoint()` works: it
+    integrates backwards in the ambient space, where a solver of cfjax is a Runge-Kutta method.
     """
 
     field: Callable[[Any, Any, Any], PyTree]

@@ -30,9 +30,7 @@ class Affine(AbstractAlgebraElement, AbstractSemilinearField):
     varies, use its largest value in M, not its mean.
 
     Boundary values and fluxes that are constant in time may be in b, divided by `dx^2`. Subtract
-    those that vary: take a smooth w that has them and solve for `v = u - w`, whose boundary values
-    are zero, `v' = M v + g(v + w) + L w - w'`. Here `L w` is M applied to w with its boundary
-    values in place, so it is as smooth as w. In b they would lower the order, of CF4 to two.
+    those that vary, by a smooth w that has them: in b they would lower the order, of CF4 to two.
 
     Without a transform the state and `b` are the coefficients themselves, and a flow costs an
     exponential, a division and a polynomial for each eigenvalue. With a transform they are points.

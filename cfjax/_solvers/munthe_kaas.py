@@ -361,40 +361,23 @@ class AbstractRungeKutta(AbstractMuntheKaas):
 class RKMK(AbstractRungeKutta, diffrax.AbstractAdaptiveSolver):
     """The Munthe-Kaas method of any explicit Runge-Kutta method, with its order and its estimate.
 
-    Each stage but the first takes the inverse derivative of the exponential, `dexpinv` of the
-    field: a closed form for `Rotation`, `QuaternionRotation`, `RigidMotion`, `PlanarMotion`,
-    `ExtendedMotion` and `Scaling`, otherwise a series. The series of a method of order q has up to
-    q - 2 commutators, or q - 3 if q is odd and above 3. From a full turn on the exponential cannot
-    be inverted. For these fields and `InertialMotion`, a step where one of them, times the step
-    size, is an angular velocity of 2 pi or more at some stage is an error, or taken again, shorter,
-    with adaptive steps. The series of other fields converges below this bound only, and the step is
-    as wrong as any that is too long.
+    Each stage but the first takes `dexpinv`, the inverse derivative of the exponential: a closed
+    form for `Rotation`, `QuaternionRotation`, `RigidMotion`, `PlanarMotion`, `ExtendedMotion` and
+    `Scaling`, otherwise a series, with up to q - 2 commutators for order q, or q - 3 if q is odd
+    and above 3. From a full turn on the exponential cannot be inverted. For these fields and
+    `InertialMotion` a step fails where one of them, times the step size, is an angular velocity of
+    2 pi or more at some stage. The series of other fields converges below this bound only.
 
     The estimate comes at no extra cost, unless the tableau is first same as last: then it needs the
     field at the end of the step, which is the first field of the next step. Dense output has order
     q - 1 and uses the stages alone; for `diffrax.Dopri8` it takes 4 evaluations more.
 
     With `coordinates="cayley"` a step takes no exponentials and no commutators: Cayley's transform
-    `cay(u) = (I - u/2)^-1 (I + u/2)` stands in place of the exponential, and the inverse of its
-    derivative is `(I - u/2) a (I + u/2)`. The order, the order of output and the cost of the
-    estimate are as above. It takes these fields, with leading axes or without, and arrays and None
-    beside them:
-
-    - `LeftMatrix`, `RightMatrix`, `Conjugation` and `Congruence` without `q`, with any `a`. Every
-      form `y^H J y` that the group of the field keeps is kept to rounding, for example of
-      orthogonal, unitary, symplectic and Lorentz matrices. J occurs nowhere. The determinant of
-      complex 3 x 3 matrices follows the trace of `a` to rounding; any other determinant that does
-      not follow from a form, for example of SU(4), is as accurate as the solution. A stage takes
-      a linear system of the size of `a` for each side that it acts from, written out up to n = 4,
-      and three products of matrices besides those with the point.
-    - `LowRankSkew`, `BorderedSkew` and `SphereRotation`, in tangent vectors at the start, as in
-      `CayleyRK4`.
-
-    These coordinates end at half a turn. A step by nearly as much fails: where the angles of
-    cay(u) are all below 1 it is none, and where a pair of them is above 2.5 for n = 3, or 2.75 for
-    n = 100, it is one. Growth has no such end, and no such check: a step that multiplies by `e^2`
-    has a relative error of 1e-3 with `RKMK5` and 1e-4 with `RKMK8`, by `e^4` 1 and 0.1. The
-    estimate need not see this, so steps should grow or decay by less than `e^2`.
+    `cay(u) = (I - u/2)^-1 (I + u/2)` stands in place of the exponential. It takes `LeftMatrix`,
+    `RightMatrix`, `Conjugation`, `Congruence` without `q`, `LowRankSkew`, `BorderedSkew` and
+    `SphereRotation`, arrays and None. Matrices that keep a form `y^H J y` keep it to rounding. A
+    step that turns by nearly pi fails; growth has no such check, so a step should grow or decay by
+    less than `e^2`. *Methods* in the documentation has more of both.
 
     **Arguments:**
 

@@ -42,24 +42,12 @@ class Projected(AbstractRungeKutta, diffrax.AbstractAdaptiveSolver):
     manifold that is nearest. Orders, estimate and cost are those of the method; no exponentials or
     commutators are computed. In a linear space it is the method itself.
 
-    What is nearest depends on the field:
-
-    - an array, a translation, stays as it is;
-    - `Rotation` keeps the length of vectors, shape `(3,)`, and turns the columns of matrices, shape
-      `(3, k)`, as one body;
-    - `QuaternionRotation` and `SphereRotation` keep length 1;
-    - `RigidMotion`, `PlanarMotion`, `ExtendedMotion` and `InertialMotion` keep the unit number or
-      the orthogonal matrix of the attitude, and leave everything else as it is;
-    - `LeftMatrix` and `RightMatrix` with a skew-Hermitian `a` keep the products of columns or rows,
-      so matrices stay orthogonal or unitary. The phase of the determinant of a complex matrix
-      follows the trace of `a`. A step takes four or five products with the point more than in plain
-      space;
-    - `LowRankSkew` and `BorderedSkew` keep orthonormal columns;
-    - `Conjugation` and `Congruence` without `q`, with any `a`, move by an element of the algebra in
-      Cayley's coordinates, which is computed beside the point, and whose estimate is that of the
-      step. This takes three products of matrices a stage, and two solves a step.
-
-    Any other class needs a method `projected`.
+    `Rotation`, `QuaternionRotation` and `SphereRotation` keep lengths, or the columns of a matrix
+    as one body; motions the unit number or orthogonal matrix of the attitude; `LeftMatrix` and
+    `RightMatrix`, whose `a` must be skew-Hermitian, the products of columns or rows; `LowRankSkew`
+    and `BorderedSkew` orthonormal columns; `Conjugation` and `Congruence` without `q` the spectrum.
+    Arrays stay as they are. Any other class needs a method `projected`. *Methods* in the
+    documentation has the table.
 
     **It is not** exact for a constant field, as `cfjax.CF4` and `cfjax.RKMK8` are at any angle; and
     it is neither symmetric nor symplectic. Its steps end where those in plain space do, at some 3

@@ -46,40 +46,9 @@ class VariationTerm(diffrax.AbstractTerm):
 
     It works with all solvers of cfjax that take fields which depend on the state, and if all parts
     of the state move by arrays, with those of diffrax too. The state moves exactly as without
-    variations, and what is carried has the order of the method.
-
-    **Coordinates.** A small change of a state y is written as n numbers `eta`: y changes by the
-    velocity that the element with coordinates `eta` has there. They are
-
-    | the field, and its part of the state | coordinates |
-    | --- | --- |
-    | `QuaternionRotation`; `Rotation` on matrices (3, 3) | `omega`: 3 |
-    | `RigidMotion` and `PlanarMotion` on poses | `omega`, `v`: 6 and 3 |
-    | `ExtendedMotion` | `omega`, `a`, `v`: 9 |
-    | `InertialMotion` | those of `ExtendedMotion` with `frame="body"`: 9 |
-    | `LeftMatrix`, `RightMatrix` on matrices, with `basis` | real coefficients of the basis |
-    | all other fields and points, arrays, None | the change itself, entry by entry |
-    | a class of your own | what its `framed` returns, by default the change itself |
-
-    in the frame of the class, `"body"` or `"fixed"`, one part of the state after the other in the
-    order of JAX: keys of a dict are sorted. `slices` says where each part is. An array of leading
-    axes has coordinates for each element.
-
-    **Equations.** With `xi` the coordinates of the field at y, a variation obeys
-    `eta' = D xi[eta] + [xi, eta] = A eta`, with the bracket of the class. Then `Phi' = A Phi`,
-    `P' = A P + P A^T + G G^T` with the columns of G the coordinates of what unit increments of the
-    noise cause, `S' = A S + d xi / d theta`, and `(log p)' = -tr D xi`. The covariance is that to
-    first order in the noise; in that order there is no difference between Itô and Stratonovich.
-    The density is that with respect to the measure which all motions of the frame keep: Haar's for
-    attitudes, unitary and orthogonal matrices; Haar's of rotations times the volume for poses; the
-    uniform one on spheres and frames of vectors, for fields that are skew, as `SphereRotation`;
-    and volume for arrays. It has the unit of one over that measure.
-
-    **Cost.** A stage takes n Jacobian products of the field for A, and at most 2 n^2 k operations
-    for k columns that are carried; blocks of A that the program shows to be zero take none. A
-    sensitivity alone takes m Jacobian products and no A; a log-density alone n, or with `probes`
-    one for each. Where the state and what is carried are at most 16 numbers in vectors of at most
-    7, such as an attitude and its covariance, steps are rewritten as those of small states are.
+    variations, and what is carried has the order of the method. *Covariance, Jacobians and
+    densities* in the documentation has the equations, the coordinates of each class, and what all
+    of it costs: a stage takes n Jacobian products of the field, m for a sensitivity alone.
 
     **Arguments:**
 
