@@ -102,7 +102,7 @@ def machine() -> dict[str, Any]:
     return {
         "processor": facts.get("model name") or platform.processor(),
         "instructions": platform.machine() + " with AVX-512" * has_avx512,
-        "cores": os.cpu_count(),
+        "cores": len(os.sched_getaffinity(0)),
         "load": round(os.getloadavg()[0], 2),
         "XLA_FLAGS": os.environ.get("XLA_FLAGS", ""),
         "platform": platform.platform(),

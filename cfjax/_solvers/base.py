@@ -42,6 +42,8 @@ class AbstractLieSolver(AbstractSolver):
     """
 
     term_structure: ClassVar = diffrax.AbstractTerm
+    # Whether a path, such as Brownian motion, may drive a term.
+    takes_noise: ClassVar[bool] = True
     # What diffrax asks a solver for first.
     term_compatible_contr_kwargs = _InstanceProperty(lambda self: {})
 
@@ -96,7 +98,14 @@ class AbstractLieSolver(AbstractSolver):
 
         **Raises** `TypeError` if the method cannot take such terms.
         """
-        return self.without_estimate() if is_driven(terms) else self
+        if not is_driven(terms):
+            return self
+        if not self.takes_noise:
+            raise TypeError(
+                f"{type(self).__name__} does not support noise or other path-driven terms: use "
+                "another method, for example cfjax.CF4() or cfjax.WeakOrder2()."
+            )
+        return self.without_estimate()
 
     def without_estimate(self) -> "AbstractLieSolver":
         return self._with(estimate=None) if hasattr(self, "estimate") else self

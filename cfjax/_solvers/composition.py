@@ -7,7 +7,6 @@ import diffrax
 import equinox as eqx
 from jax import lax
 
-from .._control_term import is_driven
 from .._methods.splitting import COMPOSITIONS
 from .base import AbstractLieSolver, State, result_of
 from .dense import Interpolation, Substeps
@@ -47,6 +46,7 @@ class Composition(AbstractLieSolver):
     composition_order: int = eqx.field(static=True)
 
     interpolation_cls: ClassVar[Any] = Interpolation
+    takes_noise: ClassVar[bool] = False
 
     def __init__(self, solver: AbstractLieSolver, order: int):
         if not isinstance(solver, AbstractLieSolver) or not solver.is_symmetric:
@@ -73,10 +73,8 @@ class Composition(AbstractLieSolver):
         return self.composition_order
 
     def for_terms(self, terms):
-        if is_driven(terms):
-            raise TypeError("Composition takes no noise: some of its steps go backwards in time.")
         self.solver.for_terms(terms)
-        return self
+        return super().for_terms(terms)
 
     def start(self, terms, t0, t1, y0, args):
         self.for_terms(terms)

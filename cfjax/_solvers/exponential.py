@@ -12,7 +12,6 @@ import jax.numpy as jnp
 import jax.tree_util as jtu
 from jaxtyping import Array, PyTree, Real
 
-from .._control_term import is_driven
 from .._field import Rest, combine, from_chart, is_field, to_chart
 from .._fields.semilinear import AbstractSemilinearField
 from .._methods import exponential as _exponential
@@ -48,6 +47,7 @@ class AbstractExponential(AbstractTableauSolver, AbstractChartSolver):
     """
 
     tableau: eqx.AbstractVar[ExponentialTableau]
+    takes_noise: ClassVar[bool] = False
     estimate: Literal["group"] | None = eqx.field(static=True, default="group", kw_only=True)
     # For equal steps: their length, as differences of times would differ from step to step by their
     # rounding, and for each part of the field the coefficients of its linear part, where that is
@@ -61,14 +61,6 @@ class AbstractExponential(AbstractTableauSolver, AbstractChartSolver):
     @property
     def first_same_as_last(self) -> bool:
         return self.estimate is not None and self.tableau.uses_last
-
-    def for_terms(self, terms):
-        if is_driven(terms):
-            raise TypeError(
-                f"{type(self).__name__} does not support noise or other path-driven terms: use a "
-                "commutator-free method, for example cfjax.CF4()."
-            )
-        return self
 
     def for_equal_steps(self, terms, length, t0, y0, args) -> Any:
         """The same method for steps of this length only, with the coefficients of all linear parts

@@ -1,14 +1,13 @@
 """The implicit midpoint rule at the mean of a flow: an exact Poisson map where nothing splits."""
 
 import math
-from typing import Any
+from typing import Any, ClassVar
 
 import diffrax
 import equinox as eqx
 import jax.tree_util as jtu
 from jaxtyping import PyTree
 
-from .._control_term import is_driven
 from .._field import is_field
 from .._term import product
 from .base import AbstractLieSolver, time_at
@@ -50,6 +49,7 @@ class ImplicitMidpoint(AbstractLieSolver):
     max_steps: int = eqx.field(default=100, static=True)
 
     interpolation_cls = Interpolation
+    takes_noise: ClassVar[bool] = False
 
     def __check_init__(self):
         rtol = self.rtol
@@ -70,13 +70,6 @@ class ImplicitMidpoint(AbstractLieSolver):
 
     def order(self, terms):
         return 2
-
-    def for_terms(self, terms):
-        if is_driven(terms):
-            raise TypeError(
-                "ImplicitMidpoint takes no noise: use another method, for example cfjax.CF4()."
-            )
-        return self
 
     def step(self, terms, t0, t1, y0, args, solver_state, made_jump):
         t0, _ = begin_step(solver_state, t0, lambda t0: None, made_jump)

@@ -7,7 +7,6 @@ import equinox as eqx
 import numpy as np
 from jaxtyping import PyTree
 
-from .._control_term import is_driven
 from .._field import is_field
 from .._methods import magnus as _magnus
 from .._methods.magnus import MagnusTableau
@@ -26,14 +25,8 @@ class AbstractOfTime(AbstractChartSolver):
 
     is_of_state: ClassVar[bool] = False
 
-    def for_terms(self, terms):
-        if is_driven(terms):
-            raise TypeError(
-                f"{type(self).__name__} takes fields at several times of a step, but a path that "
-                "drives a term has one increment for it: use another method, for example "
-                "cfjax.CF4() or, with noise, cfjax.WeakOrder2()."
-            )
-        return self
+    # It takes fields at several times of a step, for which a path has one increment.
+    takes_noise: ClassVar[bool] = False
 
     def start(self, terms, t0, t1, y0, args) -> tuple[State, Fault]:
         self.for_terms(terms)

@@ -2,7 +2,7 @@
 
 from collections.abc import Callable
 from dataclasses import replace
-from typing import Any
+from typing import Any, ClassVar
 
 import diffrax
 import equinox as eqx
@@ -13,7 +13,6 @@ from jax import lax
 from jax.flatten_util import ravel_pytree
 from jaxtyping import Array, Bool, PyTree, Real
 
-from .._control_term import is_driven
 from .._field import AbstractCoordinates, has_rate, in_coordinates, is_field, keeping, kept, landing
 from .._fields.coordinates import BesideCayley
 from .._fields.elementwise import ElementwiseCoordinates, elementwise
@@ -80,6 +79,8 @@ class Projected(AbstractRungeKutta, diffrax.AbstractAdaptiveSolver):
     # invariants are to be.
     target: PyTree = eqx.field(default=None, repr=False)
 
+    takes_noise: ClassVar[bool] = False
+
     def __init__(
         self,
         method: diffrax.AbstractSolver | diffrax.ButcherTableau,
@@ -97,14 +98,6 @@ class Projected(AbstractRungeKutta, diffrax.AbstractAdaptiveSolver):
     @property
     def chart_type(self) -> type[ProjectedChart]:
         return ProjectedChart
-
-    def for_terms(self, terms):
-        if is_driven(terms):
-            raise TypeError(
-                "cfjax.Projected does not take a term that is driven by a path. Use "
-                "cfjax.WeakOrder2() or cfjax.CF4()."
-            )
-        return super().for_terms(terms)
 
     def start(self, terms, t0, t1, y0, args):
         state, fault = super().start(terms, t0, t1, y0, args)

@@ -17,7 +17,6 @@ from jax.extend.core import Primitive
 from jax.interpreters import ad, batching, mlir
 from jaxtyping import Array, Bool, PyTree, Real
 
-from .._control_term import is_driven
 from .._field import combine, is_field, tangent
 from .._fields.semilinear import AbstractSemilinearField
 from .._methods.tableau import ContinuousExtension
@@ -79,6 +78,7 @@ class AbstractStabilised(AbstractChartSolver, diffrax.AbstractAdaptiveSolver):
     twice_index: eqx.AbstractClassVar[int]
     # Of the combination of the elements of a step that leads to points within it.
     continuous_extension: eqx.AbstractClassVar[ContinuousExtension]
+    takes_noise: ClassVar[bool] = False
 
     stages: int | None = eqx.field(static=True, default=None)
     spectral_radius: float | Callable[[Any, PyTree, PyTree], Any] | None = eqx.field(
@@ -127,14 +127,6 @@ class AbstractStabilised(AbstractChartSolver, diffrax.AbstractAdaptiveSolver):
 
     def error_order(self, terms) -> int:
         return 3
-
-    def for_terms(self, terms):
-        if is_driven(terms):
-            raise TypeError(
-                f"{type(self).__name__} is for ordinary differential equations, but a path drives "
-                "one of the terms: use another method, for example cfjax.CF4()."
-            )
-        return self
 
     def init(self, terms, t0, t1, y0, args) -> _State:
         state, fault = self.start(terms, t0, t1, y0, args)
