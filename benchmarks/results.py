@@ -102,7 +102,8 @@ def machine() -> dict[str, Any]:
     return {
         "processor": facts.get("model name") or platform.processor(),
         "instructions": platform.machine() + " with AVX-512" * has_avx512,
-        "cores": len(os.sched_getaffinity(0)),
+        # Those that this process may use.
+        "cores": getattr(os, "process_cpu_count", os.cpu_count)(),
         "load": round(os.getloadavg()[0], 2),
         "XLA_FLAGS": os.environ.get("XLA_FLAGS", ""),
         "platform": platform.platform(),

@@ -66,6 +66,13 @@ class Of(NamedTuple):
         linear = self.moving if self.derive is _transposed else ()
         return _others(self.program.in_avals, linear)
 
+    @property
+    def directions(self) -> list[bool]:
+        """Which operands of the derivative are directions, its own or those of an earlier one."""
+        earlier = self.of.directions if self.of else [False] * len(self.program.in_avals)
+        ways = self.moving if self.derive is _tangents else self.results
+        return [*(earlier[k] for k in self.residuals), *[True] * len(ways)]
+
     def applied(self, fun: Callable[..., Any], operands: Sequence[Any]) -> Callable[..., list[Any]]:
         """The derivative of a function of such operands, which is the program or its like."""
         residuals, moving = self.residuals, self.moving
@@ -106,8 +113,10 @@ class Kind(NamedTuple):
 
     def is_of_directions(self, level: int) -> bool:
         """Whether a batch is one of directions of a derivative, at a point that they share."""
-        axes = self.levels[level]
-        return bool(self.linear) and all(x is None for x in axes[: len(axes) - self.linear])
+        if self.of is None:
+            return False
+        pairs = zip(self.levels[level], self.of.directions, strict=True)
+        return all(axis is None or is_direction for axis, is_direction in pairs)
 
     @property
     def is_many(self) -> bool:

@@ -213,6 +213,35 @@ def test_directions_that_are_zero_are_not_computed():
     np.testing.assert_array_equal(run(lambda v: jax.jvp(fun, (X,), (v,))[1], X), np.zeros(3))
 
 
+DERIVATIVES = {
+    "grad": jax.grad,
+    "jacfwd": jax.jacfwd,
+    "jacrev": jax.jacrev,
+    "hessian": jax.hessian,
+    "reverse over forward": lambda f: jax.jacrev(jax.jacfwd(f)),
+    "reverse over reverse": lambda f: jax.jacrev(jax.jacrev(f)),
+}
+
+
+@pytest.mark.parametrize("name", DERIVATIVES)
+def test_derivatives_of_one_system_are_compiled_as_they_were_traced(name, monkeypatch):
+    """Batches of directions are no batches of systems. A Hessian has directions of both kinds."""
+    on_numbers, calls = random_programs.lowering._on_numbers, []
+
+    def counted(*args):
+        calls.append(args)
+        return on_numbers(*args)
+
+    monkeypatch.setattr(random_programs.lowering, "_on_numbers", counted)
+    step = random_programs.lowering.scalarised
+    loss = lambda x: size(lambda x, scale: step(lambda x: as_it_is(x, scale), x))(x, SCALE)  # noqa: E731
+    derivative = DERIVATIVES[name](loss)
+    jax.jit(derivative).lower(X)
+    assert not calls
+    jax.jit(jax.vmap(derivative)).lower(XS)
+    assert calls
+
+
 @jax.custom_jvp
 def absolute(x):
     return jnp.abs(x)
