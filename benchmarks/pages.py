@@ -1702,6 +1702,11 @@ def _first_derivative(program: str, method: str) -> str:
 
 
 @number
+def compile_reverse_tsit5() -> str:
+    return _first_derivative("gradient", "Tsit5")
+
+
+@number
 def compile_reverse_cf4() -> str:
     return _first_derivative("gradient", "CF4")
 
@@ -1712,8 +1717,8 @@ def compile_reverse_cf54() -> str:
 
 
 @number
-def compile_reverse_rkmk8() -> str:
-    return _first_derivative("gradient", "RKMK8")
+def compile_reverse_projected() -> str:
+    return _first_derivative("gradient", "Projected(Dopri8)")
 
 
 @number
@@ -1722,8 +1727,8 @@ def compile_forward_cf54() -> str:
 
 
 @number
-def compile_forward_rkmk8() -> str:
-    return _first_derivative("Jacobian", "RKMK8")
+def compile_forward_projected() -> str:
+    return _first_derivative("Jacobian", "Projected(Dopri8)")
 
 
 @number
