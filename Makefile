@@ -44,7 +44,7 @@ test-newest:
 
 # Measures everything anew, one after the other, for the pages: on Python 3.12 or newer, for the
 # newest jax, and on a machine with nothing else to do. ARGS=--quick is rough, and quicker.
-BENCHMARKS := rigid_body equal_error tolerances million_steps gradients fits fields leading_axes compile first_call second_process getting_started chain expm unitary heat stiff stabilised coordinates batch charts stability energy noise noise_steps noise_lattice quantum lindblad operators variations peers scenes
+BENCHMARKS := rigid_body equal_error tolerances million_steps gradients fits fields leading_axes compile first_call second_process getting_started chain expm heat stiff stabilised coordinates batch charts stability energy noise noise_steps noise_lattice quantum lindblad operators variations peers scenes
 benchmarks: .venv/dev
 	@$(BIN)/python benchmarks/results.py
 	for name in $(BENCHMARKS); do $(BIN)/python benchmarks/$$name.py $(ARGS) || exit 1; done

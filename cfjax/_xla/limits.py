@@ -6,7 +6,7 @@ They were set on two cores with AVX-512. What follows from one of them is below 
 
 import jax
 
-# The longest vector that is scalarised. A pose is a quaternion and a position. (attitude)
+# The longest vector that is scalarised. A pose is a quaternion and a position. (batch)
 MAX_LENGTH = 7
 # A product of two arrays is scalarised into at most this many products of numbers, those of two
 # 6 x 6 matrices. (fields)
