@@ -392,7 +392,7 @@ def test_what_is_refused(subtests, no_shape_hook):
         (cfjax.LieTerm(beside(cfjax.Congruence(-1j * H0))), other + "Congruence"),
         (cfjax.LieTerm(beside(jnp.asarray(H0))), other + "a translation"),
         (cfjax.LieTerm(beside(None)), other + "None"),
-        (driven, "Kraus4 takes fields at several times"),
+        (driven, "Kraus4 does not support noise"),
     ]
     for term, message in cases:
         start = {name: y0 for name in "ab"} if message.startswith(other) else y0
