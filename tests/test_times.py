@@ -53,9 +53,7 @@ def test_the_steps_of_diffrax_to_the_same_times(solver):
 
 def test_a_stiff_method_whose_coefficients_depend_on_the_step():
     rates = jnp.asarray([1.0, 300.0, 2000.0])
-    term = cfjax.LieTerm(
-        lambda t, y, args: cfjax.LinearAffine(-jnp.diag(rates), jnp.cos(y))
-    )
+    term = cfjax.LieTerm(lambda t, y, args: cfjax.LinearAffine(-jnp.diag(rates), jnp.cos(y)))
     options = {"term": term, "solver": cfjax.ETD54(), "y0": jnp.ones(3)}
     close(solve(**options).ys[-1], by_diffrax(**options)[-1])
 
