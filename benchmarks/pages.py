@@ -255,9 +255,10 @@ def machine() -> str:
 
 
 def _machine(facts: dict[str, object]) -> str:
-    return (
-        "{cores} cores of {processor}, {instructions}, Python {python}, jax {jax}, "
-        "diffrax {diffrax}, cfjax {cfjax}"
+    cores = "one core" if facts["cores"] == 1 else f"{facts['cores']} cores"
+    return cores + (
+        " of {processor}, {instructions}, Python {python}, jax {jax}, diffrax {diffrax}, "
+        "cfjax {cfjax}"
     ).format_map(facts)
 
 
